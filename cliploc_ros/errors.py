@@ -1,0 +1,31 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the package raises for input that its user can mend."""
+
+
+class CliplocError(Exception):
+    """Bad input. The message names the thing to mend; no traceback is needed to act on it."""
+
+
+class MapError(CliplocError):
+    """A landmark map that cannot be used: file, landmark and field are named."""
+
+
+class OptionsError(CliplocError):
+    """An option or parameter outside its allowed values."""
+
+
+class CameraError(CliplocError):
+    """Camera intrinsics or distortion that no camera can have."""
+
+
+class ImageError(CliplocError):
+    """An image that cannot be decoded."""
+
+
+class ModelError(CliplocError):
+    """Weights or an architecture that cannot be loaded."""
+
+
+class DatasetError(CliplocError):
+    """A recording that cannot be read or written."""
