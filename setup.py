@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How colcon installs the package. script/setup brings the environment that it runs in."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'cliploc_ros'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    packages=find_packages(exclude=['test', 'test.*']),
+    package_data={f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.*'))),
+    ],
+    python_requires='>=3.12',
+    # Without version numbers: script/requirements.txt is the one place for those.
+    install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy'],
+    extras_require={
+        'models': ['open_clip_torch', 'torch', 'torchvision', 'ultralytics-opencv-headless'],
+        'datasets': ['rosbags'],
+        'test': ['hypothesis', 'pytest'],
+    },
+    zip_safe=False,
+    maintainer='the cliploc_ros authors',
+    maintainer_email='cliploc-ros@example.org',
+    description='Global localization in a map of labelled objects, from one image.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            f'detector = {PACKAGE}.nodes.detector:main',
+            f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
+            f'replay = {PACKAGE}.cli.replay:main',
+            f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',
+        ],
+    },
+)
