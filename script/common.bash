@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+# shellcheck shell=bash
+#
+# What setup and test share: messages, stamps, and steps that name their cause when they fail.
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
+venv=$root/.venv
+logs=$root/build/setup
+
+say() { printf '==> %s\n' "$*"; }
+die() { printf '%s: %s\n' "script/$(basename "$0")" "$*" >&2; exit 1; }
+
+# One at a time in one tree; and pip unpacks its gigabytes beside the environment, because /tmp is
+# often a small file system of its own.
+enter_build_folder() {
+  mkdir -p "$logs" || die "cannot write to $root"
+  touch "$root/build/COLCON_IGNORE"
+  exec 9>"$root/build/setup.lock"
+  flock --nonblock 9 || { say 'waiting for another script/setup in this folder'; flock 9; }
+  export TMPDIR=$root/build/tmp
+  trap 'rm -rf "$root/build/tmp"' EXIT
+  mkdir -p "$TMPDIR"
+}
+
+# A step is done while its stamp holds the hash of the step's input. Written only on success.
+hash_of() { find "$@" -type f -not -path '*/__pycache__/*' -print0 | sort -z | xargs -0 sha256sum | sha256sum; }
+is_done() { [[ -f $1 && $(<"$1") == "$2" ]]; }
+set_done() { printf '%s\n' "$2" > "$1"; }
+
+# run_step NAME COMMAND...: the output goes to a log, large downloads to the terminal as well.
+run_step() {
+  local log=$logs/$1.log
+  shift
+  "$@" 2>&1 | tee "$log" | show_large_downloads || explain_failure "$log"
+}
+
+show_large_downloads() { grep --line-buffered -oE 'Downloading [^ ]+ \([0-9.]+ [GM]B\)' | sed -u 's/^/    /' || true; }
+
+explain_failure() {
+  if grep -qiE 'no space left on device|disk quota exceeded' "$1" || (( $(free_mb) < 100 )); then
+    die "the disk is full ($(free_mb) MB left for $root): make room and run it again, it continues"
+  fi
+  if grep -qE 'NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ConnectionResetError|ProxyError|SSLError|IncompleteRead|ProtocolError|incomplete-download' "$1"; then
+    die "the download broke off or there is no network: run it again, it continues (log: $1)"
+  fi
+  tail -n 20 "$1" >&2
+  die "this step failed, see above (whole log: $1)"
+}
+
+free_mb() { df --output=avail -m "$root" | tail -n 1; }
+
+# pip_install VENV REQUIREMENTS [PIP OPTION...]: once for each content of the file.
+pip_install() {
+  local prefix=$1 file=$2 name hash
+  shift 2
+  name=$(basename "$file" .txt)
+  hash=$(hash_of "$file" "$root/script/constraints-jazzy.txt")
+  is_done "$prefix/.$name.done" "$hash" && return
+  say "installing script/$name.txt with pip"
+  run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --retries 10 --timeout 60 \
+    --disable-pip-version-check --no-input --requirement "$file" "$@"
+  set_done "$prefix/.$name.done" "$hash"
+}
+
+# make_venv PYTHON FOLDER [VENV OPTION...]: also mends one whose making was interrupted.
+make_venv() {
+  local python=$1 prefix=$2
+  shift 2
+  is_done "$prefix/.venv.done" "$prefix" && return
+  say "making ${prefix#"$root/"} with $("$python" --version)"
+  run_step "$(basename "$prefix")" "$python" -m venv "$@" "$prefix"
+  touch "$prefix/COLCON_IGNORE"
+  # From pip 25.2 on, a download that breaks off is resumed within one run.
+  run_step "$(basename "$prefix")-pip" "$prefix/bin/python" -m pip install --upgrade 'pip>=25.2'
+  set_done "$prefix/.venv.done" "$prefix"
+}

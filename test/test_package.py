@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The package as a whole: versions, imports, licence lines, executables and interfaces."""
+
+import importlib
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+MODULES = sorted((PROJECT / 'cliploc_ros').rglob('*.py'))
+SOURCES = [*MODULES, PROJECT / 'setup.py', *sorted((PROJECT / 'test').rglob('*.py'))]
+SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
+INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
+EXECUTABLES = ['detector', 'relocalizer', 'replay', 'tum_to_bag']
+
+# As vision_msgs 4.1.1 of Jazzy has them, in this order.
+VISION_MSGS_FIELDS = {
+    'Point2D': {'x': 'double', 'y': 'double'},
+    'Pose2D': {'position': 'vision_msgs/Point2D', 'theta': 'double'},
+    'BoundingBox2D': {'center': 'vision_msgs/Pose2D', 'size_x': 'double', 'size_y': 'double'},
+    'ObjectHypothesis': {'class_id': 'string', 'score': 'double'},
+    'ObjectHypothesisWithPose': {
+        'hypothesis': 'vision_msgs/ObjectHypothesis',
+        'pose': 'geometry_msgs/PoseWithCovariance',
+    },
+    'Detection2D': {
+        'header': 'std_msgs/Header',
+        'results': 'sequence<vision_msgs/ObjectHypothesisWithPose>',
+        'bbox': 'vision_msgs/BoundingBox2D',
+        'id': 'string',
+    },
+    'Detection2DArray': {
+        'header': 'std_msgs/Header',
+        'detections': 'sequence<vision_msgs/Detection2D>',
+    },
+}
+# The hash of the published Detection2DArray, which covers the other six messages as well.
+DETECTIONS_TYPE_HASH = 'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(PROJECT))
+
+
+def test_versions_are_equal():
+    manifest = ElementTree.parse(PROJECT / 'package.xml').findtext('version')
+    setup = re.search(r"version='(.+)'", (PROJECT / 'setup.py').read_text()).group(1)
+    changelog = re.findall(r'^(\d+\.\d+\.\d+) ', (PROJECT / 'CHANGELOG.rst').read_text(), re.M)
+    assert manifest == setup == changelog[0]
+
+
+def test_core_imports_neither_ros_nor_torch():
+    code = (
+        'import pkgutil, sys, importlib, cliploc_ros, cliploc_ros.core\n'
+        "for module in pkgutil.walk_packages(cliploc_ros.core.__path__, 'cliploc_ros.core.'):\n"
+        '    importlib.import_module(module.name)\n'
+        "print(sorted({'rclpy', 'torch', 'ultralytics', 'open_clip'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=PROJECT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == '[]'
+
+
+@pytest.mark.parametrize('path', [*SOURCES, *SCRIPTS, *INTERFACES], ids=relative)
+def test_file_names_its_licence(path):
+    head = path.read_text()[:300]
+    assert 'SPDX-FileCopyrightText: 2026 the cliploc_ros authors\n' in head
+    assert 'SPDX-License-Identifier: Apache-2.0\n' in head
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=relative)
+def test_module_is_not_too_long(path):
+    assert len(path.read_text().splitlines()) <= 400
+
+
+@pytest.mark.parametrize('name', EXECUTABLES)
+def test_executable_is_installed(name):
+    from ament_index_python import get_package_prefix
+
+    executable = Path(get_package_prefix('cliploc_ros'), 'lib', 'cliploc_ros', name)
+    assert os.access(executable, os.X_OK), f'{executable} is missing: run script/setup'
+    (entry_point,) = importlib.metadata.distribution('cliploc_ros').entry_points.select(name=name)
+    assert callable(entry_point.load())
+
+
+def test_installed_package_is_complete():
+    """Every module and interface definition of the source lies in the installed copy."""
+    from ament_index_python import get_package_prefix
+
+    prefix = Path(get_package_prefix('cliploc_ros'))
+    (installed,) = prefix.glob('lib/python3*/site-packages/cliploc_ros')
+    for path in [*MODULES, *INTERFACES]:
+        copy = installed / path.relative_to(PROJECT / 'cliploc_ros')
+        assert copy.is_file(), f'{copy} is missing: run script/setup'
+        assert copy.read_bytes() == path.read_bytes(), f'{copy} is stale: run script/setup'
+
+
+@pytest.mark.parametrize('name', VISION_MSGS_FIELDS)
+def test_vision_msgs_fields(name):
+    message = getattr(importlib.import_module('vision_msgs.msg'), name)
+    assert list(message.get_fields_and_field_types().items()) == list(
+        VISION_MSGS_FIELDS[name].items()
+    )
+
+
+def test_vision_msgs_type_hash_on_the_wire():
+    import rclpy
+    from vision_msgs.msg import Detection2DArray
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        node = rclpy.create_node('type_hash', context=context)
+        node.create_publisher(Detection2DArray, 'detections', 1)
+        deadline = time.monotonic() + 10.0
+        while not (publishers := node.get_publishers_info_by_topic('detections')):
+            assert time.monotonic() < deadline, 'the publisher never appeared'
+        assert str(publishers[0].topic_type_hash) == DETECTIONS_TYPE_HASH
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
