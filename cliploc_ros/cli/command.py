@@ -1,0 +1,46 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the executables share: errors as one line, and an end on Ctrl-C or SIGTERM."""
+
+import signal
+import sys
+from collections.abc import Callable
+from types import FrameType
+
+from cliploc_ros.errors import CliplocError
+
+#: What a shell reports for a command ended by Ctrl-C.
+EXIT_INTERRUPTED = 130
+
+
+def run_command(command: Callable[[], int]) -> int:
+    """Run the body of an executable.
+
+    Parameters
+    ----------
+    command : callable
+        Returns the exit code.
+
+    Returns
+    -------
+    int
+        The exit code: 1 after one line on stderr for input that the user can mend, 130
+        when interrupted. Other exceptions keep their traceback.
+    """
+    try:
+        return command()
+    except CliplocError as error:
+        print('error:', ' '.join(str(error).split()), file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def interrupt_on_sigterm() -> None:
+    """Let SIGTERM end the process as Ctrl-C does, so that half-written output is removed."""
+    signal.signal(signal.SIGTERM, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``tum_to_bag``: a TUM RGB-D folder becomes a rosbag2 recording."""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from cliploc_ros.cli.command import interrupt_on_sigterm, run_command
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.recorded_detections import read_recorded_detections
+from cliploc_ros.datasets.rosbag import STORAGES
+from cliploc_ros.datasets.tum import TumSequence, read_tum
+from cliploc_ros.datasets.tum_conversion import (
+    ConversionOptions,
+    ConversionResult,
+    convert_tum,
+)
+
+EPILOG = """\
+topics (with --prefix camera: /camera/image and so on):
+  /image or /image/compressed   sensor_msgs/Image or CompressedImage
+  /camera_info                  sensor_msgs/CameraInfo
+  /ground_truth                 geometry_msgs/PoseStamped, the camera in the world frame
+  /detections                   vision_msgs/Detection2DArray, with --detections
+
+examples:
+  tum_to_bag rgbd_dataset_freiburg3_long_office_household office
+  tum_to_bag desk desk_bag --intrinsics fr1 --every 10 --compressed --storage mcap
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Convert a sequence; return the exit code."""
+    options = make_parser().parse_args(_without_ros_args(sys.argv[1:] if args is None else args))
+    interrupt_on_sigterm()
+    return run_command(lambda: convert(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='tum_to_bag',
+        description='Turn a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt) into a rosbag2 '
+        'recording that the nodes of this package understand. Needs no sourced ROS.',
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('folder', type=Path, help='the TUM folder')
+    parser.add_argument('output', type=Path, help='the recording to make; must not exist')
+    parser.add_argument(
+        '--every', type=int, default=1, metavar='N', help='take each N-th image only (default: 1)'
+    )
+    parser.add_argument(
+        '--detections',
+        type=Path,
+        metavar='FILE',
+        help='also write detections that were recorded earlier (JSON)',
+    )
+    parser.add_argument(
+        '--intrinsics',
+        metavar='fr1|fr2|fr3|FILE',
+        help="the dataset's camera, or a camera.json (default: the folder's camera.json, else "
+        "the folder's name says which)",
+    )
+    parser.add_argument(
+        '--storage', choices=list(STORAGES), default='sqlite3', help='default: %(default)s'
+    )
+    images = parser.add_mutually_exclusive_group()
+    images.add_argument(
+        '--raw',
+        dest='image_format',
+        action='store_const',
+        const='raw',
+        default='raw',
+        help='write decoded images (the default)',
+    )
+    images.add_argument(
+        '--compressed',
+        dest='image_format',
+        action='store_const',
+        const='compressed',
+        help="write the image files' own bytes as compressed images",
+    )
+    defaults = ConversionOptions()
+    parser.add_argument('--prefix', default=defaults.prefix, help='namespace of all topics')
+    parser.add_argument(
+        '--camera-frame', default=defaults.camera_frame, help='default: %(default)s'
+    )
+    parser.add_argument('--world-frame', default=defaults.world_frame, help='default: %(default)s')
+    return parser
+
+
+def convert(options: argparse.Namespace) -> int:
+    """Convert as the command line asks; return the exit code."""
+    begin = time.monotonic()
+    sequence = read_tum(options.folder).every(options.every)
+    camera, origin = find_camera(options.intrinsics, options.folder)
+    detections = None
+    if options.detections is not None:
+        size = (camera.width, camera.height)
+        detections = read_recorded_detections(options.detections, size)
+    print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
+    conversion = ConversionOptions(
+        storage=options.storage,
+        image_format=options.image_format,
+        prefix=options.prefix,
+        camera_frame=options.camera_frame,
+        world_frame=options.world_frame,
+    )
+    result = convert_tum(
+        sequence,
+        camera,
+        options.output,
+        conversion,
+        detections,
+        # without a terminal there is nothing to draw on
+        progress=lambda frames: tqdm(frames, unit='image', disable=None),
+    )
+    report(sequence, result, options, time.monotonic() - begin)
+    return 0
+
+
+def report(
+    sequence: TumSequence, result: ConversionResult, options: argparse.Namespace, elapsed_s: float
+) -> None:
+    """Say what was written, and which frames lack something."""
+    print(
+        f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
+        f'{result.detections} detection messages in {elapsed_s:.1f} s'
+    )
+    if len(sequence.trajectory) == 0:
+        print('the folder has no ground truth')
+    elif missing := result.images - result.poses:
+        print(f'without ground truth within 20 ms, and so without pose: {missing} images')
+    if options.detections is not None and (missing := result.images - result.detections):
+        print(f'without recorded detections, and so without message: {missing} images')
+
+
+def _without_ros_args(args: Sequence[str]) -> list[str]:
+    """Drop ``--ros-args ... [--]``, which launch appends to every executable."""
+    kept: list[str] = []
+    in_ros_args = False
+    for arg in args:
+        if in_ros_args:
+            in_ros_args = arg != '--'
+        elif arg == '--ros-args':
+            in_ros_args = True
+        else:
+            kept.append(arg)
+    return kept
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading recordings of rosbag2 (sqlite3 and mcap) without a sourced ROS."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos
+from rosbags.rosbag2 import Reader, ReaderError
+
+from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic of a recording.
+
+    Parameters
+    ----------
+    name, msgtype : str
+        As ``/image`` and ``sensor_msgs/msg/Image``.
+    message_count : int
+        How many messages the recording says it holds.
+    offered_qos : tuple of Qos
+        What its publishers offered when it was recorded; empty if that is not known.
+    type_hash : str
+        The type's RIHS01 hash; empty if not recorded.
+    """
+
+    name: str
+    msgtype: str
+    message_count: int
+    offered_qos: tuple[Qos, ...] = ()
+    type_hash: str = ''
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One recorded message, still serialized.
+
+    Parameters
+    ----------
+    topic : str
+        Its topic's name.
+    stamp_ns : int
+        When it was recorded [ns].
+    data : bytes
+        CDR, with its four-byte header.
+    """
+
+    topic: str
+    stamp_ns: int
+    data: bytes
+
+
+class BagReader:
+    """Reads a rosbag2 folder, or a single .mcap or .db3 file, in order of recording.
+
+    A context manager. Messages are streamed: memory does not grow with the recording.
+    Compressed files (zstd) are unpacked into the temporary folder while it is open.
+
+    Parameters
+    ----------
+    path : str or Path
+        The recording.
+
+    Raises
+    ------
+    DatasetError
+        On entry, if the recording cannot be read: path and reason are named.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._reader: Reader | None = None
+        self._topics: dict[str, BagTopic] = {}
+
+    def __enter__(self) -> Self:
+        """Open the recording."""
+        self._check_path()
+        try:
+            reader = Reader(self.path)
+            reader.open()
+        except Exception as error:  # whatever the library meets in a broken file
+            raise self._unreadable(error) from error
+        self._reader = reader
+        try:
+            self._topics = self._collect_topics(reader.connections)
+        except BaseException:
+            reader.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the recording."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    @property
+    def topics(self) -> Mapping[str, BagTopic]:
+        """Topics by name."""
+        return self._topics
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages on all topics."""
+        return sum(topic.message_count for topic in self._topics.values())
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the first message [ns]; 0 for an empty recording."""
+        return self._open_reader.start_time if self.message_count else 0
+
+    @property
+    def end_ns(self) -> int:
+        """Stamp of the last message [ns]; 0 for an empty recording."""
+        # the library's end lies one nanosecond after the last message
+        return self._open_reader.end_time - 1 if self.message_count else 0
+
+    def topic(self, name: str) -> BagTopic:
+        """Return a topic.
+
+        Raises
+        ------
+        DatasetError
+            If the recording has none of that name; those it has are listed.
+        """
+        if name not in self._topics:
+            there = ', '.join(
+                f'{topic.name} ({topic.msgtype})' for topic in self._topics.values()
+            )
+            raise DatasetError(f'{self.path}: has no topic {name}; it has {there or "none"}')
+        return self._topics[name]
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """Yield messages in the order of their stamps.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            Names of topics; all of them if not given.
+        start_ns, stop_ns : int, optional
+            Only messages at or after the one, and before the other [ns].
+
+        Yields
+        ------
+        BagMessage
+
+        Raises
+        ------
+        DatasetError
+            For an unknown topic, or where the recording turns out to be broken.
+        """
+        names = self._topics if topics is None else topics
+        connections = self._connections({self.topic(name).name for name in names})
+        if not connections:
+            return
+        stream = self._open_reader.messages(connections, start_ns, stop_ns)
+        while True:
+            try:
+                connection, stamp_ns, data = next(stream)
+            except StopIteration:
+                return
+            except Exception as error:  # whatever the library meets in a broken file
+                raise self._unreadable(error) from error
+            yield BagMessage(connection.topic, stamp_ns, bytes(data))
+
+    def deserialize(self, message: BagMessage) -> Any:
+        """Turn a message's bytes into an object with the fields of its type.
+
+        Raises
+        ------
+        DatasetError
+            If the type is not known here, was recorded with another definition, or the
+            bytes do not fit it.
+        """
+        topic = self.topic(message.topic)
+        store = typestore()
+        if topic.msgtype not in store.types:
+            raise DatasetError(f'{self.path}: {topic.name} has an unknown type, {topic.msgtype}')
+        if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
+            raise DatasetError(
+                f'{self.path}: {topic.name} was recorded with another definition of '
+                f'{topic.msgtype} than the one known here'
+            )
+        try:
+            return store.deserialize_cdr(message.data, topic.msgtype)
+        except Exception as error:  # the library raises what the bytes happen to cause
+            raise DatasetError(
+                f'{self.path}: a message of {topic.name} at {message.stamp_ns} is no '
+                f'{topic.msgtype}: {error}'
+            ) from error
+
+    @property
+    def _open_reader(self) -> Reader:
+        if self._reader is None:
+            raise RuntimeError('the recording is not open: use it in a with statement')
+        return self._reader
+
+    def _check_path(self) -> None:
+        if not self.path.exists():
+            raise DatasetError(f'{self.path}: no such recording')
+        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
+            raise DatasetError(
+                f'{self.path}: no metadata.yaml in this folder, so it is no rosbag2 recording, '
+                f'or one that was cut off: `ros2 bag reindex {self.path}` rebuilds it'
+            )
+
+    def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
+        topics: dict[str, BagTopic] = {}
+        for connection in connections:
+            topic = _topic_of(connection)
+            known = topics.setdefault(topic.name, topic)
+            if known is topic:
+                continue
+            if known.msgtype != topic.msgtype:
+                raise DatasetError(
+                    f'{self.path}: {topic.name} has two types, {known.msgtype} and {topic.msgtype}'
+                )
+            topics[topic.name] = BagTopic(
+                topic.name,
+                topic.msgtype,
+                known.message_count + topic.message_count,
+                known.offered_qos + topic.offered_qos,
+                known.type_hash or topic.type_hash,
+            )
+        return topics
+
+    def _connections(self, names: Collection[str]) -> list[Connection]:
+        """Return the library's handles of topics, of the recording and of each of its files.
+
+        The library drops a file's messages without a word where the file's QoS differs from
+        metadata.yaml's, which people edit to repair QoS; the files' own handles always match.
+        """
+        reader = self._open_reader
+        files = getattr(reader.storage, 'storages', [])
+        handles = [*reader.connections, *(one for file in files for one in file.connections)]
+        return [handle for handle in handles if handle.topic in names]
+
+    def _unreadable(self, error: Exception) -> DatasetError:
+        name = '' if isinstance(error, ReaderError) else f'{type(error).__name__}: '
+        return DatasetError(f'{self.path}: cannot be read as a rosbag2 recording: {name}{error}')
+
+
+def _topic_of(connection: Connection) -> BagTopic:
+    assert isinstance(connection.ext, ConnectionExtRosbag2)
+    return BagTopic(
+        connection.topic,
+        connection.msgtype,
+        connection.msgcount,
+        tuple(connection.ext.offered_qos_profiles),
+        connection.digest,
+    )

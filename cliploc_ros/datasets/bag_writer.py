@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Writing recordings of rosbag2 (sqlite3 and mcap) without a sourced ROS."""
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
+from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.errors import DatasetError
+
+STORAGES: Mapping[str, StoragePlugin] = {
+    'sqlite3': StoragePlugin.SQLITE3,
+    'mcap': StoragePlugin.MCAP,
+}
+
+_INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+
+#: What camera drivers and detectors offer: rclcpp's default, which best-effort and reliable
+#: subscribers both match.
+RELIABLE_QOS = Qos(
+    QosHistory.KEEP_LAST,
+    10,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    _INFINITE,
+    _INFINITE,
+    QosLiveliness.AUTOMATIC,
+    _INFINITE,
+    False,
+)
+#: What publishers of maps and static transforms offer: late subscribers get the last one.
+LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+
+
+class BagWriter:
+    """Writes a rosbag2 folder as Jazzy does (metadata version 9).
+
+    A context manager. The recording is built beside its place and moved there when it is
+    complete; if the block raises, nothing is left behind.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder to make. Its parent must exist.
+    storage : str
+        ``sqlite3`` or ``mcap``.
+
+    Raises
+    ------
+    DatasetError
+        If the path exists or cannot be written, a full disk among the reasons.
+    """
+
+    def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:
+        self.path = Path(path)
+        if storage not in STORAGES:
+            raise DatasetError(f'storage {storage!r} is none of {", ".join(STORAGES)}')
+        self._storage = STORAGES[storage]
+        self._staging: Path | None = None
+        self._writer: Writer | None = None
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> Self:
+        """Begin the recording beside its place."""
+        self._check_free()
+        prefix = f'.{self.path.name}.'
+        try:
+            staging = tempfile.mkdtemp(prefix=prefix, suffix='.partial', dir=self.path.parent)
+            self._staging = Path(staging)
+            writer = Writer(
+                self._staging / self.path.name, version=9, storage_plugin=self._storage
+            )
+            writer.open()
+        except (OSError, sqlite3.Error, WriterError) as error:
+            self._discard()
+            raise self._unwritable(error) from error
+        except BaseException:  # Ctrl-C
+            self._discard()
+            raise
+        self._writer = writer
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Complete the recording and move it to its place, or remove it."""
+        writer, self._writer = self._writer, None
+        try:
+            if writer is not None and kind is None:
+                self._finish(writer)
+            elif writer is not None:
+                with suppress(Exception):  # the error that ended the block is the one to report
+                    writer.abort()
+        finally:
+            self._discard()
+
+    def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
+        """Declare a topic before its first message.
+
+        Parameters
+        ----------
+        name, msgtype : str
+            As ``/image`` and ``sensor_msgs/msg/Image``.
+        qos : Qos
+            What its publisher would offer.
+        """
+        try:
+            self._connections[name] = self._open_writer.add_connection(
+                name, msgtype, typestore=typestore(), offered_qos_profiles=[qos]
+            )
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Append a message.
+
+        Parameters
+        ----------
+        topic : str
+            A declared topic.
+        stamp_ns : int
+            Time of the recording [ns].
+        message : object
+            An object of the typestore's type, or its bytes.
+        """
+        connection = self._connections[topic]
+        data = (
+            message
+            if isinstance(message, bytes)
+            else typestore().serialize_cdr(message, connection.msgtype)
+        )
+        try:
+            self._open_writer.write(connection, stamp_ns, data)
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
+
+    @property
+    def _open_writer(self) -> Writer:
+        if self._writer is None:
+            raise RuntimeError('the recording is not open: use it in a with statement')
+        return self._writer
+
+    def _check_free(self) -> None:
+        if self.path.exists() or self.path.is_symlink():
+            raise DatasetError(f'{self.path}: exists already, and is not overwritten')
+        if not self.path.parent.is_dir():
+            raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
+
+    def _finish(self, writer: Writer) -> None:
+        assert self._staging is not None
+        try:
+            writer.close()
+            self._check_free()  # it may have appeared meanwhile
+            (self._staging / self.path.name).rename(self.path)
+        except (OSError, sqlite3.Error) as error:
+            with suppress(Exception):
+                writer.abort()
+            raise self._unwritable(error) from error
+
+    def _discard(self) -> None:
+        if self._staging is not None:
+            shutil.rmtree(self._staging, ignore_errors=True)
+            self._staging = None
+
+    def _unwritable(self, error: Exception) -> DatasetError:
+        reason = getattr(error, 'strerror', None) or str(error)
+        return DatasetError(f'{self.path}: cannot be written: {reason}; nothing was left behind')

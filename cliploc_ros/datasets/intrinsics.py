@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Camera intrinsics of the TUM sequences, and of one's own from a camera.json."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.errors import CameraError, DatasetError
+
+
+def _tum_camera(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Camera:
+    return Camera(640, 480, fx, fy, cx, cy, 'plumb_bob', distortion)
+
+
+#: The dataset's published values (ROS calibration of the colour cameras).
+PRESETS: Mapping[str, Camera] = {
+    'fr1': _tum_camera(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    'fr2': _tum_camera(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    'fr3': _tum_camera(535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0),
+}
+
+_REQUIRED = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
+_OPTIONAL = ('distortion_model', 'd')
+_SEQUENCE_NAME = re.compile(r'(?<![a-z])(?:freiburg|fr)([123])(?![0-9])', re.IGNORECASE)
+
+
+def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
+    """Find the camera of a sequence.
+
+    Parameters
+    ----------
+    choice : str or None
+        A preset's name (fr1, fr2, fr3), a camera.json, or None to look in the folder for
+        a ``camera.json`` and then at its name for the TUM camera.
+    folder : Path
+        The sequence's folder.
+
+    Returns
+    -------
+    camera : Camera
+    origin : str
+        Where it comes from, to be shown to the user.
+
+    Raises
+    ------
+    DatasetError
+        If nothing says which camera it was, or the file cannot be used.
+    """
+    if choice is not None and choice in PRESETS:
+        return PRESETS[choice], f'preset {choice}'
+    if choice is not None:
+        return read_camera(choice), choice
+    if (folder / 'camera.json').exists():
+        return read_camera(folder / 'camera.json'), str(folder / 'camera.json')
+    match = _SEQUENCE_NAME.search(folder.resolve().name)
+    if match is None:
+        raise DatasetError(
+            f'{folder}: the folder name does not say which camera this is; give '
+            '--intrinsics fr1, fr2, fr3 or a camera.json'
+        )
+    return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
+
+
+def read_camera(path: str | Path) -> Camera:
+    """Read a camera.json.
+
+    It is a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and, where
+    there is distortion, ``distortion_model`` and its coefficients ``d``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Camera
+
+    Raises
+    ------
+    DatasetError
+        Naming the file and the field that is missing, unknown or impossible.
+    """
+    path = Path(path)
+    values = _load_mapping(path)
+    if unknown := sorted(set(values) - {*_REQUIRED, *_OPTIONAL}):
+        raise DatasetError(f'{path}: unknown field {unknown[0]!r}')
+    if missing := [name for name in _REQUIRED if name not in values]:
+        raise DatasetError(f'{path}: field {missing[0]!r} is missing')
+    numbers = {name: _number(values[name], name, path) for name in _REQUIRED[2:]}
+    try:
+        return Camera(
+            width=_pixels(values['width'], 'width', path),
+            height=_pixels(values['height'], 'height', path),
+            distortion_model=_model(values.get('distortion_model', 'plumb_bob'), path),
+            distortion=_coefficients(values.get('d', []), path),
+            **numbers,
+        )
+    except CameraError as error:
+        raise DatasetError(f'{path}: {error}') from error
+
+
+def _load_mapping(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text(encoding='utf-8'))
+    except FileNotFoundError:
+        raise DatasetError(
+            f'{path}: no such camera file; give fr1, fr2, fr3 or a camera.json'
+        ) from None
+    except (OSError, ValueError) as error:
+        raise DatasetError(f'{path}: cannot be read as JSON: {error}') from error
+    if not isinstance(values, dict):
+        raise DatasetError(f'{path}: expected a mapping with {", ".join(_REQUIRED)}')
+    return values
+
+
+def _number(value: Any, name: str, path: Path) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise DatasetError(f'{path}: {name} is {value!r}, not a number')
+    return float(value)
+
+
+def _pixels(value: Any, name: str, path: Path) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise DatasetError(f'{path}: {name} is {value!r}, not a number of pixels')
+    return value
+
+
+def _model(value: Any, path: Path) -> str:
+    if not isinstance(value, str):
+        raise DatasetError(f'{path}: distortion_model is {value!r}, not a name')
+    return value
+
+
+def _coefficients(values: Any, path: Path) -> tuple[float, ...]:
+    if not isinstance(values, list):
+        raise DatasetError(f'{path}: d is {values!r}, not a list of numbers')
+    return tuple(_number(value, 'd', path) for value in values)

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading TUM RGB-D folders (Sturm et al. 2012): rgb.txt, rgb/, groundtruth.txt."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.datasets.trajectory import Trajectory
+from cliploc_ros.errors import DatasetError
+
+NS_PER_S = 1_000_000_000
+#: builtin_interfaces/Time holds seconds in an int32.
+MAX_STAMP_S = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class TumSequence:
+    """A TUM RGB-D folder: colour images with stamps, and where the camera was.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder it was read from.
+    stamps_ns : tuple of int
+        Stamp of each image [ns], exactly as its decimal text says, strictly increasing.
+    image_paths : tuple of Path
+        The image files, one a stamp. They exist.
+    trajectory : Trajectory
+        Ground truth, map from camera; empty if the folder has no groundtruth.txt.
+    """
+
+    folder: Path
+    stamps_ns: tuple[int, ...]
+    image_paths: tuple[Path, ...]
+    trajectory: Trajectory
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self.stamps_ns)
+
+    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
+        """Return ``map_from_camera`` (4, 4) at a stamp; None without a sample within 20 ms."""
+        return self.trajectory.pose_at(stamp_ns)
+
+    def every(self, step: int) -> 'TumSequence':
+        """Return the sequence with each ``step``-th image only, the first included.
+
+        Raises
+        ------
+        DatasetError
+            If ``step`` is less than 1.
+        """
+        if step < 1:
+            raise DatasetError(f'every {step}th image makes no sense: give 1 or more')
+        return replace(
+            self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step]
+        )
+
+
+def read_tum(folder: str | Path) -> TumSequence:
+    """Read a TUM RGB-D folder; the images themselves stay on disk.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Holds ``rgb.txt``, the images it lists, and perhaps ``groundtruth.txt``.
+
+    Returns
+    -------
+    TumSequence
+
+    Raises
+    ------
+    DatasetError
+        Naming the file and line that cannot be used.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DatasetError(f'{folder}: no such folder')
+    stamps_ns, image_paths = _read_image_list(folder / 'rgb.txt')
+    truth = folder / 'groundtruth.txt'
+    trajectory = read_tum_trajectory(truth) if truth.exists() else _empty_trajectory()
+    return TumSequence(folder, stamps_ns, image_paths, trajectory)
+
+
+def read_tum_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
+
+    Lines may come in any order; of equal stamps the first counts.
+
+    Parameters
+    ----------
+    path : str or Path
+        The text file; ``#`` begins a comment.
+
+    Returns
+    -------
+    Trajectory
+        Quaternions normalized.
+
+    Raises
+    ------
+    DatasetError
+        Naming file and line: not eight numbers, or a quaternion far from unit norm.
+    """
+    path = Path(path)
+    samples: dict[int, list[float]] = {}
+    for where, line in _data_lines(path):
+        fields = line.replace(',', ' ').split()
+        if len(fields) != 8:
+            raise DatasetError(
+                f'{where}: expected timestamp tx ty tz qx qy qz qw, got {len(fields)} fields'
+            )
+        samples.setdefault(parse_stamp_ns(fields[0], where), _parse_pose(fields[1:], where))
+    if not samples:
+        return _empty_trajectory()
+    stamps = sorted(samples)
+    rows = np.array([samples[stamp] for stamp in stamps])
+    quats_xyzw = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    return Trajectory(np.array(stamps, dtype=np.int64), rows[:, :3], quats_xyzw)
+
+
+def parse_stamp_ns(text: str, where: str) -> int:
+    """Turn decimal seconds into nanoseconds without going through a float.
+
+    Parameters
+    ----------
+    text : str
+        Seconds, as ``1341847980.722988`` or ``1.341847980722988e9``.
+    where : str
+        File and line, for the message.
+
+    Returns
+    -------
+    int
+        Nanoseconds.
+
+    Raises
+    ------
+    DatasetError
+        If the text is no number, or no time that ROS can express.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise DatasetError(f'{where}: {text!r} is no timestamp in seconds') from None
+    if not seconds.is_finite() or not 0 <= seconds <= MAX_STAMP_S:
+        raise DatasetError(f'{where}: timestamp {text} is outside 0 to {MAX_STAMP_S} s')
+    return int((seconds * NS_PER_S).to_integral_value())
+
+
+def _read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
+    if not path.exists():
+        raise DatasetError(f'{path}: not there; a TUM folder lists its images in rgb.txt')
+    stamps_ns: list[int] = []
+    image_paths: list[Path] = []
+    for where, line in _data_lines(path):
+        fields = line.split(maxsplit=1)
+        if len(fields) != 2:
+            raise DatasetError(f'{where}: expected timestamp and file name, got {line!r}')
+        stamp_ns = parse_stamp_ns(fields[0], where)
+        if stamps_ns and stamp_ns <= stamps_ns[-1]:
+            raise DatasetError(f'{where}: timestamp {fields[0]} does not come after the last one')
+        image_path = path.parent / fields[1]
+        if not image_path.is_file():
+            raise DatasetError(f'{where}: image {image_path} does not exist')
+        stamps_ns.append(stamp_ns)
+        image_paths.append(image_path)
+    if not stamps_ns:
+        raise DatasetError(f'{path}: lists no images')
+    return tuple(stamps_ns), tuple(image_paths)
+
+
+def _parse_pose(fields: list[str], where: str) -> list[float]:
+    try:
+        values = [float(field) for field in fields]
+    except ValueError:
+        raise DatasetError(f'{where}: pose {" ".join(fields)!r} is not seven numbers') from None
+    if not np.all(np.isfinite(values)):
+        raise DatasetError(f'{where}: pose {" ".join(fields)!r} is not finite')
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1) > 0.05:
+        raise DatasetError(f'{where}: quaternion qx qy qz qw has norm {norm:.3f}, not 1')
+    return values
+
+
+def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield 'file:line' and the text of each line that is neither blank nor a comment."""
+    try:
+        text = path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f'{path}: cannot be read: {error}') from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith('#'):
+            yield f'{path}:{number}', stripped
+
+
+def _empty_trajectory() -> Trajectory:
+    return Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 4)))
