@@ -31,3 +31,55 @@ class Detections:
     def __len__(self) -> int:
         """Return the number of detections."""
         return len(self.class_ids)
+
+    def select(self, rows: NDArray[np.int64]) -> 'Detections':
+        """Return the detections of some rows, in their order."""
+        return Detections(self.bboxes_xyxy[rows], tuple(self.class_ids[i] for i in rows),
+                          self.scores[rows])
+
+    def usable(self, width: int, height: int, limit: int) -> 'Detections':
+        """Return the detections that can be localized with.
+
+        Boxes that are not finite, have no area or lie wholly outside the image are left out; of
+        the others the most confident ones stay, in their order. Boxes that reach over the
+        border stay as they are.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size [px].
+        limit : int
+            The most detections to keep: what follows is bounded by it.
+        """
+        left, top, right, bottom = self.bboxes_xyxy.reshape(-1, 4).T
+        with np.errstate(invalid='ignore', over='ignore'):
+            sound = (np.isfinite(self.bboxes_xyxy).all(axis=1) & np.isfinite(self.scores)
+                     & (right > left) & (bottom > top)
+                     & (right > 0) & (bottom > 0) & (left < width) & (top < height))
+            # A box far larger than its image is a mistake of units.
+            sound &= (right - left < 3 * width) & (bottom - top < 3 * height)
+        rows = np.nonzero(sound)[0]
+        best = rows[np.argsort(-self.scores[rows], kind='stable')[:limit]]
+        return self.select(np.sort(best))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A frame's detections with its camera and time.
+
+    Parameters
+    ----------
+    camera : Camera
+    detections : Detections
+        n of them.
+    similarities : ndarray (n, L) or None
+        Cosine similarity of each detection's crop with the label of each of the map's L
+        landmarks, in the map's order. None where only classes are known.
+    stamp_ns : int
+        When the image was taken [ns].
+    """
+
+    camera: Camera
+    detections: Detections
+    similarities: NDArray[np.float32] | None = None
+    stamp_ns: int = 0

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The camera: intrinsics, distortion, and the way from its pixels to the normalized plane."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import CameraError
+
+# Coefficients of each distortion model of sensor_msgs/CameraInfo.
+_COEFFICIENT_COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14),
+                       'equidistant': (4,)}
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+# Where redistorting misses a pixel by more than this, the model cannot be inverted there.
+_MAX_ROUND_TRIP_PX = 0.1
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with distortion, as in sensor_msgs/CameraInfo.
+
+    Parameters
+    ----------
+    width, height : int
+        Image size [px].
+    fx, fy, cx, cy : float
+        Focal lengths and principal point [px].
+    distortion_model : str
+        'plumb_bob', 'rational_polynomial' or 'equidistant'; '' with no coefficients.
+    distortion : tuple of float
+        The model's coefficients, in OpenCV's order.
+
+    Raises
+    ------
+    CameraError
+        For values that no camera can have.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = ''
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse values that no camera can have."""
+        if self.width <= 0 or self.height <= 0:
+            raise CameraError(f'image size {self.width}x{self.height} is not positive')
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not np.all(np.isfinite(intrinsics)) or self.fx <= 0.0 or self.fy <= 0.0:
+            raise CameraError(
+                f'fx={self.fx:g} fy={self.fy:g} cx={self.cx:g} cy={self.cy:g}: focal lengths must '
+                'be positive and all values finite (is the camera calibrated?)')
+        if not np.all(np.isfinite(self.distortion)):
+            raise CameraError(f'distortion {self.distortion} has values that are not finite')
+        if any(self.distortion):
+            self._check_distortion_model()
+
+    def _check_distortion_model(self) -> None:
+        counts = _COEFFICIENT_COUNTS.get(self.distortion_model)
+        if counts is None:
+            raise CameraError(f"distortion model '{self.distortion_model}' is none of "
+                              f"{', '.join(_COEFFICIENT_COUNTS)}")
+        if len(self.distortion) not in counts:
+            raise CameraError(f"distortion model '{self.distortion_model}' has "
+                              f'{" or ".join(map(str, counts))} coefficients, '
+                              f'not {len(self.distortion)}')
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """Return the intrinsic matrix K (3, 3) [px]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def normalize_points(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return pixels (n, 2) as undistorted points (n, 2) of the plane z = 1.
+
+        Rows where the distortion model has no inverse are NaN.
+        """
+        points_px = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
+        if not any(self.distortion) or len(points_px) == 0:
+            return (points_px - (self.cx, self.cy)) / (self.fx, self.fy)
+        coefficients = np.array(self.distortion)
+        pixels = np.ascontiguousarray(points_px[:, None])
+        if self.distortion_model == 'equidistant':
+            normalized = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients)
+        else:
+            normalized = cv2.undistortPointsIter(pixels, self.matrix, coefficients, None, None,
+                                                 _UNDISTORT_CRITERIA)
+        normalized = normalized.reshape(-1, 2)
+        missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
+        normalized[~(missed <= _MAX_ROUND_TRIP_PX)] = np.nan
+        return normalized
+
+    def project_normalized(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (distorted) pixels (n, 2) of points (n, 2) of the plane z = 1."""
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        if not any(self.distortion) or len(points) == 0:
+            return points * (self.fx, self.fy) + (self.cx, self.cy)
+        coefficients, zero = np.array(self.distortion), np.zeros(3)
+        if self.distortion_model == 'equidistant':
+            pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(points[:, None]),
+                                               self.matrix, coefficients)
+        else:
+            solid = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+            pixels, _ = cv2.projectPoints(solid[:, None], zero, zero, self.matrix, coefficients)
+        return pixels.reshape(-1, 2)
+
+    def normalize_bboxes(self, bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return boxes (n, 4) [px] as undistorted boxes (n, 4) of the plane z = 1.
+
+        Each edge goes where its midpoint goes: there the ellipse inscribed in the box touches.
+        """
+        left, top, right, bottom = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4).T
+        middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
+        midpoints = np.stack([left, middle_y, middle_x, top, right, middle_y, middle_x, bottom],
+                             axis=-1)
+        points = self.normalize_points(midpoints.reshape(-1, 2)).reshape(-1, 4, 2)
+        return np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]],
+                        axis=-1)

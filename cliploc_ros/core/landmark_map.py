@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The map: ellipsoidal landmarks, each with a label in natural language."""
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.ellipsoid import shape_matrices
+from cliploc_ros.core.parameter_file import read_parameter_file
+from cliploc_ros.errors import MapError
+
+_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
+_MAX_TEXT_LENGTH = 1000
+# Squares and fourth powers of lengths in this range stay far from under- and overflow.
+_SEMI_AXIS_RANGE_M = (1e-4, 1e4)
+_MAX_COORDINATE_M = 1e7
+_MAX_QUATERNION_NORM_ERROR = 0.01
+
+
+@dataclass(frozen=True)
+class LandmarkMap:
+    """Landmarks of one map frame. L is their number, at least 1.
+
+    Parameters
+    ----------
+    frame_id : str
+        The frame in which centres and orientations are given.
+    landmark_ids, labels, class_ids : tuple of str
+        Name, description in natural language and detector class of each landmark.
+    centers : ndarray (L, 3)
+        [m].
+    semi_axes : ndarray (L, 3)
+        Half lengths along each landmark's own axes [m].
+    quats_xyzw : ndarray (L, 4)
+        Unit quaternions that rotate landmark axes into map axes.
+    """
+
+    frame_id: str
+    landmark_ids: tuple[str, ...]
+    labels: tuple[str, ...]
+    class_ids: tuple[str, ...]
+    centers: NDArray[np.float64]
+    semi_axes: NDArray[np.float64]
+    quats_xyzw: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of landmarks."""
+        return len(self.landmark_ids)
+
+    @property
+    def shapes(self) -> NDArray[np.float64]:
+        """Return the shape matrices (L, 6), see cliploc_ros.core.ellipsoid."""
+        return shape_matrices(self.semi_axes, self.quats_xyzw)
+
+    @staticmethod
+    def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':
+        """Read a map from a ROS 2 parameter file.
+
+        Raises
+        ------
+        MapError
+            Names the file, the landmark and the field to mend.
+        """
+        tree = read_parameter_file(path)
+        found = [node['ros__parameters']['map'] for node in tree.values()
+                 if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
+                 and 'map' in node['ros__parameters']]
+        if len(found) != 1:
+            raise MapError(f"{path}: {'no' if not found else 'more than one'} map: expected one "
+                           "'map' under '/**: ros__parameters:'")
+        return LandmarkMap.from_mapping(found[0], str(path))
+
+    @staticmethod
+    def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
+        """Build a map from a tree with the keys frame_id and landmarks.
+
+        Parameters
+        ----------
+        tree : mapping
+            As in the map file, below the key 'map'.
+        source : str
+            Where it came from, for messages.
+
+        Raises
+        ------
+        MapError
+            Names the source, the landmark and the field to mend.
+        """
+        _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
+        frame_id = _text(tree['frame_id'], f'{source}: map: frame_id')
+        landmarks = tree['landmarks']
+        if not isinstance(landmarks, Mapping) or not landmarks:
+            raise MapError(f'{source}: map: landmarks: the map is empty')
+        rows = [_landmark(landmark_id, fields, source)
+                for landmark_id, fields in landmarks.items()]
+        labels, class_ids, centers, semi_axes, quats = zip(*rows, strict=True)
+        quats_xyzw = np.array(quats)
+        quats_xyzw /= np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
+        return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
+                           np.array(centers), np.array(semi_axes), quats_xyzw)
+
+
+def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
+    """Return one landmark's validated fields, in the order of _FIELDS."""
+    where = f"{source}: landmark '{landmark_id}'"
+    if not isinstance(landmark_id, str) or not landmark_id or '.' in landmark_id:
+        # a dot would part the name when the map comes as ROS parameters
+        raise MapError(f'{where}: an id must be text without dots')
+    _check_keys(fields, _FIELDS, where)
+    semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
+    low, high = _SEMI_AXIS_RANGE_M
+    if not all(low <= axis <= high for axis in semi_axes):
+        raise MapError(f'{where}: semi_axes: {semi_axes} must lie within {low:g} and {high:g} m')
+    center = _numbers(fields['center'], 3, f'{where}: center')
+    if max(map(abs, center)) > _MAX_COORDINATE_M:
+        raise MapError(f'{where}: center: {center} is farther than {_MAX_COORDINATE_M:g} m away')
+    quat_xyzw = _numbers(fields['orientation'], 4, f'{where}: orientation')
+    if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
+        raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has the norm '
+                       f'{math.hypot(*quat_xyzw):.3g}, not 1')
+    return (_text(fields['label'], f'{where}: label'),
+            _text(fields['class_id'], f'{where}: class_id'), center, semi_axes, quat_xyzw)
+
+
+def _check_keys(tree: Any, expected: tuple[str, ...], where: str) -> None:
+    if not isinstance(tree, Mapping):
+        raise MapError(f'{where}: expected the fields {", ".join(expected)}')
+    missing = [key for key in expected if key not in tree]
+    if missing:
+        raise MapError(f'{where}: missing field: {", ".join(missing)}')
+    unknown = [str(key) for key in tree if key not in expected]
+    if unknown:
+        raise MapError(f'{where}: unknown field: {", ".join(unknown[:5])} '
+                       f'(known: {", ".join(expected)})')
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise MapError(f'{where}: must be text that is not empty (quote numbers and yes/no), '
+                       f'not {value!r}')
+    if len(value) > _MAX_TEXT_LENGTH:
+        raise MapError(f'{where}: longer than {_MAX_TEXT_LENGTH} characters')
+    return value
+
+
+def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
+    values = tuple(value) if isinstance(value, list | tuple) or hasattr(value, 'tolist') else ()
+    numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    if len(values) != count or not numeric:
+        raise MapError(f'{where}: must be {count} numbers, not {_shorten(value)}')
+    if not all(map(math.isfinite, values)):
+        raise MapError(f'{where}: {_shorten(value)} has values that are not finite')
+    return tuple(map(float, values))
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + '...'

@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How to relocalize: every choice the method leaves to its user."""
+
+import math
+from dataclasses import dataclass
+
+from cliploc_ros.core.association import MATCHINGS
+from cliploc_ros.errors import OptionsError
+
+ALGORITHMS = ('bf', 'ransac', 'prosac', 'b-prosac')
+
+
+@dataclass(frozen=True)
+class RelocalizerOptions:
+    """Options of the method; the defaults are the paper's where the paper has one.
+
+    Parameters
+    ----------
+    matching : str
+        'class', 'clip' or 'hybrid': what makes a correspondence candidate.
+    algorithm : str
+        'bf', 'ransac', 'prosac' or 'b-prosac': which minimal samples are tried.
+    k : int
+        Landmarks retrieved for each crop.
+    iterations : int
+        Minimal samples drawn; bf tries them all instead.
+    iou_threshold : float
+        A detection and a landmark that overlap more than this (0 to 1) are an inlier.
+    random_seed : int
+        Equal seed and input give equal output; below 0 every search differs.
+    time_budget_s : float
+        bf stops after this long [s] and says how much it covered.
+    min_inliers : int
+        Fewer inliers (of different landmarks) are refused.
+    min_evidence : float
+        Less evidence is refused, see cliploc_ros.core.acceptance.
+
+    Raises
+    ------
+    OptionsError
+        Names the option and what it allows.
+    """
+
+    matching: str = 'hybrid'
+    algorithm: str = 'b-prosac'
+    k: int = 3
+    iterations: int = 500
+    iou_threshold: float = 0.2
+    random_seed: int = 0
+    time_budget_s: float = math.inf
+    min_inliers: int = 4
+    min_evidence: float = 2.5
+
+    def __post_init__(self) -> None:
+        """Refuse values outside what each option allows."""
+        _check_choice('matching', self.matching, MATCHINGS)
+        _check_choice('algorithm', self.algorithm, ALGORITHMS)
+        if self.matching == 'class' and 'prosac' in self.algorithm:
+            raise OptionsError(f"algorithm '{self.algorithm}' orders candidates by similarity, "
+                               "which matching 'class' has none of: use bf or ransac")
+        _check_range('k', self.k, 1, math.inf)
+        _check_range('iterations', self.iterations, 1, 10_000_000)
+        _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)
+        _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
+        _check_range('min_inliers', self.min_inliers, 3, math.inf)
+        _check_range('min_evidence', self.min_evidence, 0.0, math.inf)
+
+    @property
+    def needs_similarities(self) -> bool:
+        """Return whether crops must be compared with labels."""
+        return self.matching != 'class'
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise OptionsError(f"{name}: '{value}' is none of {', '.join(choices)}")
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')

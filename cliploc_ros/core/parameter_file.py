@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading a ROS 2 parameter file without ROS, and without trusting it.
+
+The tree is built from the parser's events: nothing is recursive, nothing is instantiated, and
+size and depth are bounded, so that a hostile file ends in an error and not in a crash.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cliploc_ros.errors import MapError
+
+MAX_FILE_BYTES = 256 * 1024 * 1024
+_MAX_DEPTH = 16
+# Words that YAML 1.1, and with it ROS, reads as truth values.
+_TRUE = frozenset({'y', 'yes', 'true', 'on'})
+_FALSE = frozenset({'n', 'no', 'false', 'off'})
+_QUOTED_STYLES = ('"', "'", '|', '>')
+# Longer digits are no number that anybody measured; 300 of them would overflow a float.
+_MAX_NUMBER_LENGTH = 40
+_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the tree of a YAML file: dicts, lists, str, int, float, bool and None.
+
+    Raises
+    ------
+    MapError
+        The file cannot be read, is too large, is no YAML mapping, is nested too deeply, has an
+        alias or a repeated key. The message names file and line.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise MapError(f'{path}: larger than {MAX_FILE_BYTES // 2**20} MiB')
+        text = path.read_bytes().decode('utf-8')
+    except OSError as error:
+        raise MapError(f'{path}: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise MapError(f'{path}: not a text file in UTF-8 (byte {error.start})') from error
+    try:
+        tree = _build_tree(text)
+    except yaml.YAMLError as error:
+        raise MapError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from error
+    except _TreeError as error:
+        raise MapError(f'{path}: {error}') from error
+    if not isinstance(tree, dict):
+        raise MapError(f'{path}: holds no YAML mapping')
+    return tree
+
+
+class _TreeError(Exception):
+    """What the YAML grammar allows and a parameter file must not have."""
+
+
+def _build_tree(text: str) -> Any:
+    """Return the one document of a YAML text, from its events."""
+    root: list[Any] = []
+    # the open collections, innermost last, each with the key that awaits its value
+    stack: list[tuple[Any, list[str]]] = [(root, [])]
+    for event in yaml.parse(text, Loader=_LOADER):
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise _TreeError(f'line {line}: an alias (*{event.anchor}); write the value out')
+        if isinstance(event, yaml.ScalarEvent):
+            _add(stack[-1], _scalar(event), line)
+        elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
+            if len(stack) > _MAX_DEPTH:
+                raise _TreeError(f'line {line}: nested deeper than {_MAX_DEPTH} levels')
+            collection: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
+            _add(stack[-1], collection, line)
+            stack.append((collection, []))
+        elif isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
+            stack.pop()
+    if len(root) > 1:
+        raise _TreeError('more than one YAML document')
+    return root[0] if root else None
+
+
+def _add(open_collection: tuple[Any, list[str]], value: Any, line: int) -> None:
+    """Put a value into the innermost collection: an item, a key, or a key's value."""
+    collection, pending_key = open_collection
+    if isinstance(collection, list):
+        collection.append(value)
+    elif pending_key:
+        collection[pending_key.pop()] = value
+    elif isinstance(value, dict | list):
+        raise _TreeError(f'line {line}: a key must be a name')
+    else:
+        key = str(value)
+        if key in collection:
+            raise _TreeError(f"line {line}: '{key}' stands twice")
+        pending_key.append(key)
+
+
+def _scalar(event: yaml.ScalarEvent) -> Any:
+    """Return a scalar as ROS would type it: quoted text is text, the rest by its looks."""
+    text = event.value
+    if event.style in _QUOTED_STYLES or event.tag == 'tag:yaml.org,2002:str':
+        return text
+    if text in ('', '~', 'null', 'Null', 'NULL'):
+        return None
+    if text.lower() in _TRUE | _FALSE:
+        return text.lower() in _TRUE
+    for number in (int, float) if len(text) <= _MAX_NUMBER_LENGTH else ():
+        try:
+            return number(text)
+        except ValueError:
+            pass
+    return {'.nan': float('nan'), '.inf': float('inf'), '-.inf': -float('inf')}.get(
+        text.lower(), text)

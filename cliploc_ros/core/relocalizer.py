@@ -1,0 +1,243 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The one door to the method: Relocalizer.relocalize(observations) -> Relocalization."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core import association
+from cliploc_ros.core.acceptance import Evidence, refusal
+from cliploc_ros.core.association import Candidates
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
+from cliploc_ros.core.scoring import Scene, Workspace, make_scene, verify
+from cliploc_ros.core.search import Leaders, search_exhaustively, search_samples
+from cliploc_ros.core.transforms import invert_transform, make_transform
+from cliploc_ros.core.uncertainty import pose_covariance
+from cliploc_ros.errors import OptionsError
+
+
+@dataclass(frozen=True)
+class Match:
+    """A detection explained by a landmark: row of the detection, row in the map, IoU."""
+
+    detection: int
+    landmark: int
+    iou: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose the camera may have had, and the sum of IoUs that speaks for it."""
+
+    map_from_camera: NDArray[np.float64]
+    score: float
+
+
+@dataclass(frozen=True)
+class Relocalization:
+    """What a search found, and whether to believe it.
+
+    Parameters
+    ----------
+    accepted : bool
+        Whether the pose is to be acted on.
+    reason : str
+        Why not, in one line; empty when accepted.
+    hypotheses : tuple of Hypothesis
+        The distinct best, best first; empty when nothing was found.
+    matches : tuple of Match
+        The inliers of the best.
+    covariance : ndarray (6, 6) or None
+        Of the best, see cliploc_ros.core.uncertainty; None when nothing was found.
+    tried : int
+        How many hypotheses were made.
+    best_iteration : int
+        In which iteration the best was found, from 1; 0 when nothing was found.
+    coverage : float
+        The share of its samples that the search could try in its time, 0 to 1.
+    search_ms : float
+        How long association, search and verification took [ms].
+    stamp_ns : int
+        Stamp of the observation [ns].
+    """
+
+    accepted: bool
+    reason: str
+    hypotheses: tuple[Hypothesis, ...] = ()
+    matches: tuple[Match, ...] = ()
+    covariance: NDArray[np.float64] | None = None
+    tried: int = 0
+    best_iteration: int = 0
+    coverage: float = 1.0
+    search_ms: float = 0.0
+    stamp_ns: int = 0
+
+    @property
+    def solved(self) -> bool:
+        """Return whether any pose was found, believed or not."""
+        return bool(self.hypotheses)
+
+    @property
+    def map_from_camera(self) -> NDArray[np.float64] | None:
+        """Return the best pose (4, 4), believed or not; None when there is none."""
+        return self.hypotheses[0].map_from_camera if self.hypotheses else None
+
+    @property
+    def score(self) -> float:
+        """Return the best score; 0 when nothing was found."""
+        return self.hypotheses[0].score if self.hypotheses else 0.0
+
+
+@dataclass
+class _Search:
+    """What one search left behind."""
+
+    leaders: Leaders = field(default_factory=Leaders.none_yet)
+    tried: int = 0
+    coverage: float = 1.0
+
+
+class Relocalizer:
+    """Finds camera poses in one map.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    options : RelocalizerOptions
+
+    Raises
+    ------
+    OptionsError
+        k is larger than the map.
+    """
+
+    def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
+        if options.needs_similarities and options.k > len(landmark_map):
+            raise OptionsError(f'k = {options.k}, but the map has {len(landmark_map)} landmarks: '
+                               f'set k to {len(landmark_map)} or less')
+        self._map = landmark_map
+        self._shapes = landmark_map.shapes
+        self._options = options
+
+    def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
+        """Find where the camera was.
+
+        Parameters
+        ----------
+        observations : sequence of Observation
+            One frame. (Several frames joined by odometry are not searched together yet.)
+
+        Returns
+        -------
+        Relocalization
+            Refused, with the reason, when the pose is not to be acted on.
+
+        Raises
+        ------
+        OptionsError
+            The matching type needs similarities that are missing or of the wrong shape, or not
+            exactly one observation was given.
+        """
+        if len(observations) != 1:
+            raise OptionsError(f'one observation at a time, not {len(observations)}')
+        observation = observations[0]
+        start = time.perf_counter()
+        bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
+        candidates, potential = self._associate(observation)
+        # where the lens model has no inverse there is no bearing
+        invertible = np.isfinite(bboxes).all(axis=1)
+        potential &= invertible[:, None]
+        pairs = candidates.pairs[invertible[candidates.detections]]
+        if _too_few(pairs):
+            return Relocalization(
+                False, f'{len(bboxes)} detections give fewer than three different '
+                'correspondence candidates', stamp_ns=observation.stamp_ns)
+        scene = make_scene(np.nan_to_num(bboxes, nan=1.0), self._map.centers, self._shapes,
+                           potential, pairs, self._options.iou_threshold)
+        search = self._search(scene, start)
+        return self._conclude(observation, scene, search, bboxes, start)
+
+    def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Return the candidates in the sampler's order, and the verification mask (n, L)."""
+        options = self._options
+        shape = (len(observation.detections), len(self._map))
+        by_class = association.same_class(observation.detections.class_ids, self._map.class_ids)
+        if not options.needs_similarities:
+            return association.class_candidates(by_class), by_class
+        similarities = observation.similarities
+        if similarities is None or similarities.shape != shape:
+            found = 'none' if similarities is None else f'{similarities.shape}'
+            raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
+                               f'{shape}, found {found}')
+        candidates = association.nearest_candidates(similarities, options.k)
+        potential = association.candidate_mask(candidates, shape)
+        if options.matching == 'hybrid':
+            potential |= by_class
+        if options.algorithm == 'prosac':
+            candidates = association.prosac_order(candidates)
+        elif options.algorithm == 'b-prosac':
+            candidates = association.balanced_order(candidates)
+        return candidates, potential
+
+    def _search(self, scene: Scene, start: float) -> _Search:
+        """Run the algorithm that the options name."""
+        options = self._options
+        search = _Search()
+        if options.algorithm == 'bf':
+            slices = max(1, len(scene.pairs) - SAMPLE_SIZE + 1)
+            for done, tried in enumerate(search_exhaustively(scene, search.leaders), start=1):
+                search.tried += tried
+                search.coverage = done / slices
+                if time.perf_counter() - start > options.time_budget_s:
+                    break
+            return search
+        draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+        seed = options.random_seed if options.random_seed >= 0 else None
+        samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
+        search.tried = search_samples(scene, samples, search.leaders)
+        return search
+
+    def _conclude(self, observation: Observation, scene: Scene, search: _Search,
+                  bboxes: NDArray[np.float64], start: float) -> Relocalization:
+        """Turn the leaders into a result, and decide whether to believe the first."""
+        leaders, ranked = search.leaders, search.leaders.ranked()
+        if len(ranked) == 0:
+            return Relocalization(False, 'no pose explains any three detections',
+                                  tried=search.tried, coverage=search.coverage,
+                                  search_ms=_elapsed_ms(start), stamp_ns=observation.stamp_ns)
+        hypotheses = tuple(
+            Hypothesis(invert_transform(make_transform(leaders.rotations[row],
+                                                       leaders.translations[row])),
+                       float(leaders.scores[row])) for row in ranked)
+        best = ranked[0]
+        workspace = Workspace.allocate(len(scene.bearings))
+        verify(scene, leaders.rotations[best], leaders.translations[best], workspace)
+        matches = tuple(Match(int(row), int(workspace.landmarks[row]), float(workspace.ious[row]))
+                        for row in np.nonzero(workspace.landmarks >= 0)[0])
+        rows = [match.detection for match in matches]
+        landmarks = [match.landmark for match in matches]
+        covariance = pose_covariance(hypotheses[0].map_from_camera, bboxes[rows],
+                                     scene.centers[landmarks], scene.shapes[landmarks])
+        evidence = Evidence(ious=tuple(match.iou for match in matches),
+                            landmarks=tuple(landmarks),
+                            rival_score=hypotheses[1].score if len(hypotheses) > 1 else 0.0)
+        reason = refusal(evidence, self._options)
+        return Relocalization(not reason, reason, hypotheses, matches, covariance, search.tried,
+                              int(leaders.iterations[best]), search.coverage, _elapsed_ms(start),
+                              observation.stamp_ns)
+
+
+def _too_few(pairs: NDArray[np.int64]) -> bool:
+    """Tell whether no three candidates can differ in detection and in landmark."""
+    return min(len(np.unique(pairs[:, 0])), len(np.unique(pairs[:, 1]))) < SAMPLE_SIZE
+
+
+def _elapsed_ms(start: float) -> float:
+    return (time.perf_counter() - start) * 1e3

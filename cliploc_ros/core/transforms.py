@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid transforms as 4x4 matrices, named ``a_from_b``: ``x_a = a_from_b @ x_b``."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+
+def make_transform(rotation: NDArray[np.float64], translation: NDArray[np.float64]
+                   ) -> NDArray[np.float64]:
+    """Return the 4x4 transform of a rotation (3, 3) and a translation (3,) [m]."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = translation
+    return transform
+
+
+def invert_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return b_from_a (4, 4)."""
+    rotation_t = a_from_b[:3, :3].T
+    return make_transform(rotation_t, -rotation_t @ a_from_b[:3, 3])
+
+
+def transform_from_pose(position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
+                        ) -> NDArray[np.float64]:
+    """Return the 4x4 transform of a position (3,) [m] and a quaternion x, y, z, w."""
+    return make_transform(Rotation.from_quat(quat_xyzw).as_matrix(), position)
+
+
+def quaternion_from_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quaternion x, y, z, w (4,) of a transform's rotation, with w >= 0."""
+    quat_xyzw = Rotation.from_matrix(a_from_b[:3, :3]).as_quat()
+    return quat_xyzw if quat_xyzw[3] >= 0.0 else -quat_xyzw
+
+
+def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
+    """Return the angle [deg] by which a rotation (3, 3) turns."""
+    return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
+
+
+def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float]:
+    """Return how far two poses (4, 4) lie apart: distance [m], angle [deg]."""
+    distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
+    return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
+
+
+def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
+                    ) -> NDArray[np.float64]:
+    """Return a pose's covariance after its origin moved rigidly by a lever.
+
+    Parameters
+    ----------
+    covariance : ndarray (6, 6)
+        Of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
+    lever : ndarray (3,)
+        From the old origin to the new one, in the fixed frame [m].
+    """
+    x, y, z = lever
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    return jacobian @ covariance @ jacobian.T
