@@ -2,11 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """How colcon installs the package. script/setup brings the environment that it runs in."""
 
-from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'cliploc_ros'
+
+
+def files(folder: str, pattern: str) -> list[str]:
+    """List what is to be installed from a folder, which may be absent."""
+    return [str(path) for path in sorted(Path(folder).glob(pattern))]
+
 
 setup(
     name=PACKAGE,
@@ -16,8 +22,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
-        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.*'))),
+        (f'share/{PACKAGE}/config', files('config', '*.yaml')),
+        (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',
     # Without version numbers: script/requirements.txt is the one place for those.
