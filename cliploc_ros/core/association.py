@@ -45,7 +45,7 @@ class Candidates:
         """Return (detection, landmark) of each candidate (c, 2)."""
         return np.stack([self.detections, self.landmarks], axis=1)
 
-    def ordered(self, *keys: NDArray[np.float64]) -> 'Candidates':
+    def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
         """Return the candidates sorted by keys, the first key first; ties keep their order."""
         order = np.lexsort(keys[::-1])
         return Candidates(self.detections[order], self.landmarks[order], self.ranks[order],

@@ -13,7 +13,8 @@ from cliploc_ros.errors import CameraError
 # Coefficients of each distortion model of sensor_msgs/CameraInfo.
 _COEFFICIENT_COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14),
                        'equidistant': (4,)}
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+_NEWTON_STEPS = 20
+_NEWTON_DIFFERENCE = 1e-6
 # Where redistorting misses a pixel by more than this, the model cannot be inverted there.
 _MAX_ROUND_TRIP_PX = 0.1
 
@@ -83,19 +84,32 @@ class Camera:
         Rows where the distortion model has no inverse are NaN.
         """
         points_px = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
+        normalized = (points_px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not any(self.distortion) or len(points_px) == 0:
-            return (points_px - (self.cx, self.cy)) / (self.fx, self.fy)
-        coefficients = np.array(self.distortion)
-        pixels = np.ascontiguousarray(points_px[:, None])
+            return normalized
         if self.distortion_model == 'equidistant':
-            normalized = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients)
-        else:
-            normalized = cv2.undistortPointsIter(pixels, self.matrix, coefficients, None, None,
-                                                 _UNDISTORT_CRITERIA)
-        normalized = normalized.reshape(-1, 2)
-        missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
+            # starts where a fisheye lens bends most: tan of the angle, short of 90 degrees
+            angle = np.minimum(np.linalg.norm(normalized, axis=1, keepdims=True), 1.5)
+            normalized *= np.tan(angle) / np.maximum(angle, 1e-12)
+        with np.errstate(all='ignore'):
+            for _ in range(_NEWTON_STEPS):
+                normalized -= self._newton_step(normalized, points_px)
+            missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
         normalized[~(missed <= _MAX_ROUND_TRIP_PX)] = np.nan
         return normalized
+
+    def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
+                     ) -> NDArray[np.float64]:
+        """Return by how much points (n, 2) overshoot those that project to given pixels."""
+        projected = self.project_normalized(normalized)
+        along_x, along_y = (
+            (self.project_normalized(normalized + step) - projected) / _NEWTON_DIFFERENCE
+            for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
+        missed = projected - points_px
+        determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
+        step = np.stack([missed[:, 0] * along_y[:, 1] - missed[:, 1] * along_y[:, 0],
+                         along_x[:, 0] * missed[:, 1] - along_x[:, 1] * missed[:, 0]], axis=1)
+        return step / determinant[:, None]
 
     def project_normalized(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the (distorted) pixels (n, 2) of points (n, 2) of the plane z = 1."""
@@ -109,17 +123,19 @@ class Camera:
         else:
             solid = np.concatenate([points, np.ones((len(points), 1))], axis=1)
             pixels, _ = cv2.projectPoints(solid[:, None], zero, zero, self.matrix, coefficients)
-        return pixels.reshape(-1, 2)
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def normalize_bboxes(self, bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return boxes (n, 4) [px] as undistorted boxes (n, 4) of the plane z = 1.
 
         Each edge goes where its midpoint goes: there the ellipse inscribed in the box touches.
         """
-        left, top, right, bottom = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4).T
+        bboxes_xyxy = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4)
+        left, top, right, bottom = bboxes_xyxy.T
         middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
         midpoints = np.stack([left, middle_y, middle_x, top, right, middle_y, middle_x, bottom],
                              axis=-1)
         points = self.normalize_points(midpoints.reshape(-1, 2)).reshape(-1, 4, 2)
-        return np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]],
-                        axis=-1)
+        edges: NDArray[np.float64] = np.stack(
+            [points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], axis=-1)
+        return edges

@@ -50,7 +50,7 @@ class RelocalizerOptions:
     random_seed: int = 0
     time_budget_s: float = math.inf
     min_inliers: int = 4
-    min_evidence: float = 2.5
+    min_evidence: float = 4.0
 
     def __post_init__(self) -> None:
         """Refuse values outside what each option allows."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core import association
 from cliploc_ros.core.acceptance import Evidence, refusal
 from cliploc_ros.core.association import Candidates
+from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -19,7 +20,7 @@ from cliploc_ros.core.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
 from cliploc_ros.core.scoring import Scene, Workspace, make_scene, verify
 from cliploc_ros.core.search import Leaders, search_exhaustively, search_samples
 from cliploc_ros.core.transforms import invert_transform, make_transform
-from cliploc_ros.core.uncertainty import pose_covariance
+from cliploc_ros.core.uncertainty import box_scatter, pose_covariance
 from cliploc_ros.errors import OptionsError
 
 
@@ -161,8 +162,7 @@ class Relocalizer:
                 'correspondence candidates', stamp_ns=observation.stamp_ns)
         scene = make_scene(np.nan_to_num(bboxes, nan=1.0), self._map.centers, self._shapes,
                            potential, pairs, self._options.iou_threshold)
-        search = self._search(scene, start)
-        return self._conclude(observation, scene, search, bboxes, start)
+        return self._conclude(observation, scene, self._search(scene, start), start)
 
     def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
         """Return the candidates in the sampler's order, and the verification mask (n, L)."""
@@ -204,8 +204,8 @@ class Relocalizer:
         search.tried = search_samples(scene, samples, search.leaders)
         return search
 
-    def _conclude(self, observation: Observation, scene: Scene, search: _Search,
-                  bboxes: NDArray[np.float64], start: float) -> Relocalization:
+    def _conclude(self, observation: Observation, scene: Scene, search: _Search, start: float
+                  ) -> Relocalization:
         """Turn the leaders into a result, and decide whether to believe the first."""
         leaders, ranked = search.leaders, search.leaders.ranked()
         if len(ranked) == 0:
@@ -217,21 +217,38 @@ class Relocalizer:
                                                        leaders.translations[row])),
                        float(leaders.scores[row])) for row in ranked)
         best = ranked[0]
-        workspace = Workspace.allocate(len(scene.bearings))
-        verify(scene, leaders.rotations[best], leaders.translations[best], workspace)
-        matches = tuple(Match(int(row), int(workspace.landmarks[row]), float(workspace.ious[row]))
-                        for row in np.nonzero(workspace.landmarks >= 0)[0])
-        rows = [match.detection for match in matches]
-        landmarks = [match.landmark for match in matches]
-        covariance = pose_covariance(hypotheses[0].map_from_camera, bboxes[rows],
-                                     scene.centers[landmarks], scene.shapes[landmarks])
+        matches = _matches(scene, leaders.rotations[best], leaders.translations[best])
+        covariance = _covariance(scene, leaders.samples[best], matches,
+                                 hypotheses[0].map_from_camera)
         evidence = Evidence(ious=tuple(match.iou for match in matches),
-                            landmarks=tuple(landmarks),
+                            landmarks=tuple(match.landmark for match in matches),
                             rival_score=hypotheses[1].score if len(hypotheses) > 1 else 0.0)
         reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, matches, covariance, search.tried,
                               int(leaders.iterations[best]), search.coverage, _elapsed_ms(start),
                               observation.stamp_ns)
+
+
+def _matches(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
+             ) -> tuple[Match, ...]:
+    """Return the inliers of a pose."""
+    workspace = Workspace.allocate(len(scene.bearings))
+    verify(scene, rotation, translation, workspace)
+    return tuple(Match(int(row), int(workspace.landmarks[row]), float(workspace.ious[row]))
+                 for row in np.nonzero(workspace.landmarks >= 0)[0])
+
+
+def _covariance(scene: Scene, sample: NDArray[np.int64], matches: tuple[Match, ...],
+                map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of a pose made from one sample and checked by its matches."""
+    detections = [match.detection for match in matches]
+    landmarks = [match.landmark for match in matches]
+    outlines = project_ellipsoids(invert_transform(map_from_camera), scene.centers[landmarks],
+                                  scene.shapes[landmarks])
+    sampled = scene.pairs[sample]
+    return pose_covariance(map_from_camera, scene.centers[sampled[:, 1]],
+                           2.0 * scene.box_ellipses[sampled[:, 0], 2:],
+                           box_scatter(outlines, scene.box_ellipses[detections]))
 
 
 def _too_few(pairs: NDArray[np.int64]) -> bool:

@@ -138,7 +138,7 @@ def _remember(score, iteration, sample, rotation, translation, leaders):
         leaders.scores[row] = -1.0
         free = row
     if free < 0:
-        free = np.argmin(leaders.scores)
+        free = int(np.argmin(leaders.scores))
     leaders.scores[free] = score
     leaders.iterations[free] = iteration
     leaders.samples[free] = sample

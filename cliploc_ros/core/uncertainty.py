@@ -6,33 +6,59 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.transforms import invert_transform
 
-# Box edges are never trusted beyond this, as a share of the box's size.
-_MIN_EDGE_ERROR = 0.03
+# The scatter of box centres, as a share of the box, before anything is seen, and how many
+# measurements that belief is worth: three boxes alone would seem to fit perfectly.
+_PRIOR_SCATTER = 0.1
+_PRIOR_WEIGHT = 6.0
+# Errors of box and map are shared by neighbouring edges, so fewer are independent than counted.
+# Doubling the variance brings accepted poses of real TUM frames near their 95 % ellipsoids.
+_VARIANCE_INFLATION = 2.0
 # Finite-difference steps of position [m] and rotation [rad].
 _STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
 # A direction the boxes do not fix is uncertain by this much, not infinitely: m^2 and rad^2.
 _PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
 
 
-def pose_covariance(map_from_camera: NDArray[np.float64], bboxes: NDArray[np.float64],
-                    centers: NDArray[np.float64], shapes: NDArray[np.float64]
-                    ) -> NDArray[np.float64]:
-    """Return the covariance of a camera pose whose boxes show given landmarks.
+def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64]) -> float:
+    """Return the standard deviation of box centres, as a share of the box's size.
 
-    The edges of the boxes, in units of each box's size, are taken as measurements of the edges
-    of the projected ellipsoids. Their scatter at the pose itself (its bias included, since the
-    pose is not refined) goes through the linearized projection to the pose.
+    Parameters
+    ----------
+    ellipses : ndarray (m, 5)
+        Projected outlines of the inliers' landmarks, see project_ellipsoids.
+    box_ellipses : ndarray (m, 4)
+        Centre and semi-axes of the ellipses inscribed in the inliers' boxes.
+    """
+    size = 2.0 * box_ellipses[:, 2:]
+    center_errors = (ellipses[:, :2] - box_ellipses[:, :2]) / size
+    # An edge moves by half of what its box grows.
+    size_errors = (np.sqrt(ellipses[:, [2, 4]]) - box_ellipses[:, 2:]) / size
+    squares = np.nansum(center_errors**2) + np.nansum(size_errors**2)
+    # Six of the centres' errors are zero by construction: P3P fits three centres exactly.
+    freedom = max(0, center_errors.size - 6) + size_errors.size
+    return float(np.sqrt((squares + _PRIOR_WEIGHT * _PRIOR_SCATTER**2)
+                         / (freedom + _PRIOR_WEIGHT)))
+
+
+def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.float64],
+                    box_sizes: NDArray[np.float64], scatter: float) -> NDArray[np.float64]:
+    """Return the covariance of a camera pose that three box centres fix.
+
+    The pose of P3P has no error but that of its three bearings. These scatter with the size of
+    their boxes, by as much as the inliers' boxes miss the projected landmarks; the linearized
+    projection carries the scatter to the pose.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
-    bboxes : ndarray (m, 4)
-        Inlier boxes x, y, x, y on the plane z = 1.
-    centers, shapes : ndarray (m, 3), (m, 6)
-        The landmark that each box shows.
+    centers : ndarray (3, 3)
+        The sampled landmarks' centres in the map [m].
+    box_sizes : ndarray (3, 2)
+        Width and height of the sampled boxes on the plane z = 1.
+    scatter : float
+        See box_scatter.
 
     Returns
     -------
@@ -40,19 +66,16 @@ def pose_covariance(map_from_camera: NDArray[np.float64], bboxes: NDArray[np.flo
         Of x, y, z [m] and the rotations about the map's fixed X, Y, Z axes [rad], about the
         camera's position (ROS order). Symmetric and positive definite.
     """
-    size = np.repeat(bboxes[:, 2:] - bboxes[:, :2], 2, axis=0).reshape(-1, 4)
+    def projections(step: NDArray[np.float64]) -> NDArray[np.float64]:
+        camera_from_map = invert_transform(_moved(map_from_camera, step))
+        points = centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+        return (points[:, :2] / points[:, 2:]).ravel()
 
-    def edge_errors(step: NDArray[np.float64]) -> NDArray[np.float64]:
-        moved = _moved(map_from_camera, step)
-        edges = ellipse_bboxes(project_ellipsoids(invert_transform(moved), centers, shapes))
-        return np.nan_to_num((edges - bboxes) / size).ravel()
-
-    jacobian = np.stack([(edge_errors(step) - edge_errors(-step)) / (2 * step.max())
+    jacobian = np.stack([(projections(step) - projections(-step)) / (2 * step.max())
                          for step in np.diag(_STEPS)], axis=1)
-    errors = edge_errors(np.zeros(6))
-    spare = max(1, len(errors) - 6)
-    variance = max(_MIN_EDGE_ERROR**2, float(errors @ errors) / spare)
-    information = jacobian.T @ jacobian / variance + np.diag(1.0 / np.array(_PRIOR_VARIANCES))
+    variances = _VARIANCE_INFLATION * (box_sizes.ravel() * scatter)**2
+    information = (jacobian.T @ (jacobian / variances[:, None])
+                   + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
     covariance = np.linalg.inv(information)
     return (covariance + covariance.T) / 2
 
