@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``replay``: publishes a recording where no ``ros2 bag`` is installed."""
+
+import argparse
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from cliploc_ros.cli.command import run_command
+from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.errors import OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.ros.player import Player, PlayReport
+
+NODE_NAME = 'replay'
+NS_PER_S = 1_000_000_000
+
+EPILOG = """\
+examples:
+  replay office --clock --wait-for-subscribers /image
+  replay office --rate 0.5 --topics /image /camera_info --remap /image:=/camera/image
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Publish a recording; return the exit code."""
+    arguments = list(sys.argv[1:] if args is None else args)
+    stop = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    return run_command(lambda: replay(arguments, stop))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='replay',
+        usage='replay BAG [options] [--ros-args ...]',
+        description='Publish the messages of a rosbag2 recording (sqlite3 or mcap, also those of '
+        '`ros2 bag record`) with their recorded bytes, types and QoS.',
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder, or a .mcap or .db3 file')
+    parser.add_argument(
+        '-r', '--rate', type=_positive, default=1.0, metavar='X',
+        help='speed: 2 is twice as fast as recorded (default: 1)',
+    )
+    parser.add_argument('-l', '--loop', action='store_true', help='begin again at the end')
+    parser.add_argument(
+        '--start-offset', type=_not_negative, default=0.0, metavar='S',
+        help='begin S seconds after the start of the recording',
+    )
+    parser.add_argument(
+        '--topics', nargs='+', metavar='TOPIC', help='publish these only (default: all)'
+    )
+    parser.add_argument(
+        '--exclude', nargs='+', default=[], metavar='TOPIC', help='leave these out'
+    )
+    parser.add_argument(
+        '-m', '--remap', nargs='+', type=_remap_rule, default=[], metavar='OLD:=NEW',
+        help='publish the recorded topic OLD as NEW',
+    )
+    parser.add_argument(
+        '--clock', nargs='?', type=_positive, const=40.0, metavar='HZ',
+        help="publish the recording's time on /clock, HZ times a second (40 if not given), for "
+        'nodes with use_sim_time; with --loop it jumps back at each start',
+    )
+    parser.add_argument(
+        '--wait-for-subscribers', nargs='*', metavar='TOPIC',
+        help='begin only when each of these topics (all if none is named) has a subscriber',
+    )
+    parser.add_argument(
+        '--wait-timeout', type=_not_negative, default=30.0, metavar='S',
+        help='give up waiting for subscribers after S seconds (default: 30)',
+    )
+    return parser
+
+
+def replay(args: list[str], stop: threading.Event) -> int:
+    """Publish a recording until its end or until stopped.
+
+    Parameters
+    ----------
+    args : list of str
+        The command line, those for ROS among them.
+    stop : threading.Event
+        Ends the replay.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    CliplocError
+        For a recording or an option that cannot be used, or where ROS is not there.
+    """
+    if {'-h', '--help'} & set(args):  # shall work without ROS
+        make_parser().parse_args(args)
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import remove_ros_args
+    except ImportError as error:
+        raise OptionsError(
+            f'ROS 2 is not there to publish with ({error}): source it, or run script/setup'
+        ) from error
+    try:
+        plain_args = remove_ros_args([NODE_NAME, *args])[1:]
+        options = make_parser().parse_args(plain_args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # what rclpy makes of arguments that it cannot read
+        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
+    try:
+        with BagReader(options.bag) as reader:
+            return _play(_make_player(reader, options, stop), options, stop)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _make_player(
+    reader: BagReader, options: argparse.Namespace, stop: threading.Event
+) -> 'Player':
+    from rclpy.exceptions import InvalidTopicNameException
+    from rclpy.node import Node
+
+    from cliploc_ros.ros.player import Player, PlayOptions
+
+    play_options = PlayOptions(
+        rate=options.rate,
+        start_offset_s=options.start_offset,
+        topics=None if options.topics is None else [_absolute(name) for name in options.topics],
+        exclude=[_absolute(name) for name in options.exclude],
+        remap=dict(options.remap),
+        clock_hz=options.clock,
+        loop=options.loop,
+    )
+    # nothing spins this node, so it could not serve its parameters
+    node = Node(NODE_NAME, start_parameter_services=False)
+    try:
+        return Player(node, reader, play_options, stop)
+    except InvalidTopicNameException as error:
+        raise OptionsError(f'--remap: {error}') from error
+
+
+def _play(player: 'Player', options: argparse.Namespace, stop: threading.Event) -> int:
+    if options.wait_for_subscribers is not None:
+        names = [_absolute(name) for name in options.wait_for_subscribers]
+        player.wait_for_subscribers(names, options.wait_timeout)
+    length_s = (player.end_ns - player.start_ns) / NS_PER_S
+    print(
+        f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
+        f'at rate {options.rate:g}',
+        flush=True,
+    )
+    begin = time.monotonic()
+    with tqdm(
+        total=round(length_s, 1), unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+        disable=None,  # without a terminal there is nothing to draw on
+    ) as bar:
+        report = player.play(_progress(bar, player.start_ns))
+    _tell(report, stopped=stop.is_set(), elapsed_s=time.monotonic() - begin)
+    return 0
+
+
+def _progress(bar: 'tqdm[None]', start_ns: int) -> Callable[[BagMessage], None]:
+    def show(message: BagMessage) -> None:
+        bar.update((message.stamp_ns - start_ns) / NS_PER_S - bar.n)
+
+    return show
+
+
+def _tell(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
+    passes = f', {report.passes} passes' if report.passes > 1 else ''
+    print(
+        f'{"stopped: " if stopped else ""}published {report.counts.total()} messages on '
+        f'{len(report.counts)} topics in {elapsed_s:.1f} s{passes}; '
+        f'at most {report.worst_lateness_s * 1000:.1f} ms late',
+        flush=True,
+    )
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not a number of 0 or more')
+    return value
+
+
+def _remap_rule(text: str) -> tuple[str, str]:
+    old, separator, new = text.partition(':=')
+    if not (old and separator and new):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form OLD:=NEW')
+    return _absolute(old), new
+
+
+def _absolute(name: str) -> str:
+    return name if name.startswith('/') else f'/{name}'
+
+
+if __name__ == '__main__':
+    sys.exit(main())
