@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of several topics that belong together: those with exactly the same stamp."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+
+class ExactPairing:
+    """Waits until every topic has a message of the same stamp. Memory is bounded.
+
+    Stamps are compared, never ordered: simulated time may jump back, and frames may come out of
+    order.
+
+    Parameters
+    ----------
+    max_bytes : mapping of str to int
+        The topics, and how much of each may wait [bytes].
+    max_count : int
+        How many messages of each topic may wait.
+    """
+
+    def __init__(self, max_bytes: Mapping[str, int], max_count: int) -> None:
+        self._max_bytes = dict(max_bytes)
+        self._max_count = max_count
+        self._waiting: dict[str, OrderedDict[int, tuple[Any, int]]] = {
+            topic: OrderedDict() for topic in max_bytes}
+        self._bytes = dict.fromkeys(max_bytes, 0)
+        self.received = dict.fromkeys(max_bytes, 0)
+        self.last_stamp_ns: dict[str, int] = {}
+
+    def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
+        """Take one message in; return the complete set by topic, if this completed one.
+
+        Parameters
+        ----------
+        topic : str
+        stamp_ns : int
+        item : object
+            What comes back in the set.
+        size : int
+            Memory that the item holds [bytes].
+        """
+        self.received[topic] += 1
+        self.last_stamp_ns[topic] = stamp_ns
+        waiting = self._waiting[topic]
+        if stamp_ns in waiting:
+            self._forget(topic, stamp_ns)
+        waiting[stamp_ns] = (item, size)
+        self._bytes[topic] += size
+        while len(waiting) > self._max_count or (
+                self._bytes[topic] > self._max_bytes[topic] and len(waiting) > 1):
+            self._forget(topic, next(iter(waiting)))
+        if any(stamp_ns not in other for other in self._waiting.values()):
+            return None
+        complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
+        for name, other in self._waiting.items():
+            # what came before the completed one is late for good
+            while stamp_ns in other:
+                self._forget(name, next(iter(other)))
+        return complete
+
+    def waiting_bytes(self) -> int:
+        """Return how much memory the waiting messages hold [bytes]."""
+        return sum(self._bytes.values())
+
+    def clear(self) -> None:
+        """Forget all that waits, and what was received."""
+        for waiting in self._waiting.values():
+            waiting.clear()
+        self._bytes = dict.fromkeys(self._bytes, 0)
+        self.received = dict.fromkeys(self.received, 0)
+        self.last_stamp_ns.clear()
+
+    def _forget(self, topic: str, stamp_ns: int) -> None:
+        _, size = self._waiting[topic].pop(stamp_ns)
+        self._bytes[topic] -= size

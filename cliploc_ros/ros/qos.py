@@ -1,0 +1,30 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Quality of service by name. All can be overridden by ``qos_overrides`` parameters."""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
+
+# Sensor data: a best-effort reader matches best-effort and reliable cameras, and the newest
+# frame is the one that counts.
+IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
+                   reliability=ReliabilityPolicy.BEST_EFFORT,
+                   durability=DurabilityPolicy.VOLATILE)
+# Small messages that must not be lost to a burst: they are paired with images by stamp.
+CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
+                         reliability=ReliabilityPolicy.BEST_EFFORT)
+DETECTIONS_IN = CAMERA_INFO
+DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
+                            reliability=ReliabilityPolicy.RELIABLE)
+POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
+                  reliability=ReliabilityPolicy.RELIABLE)
+# Requests are answered one after another; so many may wait.
+SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
+                     reliability=ReliabilityPolicy.RELIABLE)
+
+
+def overridable() -> QoSOverridingOptions:
+    """Return the options that let a user override history, depth, reliability, durability."""
+    return QoSOverridingOptions(policy_kinds=(
+        QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
+        QoSPolicyKind.DURABILITY))

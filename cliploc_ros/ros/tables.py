@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of the two nodes, and the options that their values become."""
+
+import math
+from collections.abc import Mapping
+
+from cliploc_ros.core.association import MATCHINGS
+from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.parameters import ParameterRow, Value
+
+TRANSPORTS = ('raw', 'compressed')
+MODES = ('on_request', 'continuous')
+
+_IMAGE_TRANSPORT = ParameterRow(
+    'image_transport', 'raw', "Listen to 'image' or to 'image/compressed'.",
+    choices=TRANSPORTS, read_only=True)
+_DEVICE = ParameterRow(
+    'device', 'auto', "Where the network runs: 'auto' takes a GPU if there is one, else 'cpu', "
+    "'cuda' or 'cuda:N'.", read_only=True)
+_MODEL_DIR = ParameterRow(
+    'model_dir', '', 'Where weights named by a tag are downloaded to; empty: '
+    '~/.cache/cliploc_ros/models.', read_only=True)
+
+DETECTOR = (
+    ParameterRow('model', 'yolov8x.pt', 'Weights: a local file, or a name that ultralytics '
+                 'downloads.', read_only=True),
+    ParameterRow('confidence', 0.1, 'Detections below this confidence are left out.',
+                 low=0.0, high=1.0),
+    ParameterRow('iou', 0.7, 'Of two boxes of a class that overlap more than this, one stays.',
+                 low=0.0, high=1.0),
+    ParameterRow('image_size', 640, 'The longer side of the image that the network sees.',
+                 unit='px', low=32, high=4096),
+    ParameterRow('max_detections', 100, 'The most confident detections published.',
+                 low=1, high=1000),
+    _DEVICE,
+    _MODEL_DIR,
+    _IMAGE_TRANSPORT,
+)
+
+RELOCALIZER = (
+    ParameterRow('map_file', '', "A map to load; empty: the map stands in the parameters "
+                 "below 'map'.", read_only=True),
+    ParameterRow('mode', 'on_request', 'When to localize: when a service is called, or '
+                 'continuously.', choices=MODES, read_only=True),
+    ParameterRow('timeout_s', 10.0, 'How long a request waits for fresh frames.', unit='s',
+                 low=0.1, high=3600.0),
+    ParameterRow('matching', 'hybrid', 'What makes a candidate: equal classes, similarity by '
+                 'CLIP, or CLIP with classes for verification.', choices=MATCHINGS,
+                 read_only=True),
+    ParameterRow('algorithm', 'b-prosac', 'How minimal samples are chosen; bf tries all.',
+                 choices=ALGORITHMS),
+    ParameterRow('k', 3, 'Landmarks retrieved for each crop.', low=1, high=1000),
+    ParameterRow('iterations', 500, 'Minimal samples drawn for a request.', low=1,
+                 high=10_000_000),
+    ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
+                 low=0.0, high=1.0),
+    ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
+    ParameterRow('time_budget_s', 10.0, 'bf stops after this long.', unit='s', low=0.0,
+                 high=3600.0),
+    ParameterRow('min_inliers', 4, 'A pose that explains fewer landmarks is refused.', low=3,
+                 high=1000),
+    ParameterRow('min_evidence', 4.0, 'A pose with less evidence (score plus twice its margin '
+                 'over the best elsewhere) is refused.', low=0.0, high=1e6),
+    ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),
+    ParameterRow('clip_model', 'ViT-L-14', 'Architecture, by its open_clip name.',
+                 read_only=True),
+    ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
+                 read_only=True),
+    _DEVICE,
+    _MODEL_DIR,
+    ParameterRow('cache_dir', '', 'Where label embeddings are kept; empty: '
+                 '~/.cache/cliploc_ros.', read_only=True),
+    _IMAGE_TRANSPORT,
+    ParameterRow('rectified', False, 'The image is rectified: take P of camera_info and no '
+                 'distortion.'),
+    ParameterRow('base_frame', '', "Publish the pose of this frame; empty: the camera's."),
+    ParameterRow('base_from_camera', [0.0] * 7, 'Mount of the camera on base_frame: x, y, z [m] '
+                 'and quaternion x, y, z, w; all zeros: ask tf2.', unit='m'),
+    ParameterRow('tf_timeout_s', 0.5, "How long to wait for tf2 at the image's stamp.", unit='s',
+                 low=0.0, high=60.0),
+)
+
+
+def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
+    """Return the method's options from the values of the relocalizer's parameters.
+
+    Raises
+    ------
+    OptionsError
+        Names the option and what it allows.
+    """
+    names = RelocalizerOptions.__dataclass_fields__.keys()
+    _check_mount(values['base_from_camera'])
+    return RelocalizerOptions(**{name: values[name] for name in names})  # type: ignore[arg-type]
+
+
+def _check_mount(mount: Value) -> None:
+    assert isinstance(mount, list)
+    if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
+        raise OptionsError(f'base_from_camera: the quaternion {mount[3:]} is not of unit length')

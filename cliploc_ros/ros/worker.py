@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Work beside the executor: the node answers while a network runs."""
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+from cliploc_ros.errors import CliplocError
+
+T = TypeVar('T')
+# How long a running network may delay the end of its process.
+_GRACE_S = 1.0
+
+
+class Worker:
+    """One thread that works off tasks, one at a time."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix='inference')
+        self._running: set[Future[object]] = set()
+
+    def submit(self, task: Callable[[], T]) -> 'Future[T]':
+        """Queue a task; its result or exception is in the future returned."""
+        future = self._pool.submit(task)
+        self._running.add(future)
+        future.add_done_callback(self._running.discard)
+        return future
+
+    def stop(self) -> bool:
+        """Drop what waits; return whether the running task ended in time."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        deadline = time.monotonic() + _GRACE_S
+        while self._running and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return not self._running
+
+
+class LatestOnly(Generic[T]):
+    """Hands items to a worker; while it is busy only the newest waits.
+
+    Parameters
+    ----------
+    worker : Worker
+    work : callable
+        Takes one item, in the worker's thread.
+    """
+
+    def __init__(self, worker: Worker, work: Callable[[T], None]) -> None:
+        self._worker = worker
+        self._work = work
+        self._lock = threading.Lock()
+        self._items: list[T] = []
+        self.dropped = 0
+
+    def offer(self, item: T) -> None:
+        """Give an item to be worked on, in place of one that still waits."""
+        with self._lock:
+            waiting = bool(self._items)
+            self.dropped += waiting
+            self._items = [item]
+        if not waiting:
+            self._worker.submit(self._take)
+
+    def _take(self) -> None:
+        with self._lock:
+            item = self._items.pop()
+        self._work(item)
+
+
+class Retrying(Generic[T]):
+    """Something that is made when first needed, and again after it failed.
+
+    Parameters
+    ----------
+    make : callable
+        Makes it, or raises CliplocError.
+    pause_s : float
+        After a failure the same error is raised for so long, without another attempt [s].
+    """
+
+    def __init__(self, make: Callable[[], T], pause_s: float = 0.0) -> None:
+        self._make = make
+        self._pause_s = pause_s
+        self._made: list[T] = []
+        self._error: CliplocError | None = None
+        self._failed_at = 0.0
+
+    def get(self) -> T:
+        """Return it.
+
+        Raises
+        ------
+        CliplocError
+            It cannot be made; mend what the message names and ask again.
+        """
+        if self._made:
+            return self._made[0]
+        if self._error is not None and time.monotonic() - self._failed_at < self._pause_s:
+            raise self._error
+        try:
+            self._made.append(self._make())
+        except CliplocError as error:
+            self._error, self._failed_at = error, time.monotonic()
+            raise
+        return self._made[0]
+
+
+def leave(worker_ended: bool) -> None:
+    """End the process with exit code 0, even while a network still runs in its thread."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if not worker_ended:
+        # A thread inside a network cannot be stopped, and Python would wait for it.
+        os._exit(0)
