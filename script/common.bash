@@ -48,7 +48,7 @@ explain_failure() {
   die "this step failed, see above (whole log: $1)"
 }
 
-free_mb() { df --output=avail -m "$root" | tail -n 1; }
+free_mb() { df --output=avail -m "$root" | tail -n 1 | tr -d ' '; }
 
 # pip_install VENV REQUIREMENTS [PIP OPTION...]: once for each content of the file.
 pip_install() {
@@ -58,7 +58,7 @@ pip_install() {
   hash=$(hash_of "$file" "$root/script/constraints-jazzy.txt")
   is_done "$prefix/.$name.done" "$hash" && return
   say "installing script/$name.txt with pip"
-  run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --retries 10 --timeout 60 \
+  run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --resume-retries 20 \
     --disable-pip-version-check --no-input --requirement "$file" "$@"
   set_done "$prefix/.$name.done" "$hash"
 }
