@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Writing recordings: what comes back, what Jazzy would find, what a failure leaves behind."""
+
+import sqlite3
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import yaml
+
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.rosbag import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter, typestore
+from cliploc_ros.errors import DatasetError
+
+STAMP_NS = 1341847980722988001
+CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))
+
+
+@pytest.fixture(params=['sqlite3', 'mcap'])
+def storage(request):
+    return request.param
+
+
+def read_one(bag):
+    with BagReader(bag) as reader:
+        (message,) = reader.messages()
+        return message, reader.deserialize(message)
+
+
+def write_one(path, storage, msgtype, message, stamp_ns=STAMP_NS):
+    with BagWriter(path, storage) as bag:
+        bag.add_topic('/topic', msgtype)
+        bag.write('/topic', stamp_ns, message)
+    return read_one(path)
+
+
+def test_image_comes_back(tmp_path, storage):
+    pixels_rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    message = bag_messages.image_message(STAMP_NS, 'camera', pixels_rgb)
+    raw, image = write_one(tmp_path / 'bag', storage, bag_messages.IMAGE, message)
+    assert raw.stamp_ns == bag_messages.stamp_ns(image) == STAMP_NS
+    assert (image.encoding, image.height, image.width, image.step) == ('rgb8', 48, 64, 192)
+    assert image.header.frame_id == 'camera'
+    np.testing.assert_array_equal(image.data.reshape(48, 64, 3), pixels_rgb)
+
+
+def test_camera_info_comes_back(tmp_path, storage):
+    message = bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA)
+    _, info = write_one(tmp_path / 'bag', storage, bag_messages.CAMERA_INFO, message)
+    assert (info.width, info.height, info.distortion_model) == (64, 48, 'plumb_bob')
+    assert list(info.d) == [0.1, -0.2, 0.001, 0.002, 0.3]
+    assert list(info.k) == [53.5, 0, 32.0, 0, 53.9, 24.7, 0, 0, 1]
+    assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
+    assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+
+
+def test_detections_come_back(tmp_path, storage):
+    detections = Detections(
+        np.array([[1.5, 2.0, 30.25, 40.0], [0.0, 0.0, 63.0, 47.0]]),
+        ('teddy bear', 'tv'),
+        np.array([0.5, 0.25]),
+    )
+    message = bag_messages.detections_message(STAMP_NS, 'camera', detections)
+    _, array = write_one(tmp_path / 'bag', storage, bag_messages.DETECTIONS, message)
+    assert [bag_messages.stamp_ns(one) for one in (array, *array.detections)] == [STAMP_NS] * 3
+    again = bag_messages.detections_of(array)
+    np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
+    np.testing.assert_array_equal(again.scores, detections.scores)
+    assert again.class_ids == detections.class_ids
+
+
+def test_best_hypothesis_counts():
+    detections = Detections(np.array([[0.0, 0, 1, 1]]), ('cup',), np.array([0.5]))
+    message = bag_messages.detections_message(STAMP_NS, 'camera', detections)
+    (result,) = message.detections[0].results
+    store = typestore().types
+    better = store['vision_msgs/msg/ObjectHypothesisWithPose'](
+        hypothesis=store['vision_msgs/msg/ObjectHypothesis'](class_id='bowl', score=0.75),
+        pose=result.pose,
+    )
+    message.detections[0].results = [result, better]
+    assert bag_messages.detections_of(message).class_ids == ('bowl',)
+    message.detections[0].results = []
+    assert bag_messages.detections_of(message).class_ids == ('',)
+
+
+def test_pose_comes_back(tmp_path, storage):
+    quat_xyzw = np.array([0.5, 0.5, -0.5, 0.5])
+    map_from_camera = transform_from_pose(np.array([1.0, -2.0, 3.0]), quat_xyzw)
+    message = bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)
+    _, pose = write_one(tmp_path / 'bag', storage, bag_messages.POSE, message)
+    assert pose.header.frame_id == 'world'
+    again = bag_messages.map_from_camera_of(pose)
+    np.testing.assert_allclose(again, map_from_camera, atol=1e-15)
+
+
+@pytest.mark.parametrize('stamp_ns', [0, 1, 999_999_999, 1_000_000_000, (2**31) * 10**9 - 1])
+def test_stamps_are_exact_to_the_nanosecond(tmp_path, storage, stamp_ns):
+    message = bag_messages.pose_message(stamp_ns, 'world', np.eye(4))
+    raw, pose = write_one(tmp_path / 'bag', storage, bag_messages.POSE, message, stamp_ns)
+    assert raw.stamp_ns == bag_messages.stamp_ns(pose) == stamp_ns
+
+
+def test_metadata_is_as_jazzy_reads_it(tmp_path, storage):
+    with BagWriter(tmp_path / 'office', storage) as bag:
+        bag.add_topic('/pose', bag_messages.POSE, RELIABLE_QOS)
+        bag.add_topic('/map', bag_messages.DETECTIONS, LATCHED_QOS)
+        for index in range(3):
+            message = bag_messages.pose_message(STAMP_NS + index, 'world', np.eye(4))
+            bag.write('/pose', STAMP_NS + index, message)
+    content = yaml.safe_load((tmp_path / 'office' / 'metadata.yaml').read_text())
+    info = content['rosbag2_bagfile_information']
+    assert (info['version'], info['storage_identifier']) == (9, storage)
+    assert info['message_count'] == 3
+    assert info['starting_time'] == {'nanoseconds_since_epoch': STAMP_NS}
+    assert info['duration'] == {'nanoseconds': 2}
+    (file,) = info['relative_file_paths']
+    assert (tmp_path / 'office' / file).exists()
+    infinite = {'sec': 9223372036, 'nsec': 854775807}
+    offered = {
+        'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': infinite, 'lifespan': infinite, 'liveliness': 'automatic',
+        'liveliness_lease_duration': infinite, 'avoid_ros_namespace_conventions': False,
+    }
+    latched = offered | {'depth': 1, 'durability': 'transient_local'}
+    topics = [one['topic_metadata'] for one in info['topics_with_message_count']]
+    assert [one['offered_qos_profiles'] for one in topics] == [[offered], [latched]]
+    assert [one['serialization_format'] for one in topics] == ['cdr', 'cdr']
+    assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')
+
+
+def test_database_has_jazzys_tables(tmp_path):
+    write_one(
+        tmp_path / 'bag', 'sqlite3', bag_messages.POSE,
+        bag_messages.pose_message(STAMP_NS, 'world', np.eye(4)),
+    )
+    connection = sqlite3.connect(tmp_path / 'bag' / 'bag.db3')
+    tables = {name for (name,) in connection.execute('SELECT name FROM sqlite_master')}
+    assert tables >= {'schema', 'metadata', 'topics', 'message_definitions', 'messages'}
+    ((version,),) = connection.execute('SELECT schema_version FROM schema')
+    assert version == 4
+    connection.close()
+
+
+def test_existing_output_is_kept(tmp_path, storage):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'precious').write_text('data')
+    with pytest.raises(DatasetError, match='exists already'), BagWriter(tmp_path / 'bag', storage):
+        pass
+    assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
+
+
+def test_failure_leaves_nothing(tmp_path, storage):
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', storage) as bag:
+        bag.add_topic('/pose', bag_messages.POSE)
+        bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
+        assert not (tmp_path / 'bag').exists()  # built beside its place
+        assert len(list(tmp_path.iterdir())) == 1
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_that_appears_meanwhile_is_kept(tmp_path, storage):
+    with pytest.raises(DatasetError, match='exists already'), \
+            BagWriter(tmp_path / 'bag', storage) as bag:
+        bag.add_topic('/pose', bag_messages.POSE)
+        (tmp_path / 'bag').write_text('mine')
+    assert [path.name for path in tmp_path.iterdir()] == ['bag']
+    assert (tmp_path / 'bag').read_text() == 'mine'
+
+
+def test_missing_parent_and_storage_are_named(tmp_path):
+    with pytest.raises(DatasetError, match=r'the folder .*nowhere does not exist'), \
+            BagWriter(tmp_path / 'nowhere' / 'bag'):
+        pass
+    with pytest.raises(DatasetError, match="'zip' is none of sqlite3, mcap"):
+        BagWriter(tmp_path / 'bag', 'zip')
+
+
+def test_full_disk_leaves_nothing(tmp_path, storage):
+    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    program = textwrap.dedent("""
+        import resource, sys
+        import numpy as np
+        from cliploc_ros.datasets import bag_messages
+        from cliploc_ros.datasets.rosbag import BagWriter
+        from cliploc_ros.errors import DatasetError
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
+        try:
+            with BagWriter(sys.argv[1], sys.argv[2]) as bag:
+                bag.add_topic('/image', bag_messages.IMAGE)
+                pixels = np.zeros((480, 640, 3), dtype=np.uint8)
+                for stamp in range(10):
+                    bag.write('/image', stamp, bag_messages.image_message(stamp, '', pixels))
+        except DatasetError as error:
+            print(error)
+    """)
+    run = subprocess.run(
+        [sys.executable, '-c', program, tmp_path / 'bag', storage],
+        capture_output=True, text=True, check=True, timeout=60,
+    )
+    assert 'cannot be written' in run.stdout
+    assert 'nothing was left behind' in run.stdout
+    assert list(tmp_path.iterdir()) == []

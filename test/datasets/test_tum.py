@@ -1,0 +1,342 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading TUM folders, trajectories, cameras and recorded detections."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.datasets.intrinsics import PRESETS, find_camera, read_camera
+from cliploc_ros.datasets.recorded_detections import read_recorded_detections
+from cliploc_ros.datasets.trajectory import Trajectory, slerp
+from cliploc_ros.datasets.tum import parse_stamp_ns, read_tum, read_tum_trajectory
+from cliploc_ros.errors import DatasetError
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A TUM folder of three images; their content does not matter here."""
+    path = tmp_path / 'rgbd_dataset_freiburg2_desk'
+    (path / 'rgb').mkdir(parents=True)
+    lines = ['# color images', '# timestamp filename']
+    for stamp in ('1.000001', '1.033', '1.1'):
+        (path / 'rgb' / f'{stamp}.png').write_bytes(b'')
+        lines.append(f'{stamp} rgb/{stamp}.png')
+    (path / 'rgb.txt').write_text('\n'.join(lines) + '\n')
+    (path / 'groundtruth.txt').write_text(
+        '# timestamp tx ty tz qx qy qz qw\n'
+        '1.00 0 0 0 0 0 0 1\n'
+        '1.04 4 8 -4 0 0 0.7071 0.7071\n'
+    )
+    return path
+
+
+def test_reads_a_folder(folder):
+    sequence = read_tum(folder)
+    assert sequence.stamps_ns == (1_000_001_000, 1_033_000_000, 1_100_000_000)
+    assert [path.name for path in sequence.image_paths] == ['1.000001.png', '1.033.png', '1.1.png']
+    assert len(sequence.trajectory) == 2
+    assert sequence.every(2).stamps_ns == (1_000_001_000, 1_100_000_000)
+
+
+def test_pose_between_samples(folder):
+    pose = read_tum(folder).pose_at(1_010 * MS)
+    quarter = Rotation.from_euler('z', 22.5, degrees=True).as_matrix()
+    np.testing.assert_allclose(pose[:3, :3], quarter, atol=1e-12)
+    np.testing.assert_allclose(pose[:3, 3], [1, 2, -1], atol=1e-12)
+
+
+def test_pose_near_the_ends_and_in_gaps(folder):
+    sequence = read_tum(folder)
+    np.testing.assert_array_equal(sequence.pose_at(980 * MS), np.eye(4))
+    assert sequence.pose_at(980 * MS - 1) is None
+    assert sequence.pose_at(1_060 * MS) is not None
+    assert sequence.pose_at(1_060 * MS + 1) is None
+    (folder / 'groundtruth.txt').write_text('1.00 0 0 0 0 0 0 1\n1.10 1 0 0 0 0 0 1\n')
+    gap = read_tum(folder)
+    assert gap.pose_at(1_020 * MS) is not None
+    assert gap.pose_at(1_050 * MS) is None
+
+
+def test_folder_without_ground_truth(folder):
+    (folder / 'groundtruth.txt').unlink()
+    sequence = read_tum(folder)
+    assert len(sequence.trajectory) == 0
+    assert sequence.pose_at(1_000 * MS) is None
+
+
+def test_ground_truth_in_any_order(folder):
+    (folder / 'groundtruth.txt').write_text(
+        '1.04 4 0 0 0 0 0 1\n1.00 0 0 0 0 0 0 1\n1.04 9 9 9 0 0 0 1\n'
+    )
+    assert read_tum(folder).pose_at(1_020 * MS)[0, 3] == pytest.approx(2)
+
+
+@given(st.integers(0, 2**31 * 10**9 - 10**9))
+def test_stamps_are_exact(stamp_ns):
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    assert parse_stamp_ns(f'{seconds}.{nanoseconds:09}', 'here') == stamp_ns
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('1341847980.722988', 1341847980722988000),
+        ('1.341847980722988100e+09', 1341847980722988100),
+        ('7', 7_000_000_000),
+        ('0.0000000005', 0),
+        ('0.0000000006', 1),
+    ],
+)
+def test_stamp_notations(text, expected):
+    assert parse_stamp_ns(text, 'here') == expected
+
+
+@pytest.mark.parametrize('text', ['', 'x', 'nan', 'inf', '-1', '2147483648'])
+def test_no_stamps(text):
+    with pytest.raises(DatasetError, match=r'^here: '):
+        parse_stamp_ns(text, 'here')
+
+
+@pytest.mark.parametrize(
+    ('name', 'text', 'message'),
+    [
+        ('rgb.txt', '1.0\n', r'rgb.txt:1: expected timestamp and file name'),
+        ('rgb.txt', 'one rgb/1.1.png\n', r"rgb.txt:1: 'one' is no timestamp"),
+        ('rgb.txt', '# x\n\n1.0 rgb/none.png\n', r'rgb.txt:3: image .*none.png does not exist'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.1 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
+        ('rgb.txt', '# nothing\n', r'rgb.txt: lists no images'),
+        ('groundtruth.txt', '1 2 3\n', r'groundtruth.txt:1: expected .*, got 3 fields'),
+        ('groundtruth.txt', '1 0 0 0 0 0 0 one\n', r'groundtruth.txt:1: .*not seven numbers'),
+        ('groundtruth.txt', '1 0 0 nan 0 0 0 1\n', r'groundtruth.txt:1: .*not finite'),
+        ('groundtruth.txt', '1 0 0 0 0 0 0 0\n', r'groundtruth.txt:1: .*norm 0.000, not 1'),
+        ('groundtruth.txt', '-1 0 0 0 0 0 0 1\n', r'groundtruth.txt:1: timestamp -1'),
+    ],
+)
+def test_malformed_files_are_named(folder, name, text, message):
+    (folder / name).write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_tum(folder)
+
+
+def test_missing_files_are_named(folder, tmp_path):
+    with pytest.raises(DatasetError, match='no such folder'):
+        read_tum(tmp_path / 'none')
+    (folder / 'rgb.txt').write_bytes(b'\xff\xfe')
+    with pytest.raises(DatasetError, match=r'rgb\.txt: cannot be read'):
+        read_tum(folder)
+    (folder / 'rgb.txt').unlink()
+    with pytest.raises(DatasetError, match=r'rgb\.txt: not there'):
+        read_tum(folder)
+    with pytest.raises(DatasetError, match='cannot be read'):
+        read_tum_trajectory(tmp_path / 'none.txt')
+
+
+def test_every_must_be_positive(folder):
+    with pytest.raises(DatasetError, match='1 or more'):
+        read_tum(folder).every(0)
+
+
+quaternions = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
+    lambda values: np.linalg.norm(values) > 0.1
+).map(lambda values: np.array(values) / np.linalg.norm(values))
+
+
+@given(quaternions, quaternions, st.floats(0, 1))
+def test_slerp_agrees_with_scipy(start, end, fraction):
+    turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).magnitude()
+    if turn > np.pi - 1e-3:  # two shortest arcs: either is right
+        return
+    expected = Rotation.from_quat(start) * Rotation.from_rotvec(
+        fraction * (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+    )
+    result = slerp(start, end, fraction)
+    assert np.linalg.norm(result) == pytest.approx(1, abs=1e-9)
+    # below cosine 0.9995 slerp is exact; above it is linear, and 3e-6 rad off at most
+    assert (expected.inv() * Rotation.from_quat(result)).magnitude() < 1e-5
+
+
+def test_real_sequence(shared_data):
+    """The real folder: 17 images, the first of them 67 ms before the first pose."""
+    sequence = read_tum(shared_data / 'tum_fr3_office')
+    assert len(sequence) == 17
+    assert sequence.stamps_ns[0] == 1341847980722988000
+    assert [sequence.pose_at(stamp) is None for stamp in sequence.stamps_ns] == [True] + [
+        False
+    ] * 16
+
+
+def test_real_poses_agree_with_others_interpolation(shared_data):
+    folder = shared_data / 'tum_fr3_office'
+    sequence = read_tum(folder)
+    queries = np.load(folder / 'queries.npz')
+    for seconds, truth in zip(queries['timestamps'], queries['map_from_camera'], strict=True):
+        pose = sequence.pose_at(round(seconds * 1e6) * 1000)
+        error_m, error_deg = pose_error(pose, truth)
+        assert error_m < 1e-6
+        assert error_deg < 1e-4
+
+
+def test_empty_trajectory_has_no_pose():
+    empty = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 4)))
+    assert empty.pose_at(0) is None
+
+
+# --- cameras -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('name', 'preset'),
+    [
+        ('rgbd_dataset_freiburg1_desk', 'fr1'),
+        ('rgbd_dataset_freiburg2_pioneer_slam', 'fr2'),
+        ('tum_fr3_office', 'fr3'),
+        ('FR1', 'fr1'),
+    ],
+)
+def test_camera_from_the_folder_name(tmp_path, name, preset):
+    camera, origin = find_camera(None, tmp_path / name)
+    assert camera == PRESETS[preset]
+    assert preset in origin
+
+
+@pytest.mark.parametrize('name', ['office', 'frog1', 'fr4', 'fr12', 'afr1'])
+def test_folder_name_that_says_nothing(tmp_path, name):
+    with pytest.raises(DatasetError, match=r'--intrinsics fr1, fr2, fr3 or a camera\.json'):
+        find_camera(None, tmp_path / name)
+
+
+def test_presets_are_the_published_values():
+    camera = PRESETS['fr1']
+    assert (camera.width, camera.height) == (640, 480)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (517.3, 516.5, 318.6, 255.3)
+    assert camera.distortion == (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    assert {camera.distortion_model for camera in PRESETS.values()} == {'plumb_bob'}
+
+
+def camera_json(path, **changes):
+    values = {'width': 640, 'height': 480, 'fx': 500, 'fy': 501.5, 'cx': 320, 'cy': 240}
+    values |= {'distortion_model': 'plumb_bob', 'd': [0.1, 0, 0, 0, 0]}
+    values |= changes
+    path.write_text(json.dumps({name: one for name, one in values.items() if one != 'absent'}))
+    return path
+
+
+def test_camera_from_a_file(tmp_path):
+    path = camera_json(tmp_path / 'camera.json')
+    camera = read_camera(path)
+    assert (camera.fx, camera.fy, camera.distortion) == (500.0, 501.5, (0.1, 0.0, 0.0, 0.0, 0.0))
+    assert find_camera(str(path), tmp_path) == (camera, str(path))
+    assert find_camera(None, tmp_path) == (camera, str(path))
+    assert find_camera('fr2', tmp_path)[0] == PRESETS['fr2']
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'fx': 'absent'}, "field 'fx' is missing"),
+        ({'fz': 1}, "unknown field 'fz'"),
+        ({'fx': '500'}, "fx is '500', not a number"),
+        ({'fx': float('nan')}, 'fx=nan'),
+        ({'fx': 0}, 'fx=0'),
+        ({'width': 640.5}, 'width is 640.5, not a number of pixels'),
+        ({'width': -1}, '-1x480'),
+        ({'d': [1, 2]}, 'coefficients'),
+        ({'d': 3}, 'd is 3, not a list'),
+        ({'distortion_model': 'magic'}, "'magic'"),
+        ({'distortion_model': 5}, 'distortion_model is 5'),
+    ],
+)
+def test_impossible_cameras_are_refused(tmp_path, changes, message):
+    path = camera_json(tmp_path / 'camera.json', **changes)
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_camera(path)
+    assert str(path) in str(caught.value)
+
+
+def test_camera_files_that_are_none(tmp_path):
+    with pytest.raises(DatasetError, match='no such camera file'):
+        find_camera('fr9', tmp_path)
+    for text in ('{', '[]'):
+        (tmp_path / 'camera.json').write_text(text)
+        with pytest.raises(DatasetError, match=r'camera\.json'):
+            read_camera(tmp_path / 'camera.json')
+
+
+# --- recorded detections -------------------------------------------------------------------
+
+BOOK = {'class_id': 'book', 'score': 0.5789, 'bbox_xyxy': [173.0, 138.0, 219.5, 208.0]}
+
+
+def detections_json(path, frames, **more):
+    path.write_text(json.dumps({'frames': frames, **more}))
+    return path
+
+
+def test_recorded_detections(tmp_path):
+    path = detections_json(
+        tmp_path / 'd.json',
+        [
+            {'timestamp': '1341847980.722988', 'detections': [BOOK, {**BOOK, 'class_id': 'tv'}]},
+            {'timestamp': 1341847980.754743, 'detections': []},
+        ],
+        image_size=[640, 480],
+    )
+    detections = read_recorded_detections(path, (640, 480))
+    assert list(detections) == [1341847980722988000, 1341847980754743000]
+    first, second = detections.values()
+    np.testing.assert_array_equal(first.bboxes_xyxy, [[173, 138, 219.5, 208]] * 2)
+    assert first.class_ids == ('book', 'tv')
+    assert list(first.scores) == [0.5789, 0.5789]
+    assert second.bboxes_xyxy.shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ('frames', 'message'),
+    [
+        ([{'detections': []}], "frame 0: field 'timestamp' is missing"),
+        ([{'timestamp': '1'}], "frame 0: field 'detections' is missing"),
+        ([{'timestamp': 'x', 'detections': []}], "frame 0: 'x' is no timestamp"),
+        ([{'timestamp': '1', 'detections': []}] * 2, 'frame 1: timestamp 1 is there twice'),
+        ([{'timestamp': '1', 'detections': [{}]}], "detection 0: field 'class_id' is missing"),
+        ([3], "frame 0: field 'timestamp' is missing"),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'score': 2}]}], 'score is 2.0'),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'score': True}]}], 'wrong type'),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'score': float('nan')}]}], 'contains NaN'),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'bbox_xyxy': [1, 2, 3]}]}], 'four numbers'),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'bbox_xyxy': [9, 2, 3, 4]}]}], 'left, top'),
+        ([{'timestamp': '1', 'detections': [{**BOOK, 'bbox_xyxy': '1234'}]}], 'wrong type'),
+    ],
+)
+def test_malformed_detections_are_named(tmp_path, frames, message):
+    path = detections_json(tmp_path / 'd.json', frames)
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_recorded_detections(path)
+    assert str(path) in str(caught.value)
+
+
+def test_detection_files_that_are_none(tmp_path):
+    with pytest.raises(DatasetError, match='no such file'):
+        read_recorded_detections(tmp_path / 'none.json')
+    for text in ('{', '[]', '{}', '3'):
+        (tmp_path / 'd.json').write_text(text)
+        with pytest.raises(DatasetError, match=r'd\.json'):
+            read_recorded_detections(tmp_path / 'd.json')
+    detections_json(tmp_path / 'd.json', [], image_size=[640, 480])
+    with pytest.raises(DatasetError, match=r'image_size is \[640, 480\], but the images'):
+        read_recorded_detections(tmp_path / 'd.json', (320, 240))
+
+
+def test_real_detections(shared_data):
+    path = shared_data / 'tum_fr3_office' / 'detections.json'
+    detections = read_recorded_detections(path, (640, 480))
+    assert len(detections) == 2585
+    assert sum(len(frame) for frame in detections.values()) == 17225
