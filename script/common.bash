@@ -20,7 +20,8 @@ enter_build_folder() {
   flock --nonblock 9 || { say 'waiting for another script/setup in this folder'; flock 9; }
   export TMPDIR=$root/build/tmp
   trap 'rm -rf "$root/build/tmp"' EXIT
-  mkdir -p "$TMPDIR"
+  rm -rf "$TMPDIR" # what a killed run left
+  mkdir "$TMPDIR"
 }
 
 # A step is done while its stamp holds the hash of the step's input. Written only on success.
