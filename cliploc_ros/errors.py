@@ -29,3 +29,11 @@ class ModelError(CliplocError):
 
 class DatasetError(CliplocError):
     """A recording that cannot be read or written."""
+
+
+class InternalError(CliplocError):
+    """A defect of this package, not of its input. The traceback is in the log."""
+
+
+class StoppedError(CliplocError):
+    """The process is ending; what was asked for will not come."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core import association
 from cliploc_ros.core.acceptance import Evidence, refusal
 from cliploc_ros.core.association import Candidates
+from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -126,6 +127,20 @@ class Relocalizer:
         self._map = landmark_map
         self._shapes = landmark_map.shapes
         self._options = options
+
+    def warm_up(self) -> None:
+        """Compile the kernels, or read them from disk, before the first request needs them."""
+        rng = np.random.default_rng(0)
+        bboxes = np.array([[100, 100, 150, 160], [300, 120, 360, 150], [200, 300, 260, 390]],
+                          dtype=np.float64)
+        pairs = np.array([[0, 0], [1, 1], [2, 2]], dtype=np.int64)
+        centers = np.array([[0.0, 0, 5], [1, 0, 6], [0, 1, 5]])
+        shapes = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (3, 1))
+        scene = make_scene(Camera(640, 480, 500.0, 500.0, 320.0, 240.0).normalize_bboxes(bboxes),
+                           centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
+        search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet())
+        sum(search_exhaustively(scene, Leaders.none_yet()))
+        project_ellipsoids(np.eye(4), centers, shapes)
 
     def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
         """Find where the camera was.

@@ -19,23 +19,22 @@ _IMAGE_TRANSPORT = ParameterRow(
 _DEVICE = ParameterRow(
     'device', 'auto', "Where the network runs: 'auto' takes a GPU if there is one, else 'cpu', "
     "'cuda' or 'cuda:N'.", read_only=True)
-_MODEL_DIR = ParameterRow(
-    'model_dir', '', 'Where weights named by a tag are downloaded to; empty: '
-    '~/.cache/cliploc_ros/models.', read_only=True)
+_CACHE_DIR = ParameterRow(
+    'cache_dir', '', 'Where downloads and label embeddings are kept; empty: '
+    '~/.cache/cliploc_ros.', read_only=True)
 
 DETECTOR = (
     ParameterRow('model', 'yolov8x.pt', 'Weights: a local file, or a name that ultralytics '
-                 'downloads.', read_only=True),
-    ParameterRow('confidence', 0.1, 'Detections below this confidence are left out.',
+                 'downloads once.', read_only=True),
+    ParameterRow('conf', 0.1, 'Detections below this confidence are left out.',
                  low=0.0, high=1.0),
     ParameterRow('iou', 0.7, 'Of two boxes of a class that overlap more than this, one stays.',
                  low=0.0, high=1.0),
-    ParameterRow('image_size', 640, 'The longer side of the image that the network sees.',
+    ParameterRow('imgsz', 640, 'The longer side of the image that the network sees.',
                  unit='px', low=32, high=4096),
-    ParameterRow('max_detections', 100, 'The most confident detections published.',
-                 low=1, high=1000),
+    ParameterRow('max_det', 100, 'The most confident detections published.', low=1, high=1000),
     _DEVICE,
-    _MODEL_DIR,
+    _CACHE_DIR,
     _IMAGE_TRANSPORT,
 )
 
@@ -68,10 +67,10 @@ RELOCALIZER = (
                  read_only=True),
     ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
                  read_only=True),
+    ParameterRow('clip_checkpoint', '', 'Local file with the weights of that tag; empty: '
+                 'download them once.', read_only=True),
     _DEVICE,
-    _MODEL_DIR,
-    ParameterRow('cache_dir', '', 'Where label embeddings are kept; empty: '
-                 '~/.cache/cliploc_ros.', read_only=True),
+    _CACHE_DIR,
     _IMAGE_TRANSPORT,
     ParameterRow('rectified', False, 'The image is rectified: take P of camera_info and no '
                  'distortion.'),

@@ -6,30 +6,63 @@ import os
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from typing import Any
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, InternalError, StoppedError
 
-T = TypeVar('T')
 # How long a running network may delay the end of its process.
 _GRACE_S = 1.0
 
 
 class Worker:
-    """One thread that works off tasks, one at a time."""
+    """One thread that works off tasks, one at a time, and survives all of them.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    report : callable
+        Takes the traceback of an exception that is no CliplocError.
+    """
+
+    def __init__(self, report: Callable[[str], object]) -> None:
+        self._report = report
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix='inference')
-        self._running: set[Future[object]] = set()
+        self._running: set[Future[Any]] = set()
 
-    def submit(self, task: Callable[[], T]) -> 'Future[T]':
-        """Queue a task; its result or exception is in the future returned."""
-        future = self._pool.submit(task)
+    def submit[T](self, task: Callable[[], T]) -> 'Future[T]':
+        """Queue a task; its result or CliplocError is in the future returned."""
+        try:
+            future = self._pool.submit(self._guarded, task)
+        except RuntimeError as error:
+            raise StoppedError('the node is shutting down') from error
         self._running.add(future)
         future.add_done_callback(self._running.discard)
         return future
+
+    def run[T](self, task: Callable[[], T]) -> T:
+        """Return the result of a task, when its turn has come.
+
+        Raises
+        ------
+        CliplocError
+            What the task raised; StoppedError when the process ends first.
+        """
+        try:
+            return self.submit(task).result()
+        except CancelledError as error:
+            raise StoppedError('the node is shutting down') from error
+
+    def _guarded[T](self, task: Callable[[], T]) -> T:
+        try:
+            return task()
+        except CliplocError:
+            raise
+        except Exception as error:
+            self._report(traceback.format_exc())
+            raise InternalError(f'internal error: {type(error).__name__}: {error} (the traceback '
+                                'is in the log)') from error
 
     def stop(self) -> bool:
         """Drop what waits; return whether the running task ended in time."""
@@ -40,7 +73,7 @@ class Worker:
         return not self._running
 
 
-class LatestOnly(Generic[T]):
+class LatestOnly[T]:
     """Hands items to a worker; while it is busy only the newest waits.
 
     Parameters
@@ -72,7 +105,7 @@ class LatestOnly(Generic[T]):
         self._work(item)
 
 
-class Retrying(Generic[T]):
+class Retrying[T]:
     """Something that is made when first needed, and again after it failed.
 
     Parameters

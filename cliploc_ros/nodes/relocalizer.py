@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The relocalizer node: from image and detections to the robot's pose, when asked."""
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from std_msgs.msg import Header
+from std_srvs.srv import Empty, Trigger
+
+from cliploc_ros.core.relocalizer import Relocalization
+from cliploc_ros.core.transforms import move_covariance
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
+from cliploc_ros.ros.frame_source import Frame, FrameSource
+from cliploc_ros.ros.frames import BaseFrame
+from cliploc_ros.ros.localizer import Localizer, load_localizer
+from cliploc_ros.ros.parameters import NodeParameters
+from cliploc_ros.ros.process import WorkingNode, run_node
+from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.worker import LatestOnly, Retrying
+
+_LOG_PERIOD_S = 5.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a frame led to: a pose to publish or None, and one line that says why."""
+
+    pose: PoseWithCovarianceStamped | None
+    message: str
+
+
+class RelocalizerNode(WorkingNode):
+    """Answers where the robot is, when asked or with every frame."""
+
+    def __init__(self) -> None:
+        super().__init__('relocalizer')
+        self._parameters = NodeParameters(self, RELOCALIZER, relocalizer_options)
+        self._localizer: Retrying[Localizer] = Retrying(self._load)
+        self._base = BaseFrame(self)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
+        self._initial_pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose',
+                                                   qos.POSE)
+        self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
+        self._continuous = LatestOnly(self.worker, self._localize_and_log)
+        self._frames = FrameSource(self, self._parameters['image_transport'], self._on_frame)
+        # Requests are answered one after another, each from frames newer than itself.
+        requests = MutuallyExclusiveCallbackGroup()
+        self.create_service(Trigger, '~/relocalize', self._on_relocalize,
+                            qos_profile=qos.SERVICE, callback_group=requests)
+        self.create_service(Empty, 'reinitialize_global_localization', self._on_reinitialize,
+                            qos_profile=qos.SERVICE, callback_group=requests)
+        self.worker.submit(self._load_ahead)
+        if self._parameters['mode'] == 'continuous':
+            self._frames.listening().__enter__()
+
+    def release(self) -> None:
+        """Let go the request that waits for frames."""
+        self._frames.stop()
+
+    def _load(self) -> Localizer:
+        return load_localizer(self, self._parameters.snapshot())
+
+    def _load_ahead(self) -> None:
+        """Load map and network before the first request needs them."""
+        start = time.monotonic()
+        try:
+            localizer = self._localizer.get()
+            self.get_logger().info(f'ready after {time.monotonic() - start:.1f} s: '
+                                   f'{localizer.description}')
+        except CliplocError as error:
+            self.get_logger().error(str(error))
+
+    def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        answer = self._wake_up()
+        response.success = answer.pose is not None
+        response.message = answer.message
+        return response
+
+    def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        self._wake_up()
+        return response
+
+    def _wake_up(self) -> Answer:
+        """Localize from the next fresh frame, and tell a running localizer of success."""
+        try:
+            # A map or weights that were missing may have been mended since.
+            self.worker.run(self._localizer.get)
+            with self._frames.listening():
+                frame = self._frames.wait_for_fresh(self._parameters['timeout_s'])
+            answer = self.worker.run(lambda: self._localize(frame))
+        except CliplocError as error:
+            answer = Answer(None, str(error))
+        if answer.pose is not None:
+            self._initial_pose.publish(answer.pose)
+        self.get_logger().info(answer.message)
+        return answer
+
+    def _on_frame(self, frame: Frame) -> None:
+        if self._parameters['mode'] == 'continuous':
+            self._continuous.offer(frame)
+
+    def _localize_and_log(self, frame: Frame) -> None:
+        try:
+            message = self._localize(frame).message
+        except CliplocError as error:
+            message = str(error)
+        self.get_logger().info(message, throttle_duration_sec=_LOG_PERIOD_S)
+
+    def _localize(self, frame: Frame) -> Answer:
+        """Localize from one frame and publish what was found; in the worker's thread."""
+        values: Mapping[str, Any] = self._parameters.snapshot()
+        localizer = self._localizer.get()
+        found, times = localizer.localize(frame, values)
+        header = Header(stamp=frame.image.header.stamp, frame_id=localizer.map_frame)
+        camera_from_base = self._base.camera_from_base(
+            values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
+            header.stamp, values['tf_timeout_s'])
+        bases = [hypothesis.map_from_camera @ camera_from_base
+                 for hypothesis in found.hypotheses]
+        self._hypotheses.publish(pose_array_msg(header, bases))
+        if not found.accepted:
+            return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]')
+        assert found.covariance is not None  # what is accepted has one
+        lever = found.hypotheses[0].map_from_camera[:3, :3] @ camera_from_base[:3, 3]
+        pose = pose_with_covariance_msg(header, bases[0],
+                                        move_covariance(found.covariance, lever))
+        self._pose.publish(pose)
+        x, y, z = bases[0][:3, 3]
+        return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {localizer.map_frame} '
+                            f'[{_summary(found)}; {times}]')
+
+
+def _summary(found: Relocalization) -> str:
+    return (f'score {found.score:.2f}, {len(found.matches)} inliers, '
+            f'{found.tried} hypotheses')
+
+
+def main() -> int:
+    """Run the node until it is told to stop."""
+    return run_node(RelocalizerNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

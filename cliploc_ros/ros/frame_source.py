@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames from the wire: image, camera_info and detections of the same stamp."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.errors import CliplocError, StoppedError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.pairing import ExactPairing
+
+# What may wait for its counterparts: a second of 1080p images, or slow detections of them.
+_MAX_WAITING = 60
+_MAX_IMAGE_BYTES = 256 * 2**20
+_MAX_DETECTIONS_BYTES = 16 * 2**20
+# A guess at what one detection holds in Python's memory.
+_DETECTION_BYTES = 2000
+
+
+class NoFrameError(CliplocError):
+    """No complete frame came in time; the message says what was missing."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The messages of one instant, and when the image arrived (monotonic clock) [s]."""
+
+    image: Image | CompressedImage
+    camera_info: CameraInfo
+    detections: Detection2DArray
+    received_at: float
+
+
+class FrameSource:
+    """Subscribes while somebody needs frames, and only then.
+
+    Parameters
+    ----------
+    node : Node
+    transport : str
+        'raw' or 'compressed'.
+    on_frame : callable
+        Called with each complete frame, in the executor's thread.
+    """
+
+    def __init__(self, node: Node, transport: str, on_frame: Callable[[Frame], None]) -> None:
+        self._node = node
+        self._image_type = Image if transport == 'raw' else CompressedImage
+        self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
+                        'camera_info': 'camera_info', 'detections': 'detections'}
+        self._on_frame = on_frame
+        self._group = MutuallyExclusiveCallbackGroup()
+        self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
+                                      'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
+        self._changed = threading.Condition()
+        self._subscriptions: list[Subscription] = []
+        self._listeners = 0
+        self._newest: Frame | None = None
+        self._stopped = False
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Hold the subscriptions open; the first to come opens them, the last closes them."""
+        with self._changed:
+            self._listeners += 1
+            if self._listeners == 1:
+                self._open()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._listeners -= 1
+                if self._listeners == 0:
+                    self._close()
+
+    def wait_for_fresh(self, timeout_s: float) -> Frame:
+        """Return the first complete frame whose image arrives from now on.
+
+        Parameters
+        ----------
+        timeout_s : float
+            [s]
+
+        Raises
+        ------
+        NoFrameError
+            None came in time; the message says what was missing.
+        StoppedError
+            The node is shutting down.
+        """
+        now = time.monotonic()
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopped or self._newest_since(now) is not None,
+                                   timeout_s)
+            if self._stopped:
+                raise StoppedError('the node is shutting down')
+            frame = self._newest_since(now)
+            if frame is None:
+                raise NoFrameError(f'no fresh frame within {timeout_s:g} s: {self._why_none()}')
+            return frame
+
+    def stop(self) -> None:
+        """Release everybody who waits."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def _newest_since(self, moment: float) -> Frame | None:
+        newest = self._newest
+        return newest if newest is not None and newest.received_at >= moment else None
+
+    def _open(self) -> None:
+        self._pairing.clear()
+        self._newest = None
+        for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
+                                            ('camera_info', CameraInfo, qos.CAMERA_INFO),
+                                            ('detections', Detection2DArray, qos.DETECTIONS_IN)):
+            self._subscriptions.append(self._node.create_subscription(
+                message_type, self._topics[name], self._receiver(name), profile,
+                callback_group=self._group, qos_overriding_options=qos.overridable()))
+
+    def _close(self) -> None:
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+        self._pairing.clear()
+        self._newest = None
+
+    def _receiver(self, name: str) -> Callable[[Any], None]:
+        def receive(msg: Any) -> None:
+            self._take(name, msg)
+        return receive
+
+    def _take(self, name: str, msg: Any) -> None:
+        """Take one message in, and pass the frame on that it completes."""
+        size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
+                'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
+        with self._changed:
+            if not self._listeners:
+                return
+            complete = self._pairing.add(name, stamp_ns(msg.header.stamp),
+                                         (msg, time.monotonic()), size)
+            if complete is None:
+                return
+            image, received_at = complete['image']
+            frame = Frame(image, complete['camera_info'][0], complete['detections'][0],
+                          received_at)
+            self._newest = frame
+            self._changed.notify_all()
+        self._on_frame(frame)
+
+    def _why_none(self) -> str:
+        """Say what was missing."""
+        received = self._pairing.received
+        missing = [self._silence(name) for name in received if not received[name]]
+        if missing:
+            return '; '.join(missing)
+        stamps = ', '.join(f'{self._resolved(name)} {stamp / 1e9:.6f}'
+                           for name, stamp in self._pairing.last_stamp_ns.items())
+        return (f'stamps never match (last seen: {stamps}): camera_info and detections must '
+                "carry their image's header")
+
+    def _silence(self, name: str) -> str:
+        topic = self._resolved(name)
+        publishers = self._node.count_publishers(topic)
+        if publishers:
+            return (f'no {name} on {topic}, though it has {publishers} publisher(s): is it '
+                    'sending, and is its QoS compatible?')
+        return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
+
+    def _resolved(self, name: str) -> str:
+        return str(self._node.resolve_topic_name(self._topics[name]))

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From a frame of messages to a relocalization: what the node keeps loaded between requests."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.node import Node
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.models.observer import Observer
+from cliploc_ros.ros.conversions import (
+    camera_from_msg,
+    detections_from_msg,
+    image_from_msg,
+    stamp_ns,
+)
+from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.map_parameters import load_map
+from cliploc_ros.ros.tables import relocalizer_options
+
+
+class StageTimes:
+    """How long each stage of one localization took [ms]."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._stages: dict[str, float] = {}
+
+    def mark(self, stage: str) -> None:
+        """End a stage that began where the last one ended."""
+        now = time.perf_counter()
+        self._stages[stage] = (now - self._start) * 1e3
+        self._start = now
+
+    def __str__(self) -> str:
+        """Return the stages for people."""
+        return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in self._stages.items())
+
+
+class Localizer:
+    """A map and, unless only classes are matched, an observer for its labels.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    observer : Observer or None
+    options : RelocalizerOptions
+    """
+
+    def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
+                 options: RelocalizerOptions) -> None:
+        self._map = landmark_map
+        self._observer = observer
+        self._options = options
+        self._relocalizer = Relocalizer(landmark_map, options)
+        self._relocalizer.warm_up()
+
+    @property
+    def map_frame(self) -> str:
+        """Return the frame that poses are given in."""
+        return self._map.frame_id
+
+    @property
+    def description(self) -> str:
+        """Return what is loaded, in a line."""
+        return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', "
+                f'{self._options.matching}_{self._options.algorithm}')
+
+    def localize(self, frame: Frame, values: Mapping[str, Any]
+                 ) -> tuple[Relocalization, StageTimes]:
+        """Find where the camera was when it took a frame.
+
+        Parameters
+        ----------
+        frame : Frame
+        values : mapping
+            Of the relocalizer's parameters, as they are now.
+
+        Raises
+        ------
+        CliplocError
+            Names what in the frame or in the parameters is to be mended.
+        """
+        times = StageTimes()
+        image = image_from_msg(frame.image)
+        height, width = image.shape[:2]
+        camera = camera_from_msg(frame.camera_info, (width, height), values['rectified'])
+        detections = detections_from_msg(frame.detections).usable(
+            width, height, values['max_detections'])
+        times.mark('decoding')
+        stamp = stamp_ns(frame.image.header.stamp)
+        observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
+            else self._observer.observe(image, camera, detections, stamp)
+        times.mark('CLIP')
+        found = self._with_options(values).relocalize([observation])
+        times.mark('search')
+        return found, times
+
+    def _with_options(self, values: Mapping[str, Any]) -> Relocalizer:
+        """Return the relocalizer for the options as they are now."""
+        options = relocalizer_options(values)
+        if options != self._options:
+            self._relocalizer, self._options = Relocalizer(self._map, options), options
+        return self._relocalizer
+
+
+def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
+    """Load map and, if the matching type asks for it, CLIP.
+
+    Raises
+    ------
+    CliplocError
+        Names the file, parameter or download to mend.
+    """
+    options = relocalizer_options(values)
+    landmark_map = load_map(node, values['map_file'])
+    observer = None
+    if options.needs_similarities:
+        from cliploc_ros.models.clip_encoder import load_encoder
+        from cliploc_ros.models.clip_weights import ClipOptions
+        observer = Observer(*load_encoder(
+            ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
+                        checkpoint_path=values['clip_checkpoint'], device=values['device'],
+                        cache_dir=values['cache_dir']),
+            landmark_map.labels))
+    return Localizer(landmark_map, observer, options)
