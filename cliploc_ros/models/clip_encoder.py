@@ -1,0 +1,264 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""CLIP through open_clip: crops and labels in, unit embeddings out."""
+
+import ctypes
+import gc
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
+from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.devices import resolve_device, resolve_precision
+from cliploc_ros.models.files import resolve_cache_dir
+from cliploc_ros.models.images import check_image_rgb, crop_bounds
+from cliploc_ros.models.label_embeddings import LabelCache
+
+if TYPE_CHECKING:
+    import torch
+
+_LABEL_BATCH = 64
+# Past this the middle square, all that CLIP sees of a long crop, no longer depends on the rest.
+_MAX_ASPECT = 16
+
+logger = logging.getLogger(__name__)
+
+
+class LoadedEncoder(NamedTuple):
+    """An encoder ready for crops, and the embeddings (L, d) of the labels it was loaded for."""
+
+    encoder: 'ClipEncoder'
+    label_embeddings: NDArray[np.float32]
+
+
+def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
+    """Load CLIP for a map: its labels encoded, its image tower ready, its text tower gone.
+
+    The labels' embeddings come from the cache when model, weights and labels are known there;
+    then the text tower is never loaded. Otherwise it is loaded first, alone, and freed before
+    the image tower comes.
+
+    Parameters
+    ----------
+    options : ClipOptions
+        Which CLIP, and how to run it.
+    labels : sequence of str
+        The map's labels; they may repeat.
+
+    Raises
+    ------
+    ModelError
+        When the weights cannot be found or loaded.
+    OptionsError
+        When the device is not there.
+    """
+    started = time.monotonic()
+    weights = resolve_clip_weights(options)
+    # Once each, in one order: neither moving nor reordering landmarks asks for new embeddings.
+    unique = sorted(set(labels))
+    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
+    embeddings = cache.load(weights.key, unique, weights.embed_dim)
+    source = 'cached'
+    if embeddings is None:
+        source = 'encoded'
+        embeddings = encode_labels(weights, unique, resolve_device(options.device))
+        cache.store(weights.key, unique, embeddings)
+    encoder = ClipEncoder(weights, options)
+    logger.info('CLIP %s is ready after %.1f s, %d labels %s', weights.model,
+                time.monotonic() - started, len(unique), source)
+    rows = {label: row for row, label in enumerate(unique)}
+    return LoadedEncoder(encoder, embeddings[[rows[label] for label in labels]])
+
+
+class ClipEncoder:
+    """An `ImageTextEncoder` that keeps the image tower alone in memory.
+
+    Parameters
+    ----------
+    weights : ClipWeights
+        What `resolve_clip_weights` found.
+    options : ClipOptions
+        Device, precision and largest batch.
+
+    Raises
+    ------
+    ModelError
+        When the file does not hold the weights of the model, or they give no finite numbers.
+    OptionsError
+        When the device is not there.
+    """
+
+    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
+        import open_clip
+
+        self._weights = weights
+        self._max_batch = options.max_batch
+        self._device = resolve_device(options.device)
+        precision = resolve_precision(options.precision, self._device)
+        self._model, self._preprocess = load_image_tower(weights, self._device, precision)
+        self._dtype = open_clip.get_input_dtype(precision)
+        shortens = weights.preprocess.get('image_resize_mode', 'shortest') == 'shortest'
+        self._max_aspect = _MAX_ASPECT if shortens else sys.maxsize
+        # The first pass pays for kernels and memory; better now than when the robot wakes up.
+        self.encode_crops(np.zeros((32, 32, 3), dtype=np.uint8), np.array([[0.0, 0, 32, 32]]))
+
+    @property
+    def key(self) -> str:
+        """Identify model and weights: equal keys give equal label embeddings."""
+        return self._weights.key
+
+    @property
+    def embed_dim(self) -> int:
+        """Return the length d of an embedding."""
+        return self._weights.embed_dim
+
+    def encode_crops(
+        self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return one embedding for each box of an image.
+
+        A crop holds every pixel that its box touches, goes through open_clip's own
+        preprocessing, and all crops go through the tower together, at most ``max_batch`` at once.
+
+        Parameters
+        ----------
+        image_rgb : ndarray (h, w, 3) uint8
+            The image, red first.
+        bboxes_xyxy : ndarray (n, 4)
+            Left, top, right, bottom [px]; `visible_boxes` says which ones can be cropped.
+
+        Returns
+        -------
+        ndarray (n, d) float32
+            Rows of unit length.
+
+        Raises
+        ------
+        ImageError
+            For an image of another shape or type, or without pixels.
+        CliplocError
+            For boxes that are not finite, are empty, or do not overlap the image.
+        ModelError
+            When memory runs out, or the tower gives no finite numbers.
+        """
+        check_image_rgb(image_rgb)
+        bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
+        embeddings = [self._encode_batch(image_rgb, bounds[start:start + self._max_batch])
+                      for start in range(0, len(bounds), self._max_batch)]
+        return _as_rows(embeddings, self.embed_dim, self._weights)
+
+    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
+        """Return one embedding (L, d) for each label; the text tower is loaded and freed again."""
+        return encode_labels(self._weights, labels, self._device)
+
+    def _encode_batch(
+        self, image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64]
+    ) -> 'torch.Tensor':
+        import torch
+        from PIL import Image
+
+        crops = [Image.fromarray(np.ascontiguousarray(_cut(image_rgb, row, self._max_aspect)))
+                 for row in bounds]
+        batch = torch.stack([self._preprocess(crop) for crop in crops])
+        try:
+            with torch.inference_mode():
+                batch = batch.to(self._device, dtype=self._dtype)
+                return _normalize(self._model.encode_image(batch, normalize=False))
+        except torch.cuda.OutOfMemoryError as error:
+            raise ModelError(f'the GPU has no memory left for {len(crops)} crops at once: lower '
+                             'max_batch or choose a smaller model') from error
+
+
+def encode_labels(
+    weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
+) -> NDArray[np.float32]:
+    """Return one embedding (L, d) for each label, float32 rows of unit length.
+
+    The text tower is loaded for it and freed afterwards. It runs in fp32 on any device, so that
+    what one machine caches serves another. Labels longer than the model reads are cut, with a
+    warning.
+    """
+    if not labels:
+        return np.empty((0, weights.embed_dim), dtype=np.float32)
+    embeddings = _run_text_tower(weights, labels, device)
+    _free_memory()
+    return _as_rows(embeddings, weights.embed_dim, weights)
+
+
+def _run_text_tower(
+    weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
+) -> 'list[torch.Tensor]':
+    import open_clip
+    import torch
+
+    with quiet_root_logger():
+        tokenizer = open_clip.get_tokenizer(weights.model)
+    _warn_of_long_labels(tokenizer, labels)
+    model = load_text_tower(weights, device)
+    with torch.inference_mode():
+        batches = [tokenizer(list(labels[start:start + _LABEL_BATCH])).to(device)
+                   for start in range(0, len(labels), _LABEL_BATCH)]
+        return [_normalize(model.encode_text(batch, normalize=False)) for batch in batches]
+
+
+def _warn_of_long_labels(tokenizer: Any, labels: Sequence[str]) -> None:
+    room = tokenizer.context_length - 2  # between the start and end tokens
+    for label in labels:
+        tokens = len(tokenizer.encode(label))
+        if tokens > room:
+            logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
+                           'rest', label, tokens, room)
+
+
+def _cut(
+    image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64], max_aspect: int
+) -> NDArray[np.uint8]:
+    """Return a crop, a very long one shortened about its middle.
+
+    open_clip scales the short side up to the tower's and cuts a square from the middle: of a
+    crop of 1 x 2000 pixels it would make an image of 224 x 448,000 first.
+    """
+    left, top, right, bottom = bounds.tolist()
+    longest = max_aspect * min(right - left, bottom - top)
+    cut_x = max(right - left - longest, 0) // 2
+    cut_y = max(bottom - top - longest, 0) // 2
+    return image_rgb[top + cut_y:bottom - cut_y, left + cut_x:right - cut_x]
+
+
+def _normalize(features: 'torch.Tensor') -> 'torch.Tensor':
+    """Return unit rows in fp32 on the CPU: fp16 would round their length to 1e-3."""
+    import torch
+
+    return torch.nn.functional.normalize(features.float(), dim=-1).cpu()
+
+
+def _as_rows(
+    embeddings: 'list[torch.Tensor]', embed_dim: int, weights: ClipWeights
+) -> NDArray[np.float32]:
+    if not embeddings:
+        return np.empty((0, embed_dim), dtype=np.float32)
+    rows = np.concatenate([batch.numpy() for batch in embeddings])
+    if not np.isfinite(rows).all():
+        raise ModelError(f'{weights.file} gives embeddings that are not finite: the weights are '
+                         'corrupt, or overflow in fp16 (set the precision to fp32)')
+    return rows
+
+
+def _free_memory() -> None:
+    """Give what a freed network held back to the system."""
+    import torch
+
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    # glibc keeps freed blocks below 32 MB for later; a robot's other processes want them now.
+    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
+    if trim is not None:
+        trim(0)

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The two towers of CLIP, each loaded alone: the image tower to stay, the text tower to go."""
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.clip_checkpoint import copy_tensors, read_state_dict
+from cliploc_ros.models.clip_weights import ClipWeights
+
+if TYPE_CHECKING:
+    import torch
+    from PIL.Image import Image
+
+# Apple's MobileCLIP and Google's big_vision: open_clip converts these into the model it fills.
+_FOREIGN_PREFIX = 'image_encoder.'
+_FOREIGN_SUFFIXES = ('.npz', '.npy')
+
+
+def load_image_tower(
+    weights: ClipWeights, device: 'torch.device', precision: str
+) -> 'tuple[Any, Callable[[Image], torch.Tensor]]':
+    """Return a CLIP of which only ``encode_image`` works, and open_clip's preprocessing for it.
+
+    Parameters
+    ----------
+    weights : ClipWeights
+        What to load.
+    device : torch.device
+        Where it runs.
+    precision : str
+        'fp16' or 'fp32'.
+
+    Raises
+    ------
+    ModelError
+        When the file does not hold the weights of the model.
+    """
+    model, preprocess = _load(weights, 'visual', device, precision)
+    return model, preprocess
+
+
+def load_text_tower(weights: ClipWeights, device: 'torch.device') -> Any:
+    """Return a CLIP of which only ``encode_text`` works, in fp32; raises as the image tower."""
+    model, _ = _load(weights, 'text', device, 'fp32')
+    return model
+
+
+def _load(
+    weights: ClipWeights, tower: str, device: 'torch.device', precision: str
+) -> tuple[Any, Any]:
+    model, preprocess = _build_without_memory(weights, precision)
+    state = {} if weights.file.suffix in _FOREIGN_SUFFIXES else read_state_dict(weights.file)
+    module = getattr(model, tower)
+    if _is_foreign(state) or _has_unsaved_buffers(module):
+        model = _load_by_open_clip(weights, device, precision)
+    else:
+        _fill(module, tower, state, weights, device)
+    for name, _ in list(model.named_children()):
+        if name != tower:
+            delattr(model, name)
+    return model.requires_grad_(False).eval(), preprocess
+
+
+def _build_without_memory(weights: ClipWeights, precision: str) -> tuple[Any, Any]:
+    """Return the model on torch's meta device (shapes and types alone) and its preprocessing.
+
+    To draw random weights and overwrite them would take seconds and the memory of both towers.
+    """
+    import open_clip
+    import torch
+
+    with quiet_root_logger(), torch.device('meta'):
+        model, _, preprocess = open_clip.create_model_and_transforms(
+            weights.model, load_weights=False, precision=precision, device='meta',
+            force_quick_gelu=weights.quick_gelu, force_custom_text=True, **weights.preprocess)
+    return model, preprocess
+
+
+def _load_by_open_clip(weights: ClipWeights, device: 'torch.device', precision: str) -> Any:
+    """Return the model as open_clip itself builds and fills it: slower, in twice the memory."""
+    import open_clip
+
+    try:
+        with quiet_root_logger():
+            return open_clip.create_model(
+                weights.model, pretrained=str(weights.file), precision=precision, device=device,
+                force_quick_gelu=weights.quick_gelu, force_custom_text=True)
+    except Exception as error:  # open_clip has no exceptions of its own
+        raise ModelError(f'{weights.file} does not hold the weights of CLIP model '
+                         f"'{weights.model}': {str(error)[:300]}") from error
+
+
+def _is_foreign(state: 'dict[str, torch.Tensor]') -> bool:
+    return not state or any(name.startswith(_FOREIGN_PREFIX) for name in state)
+
+
+def _has_unsaved_buffers(module: 'torch.nn.Module') -> bool:
+    """Tell whether a tower computes tensors when built that no checkpoint holds."""
+    from open_clip.transformer import TextTransformer
+
+    unsaved = {name for name, _ in module.named_buffers()} - module.state_dict().keys()
+    return bool(unsaved - ({'attn_mask'} if isinstance(module, TextTransformer) else set()))
+
+
+def _fill(
+    module: 'torch.nn.Module',
+    tower: str,
+    state: 'dict[str, torch.Tensor]',
+    weights: ClipWeights,
+    device: 'torch.device',
+) -> None:
+    """Give a tower on the meta device its weights, every one of them."""
+    wanted = {f'{tower}.{name}': tensor for name, tensor in module.state_dict().items()}
+    misfits = _misfits(wanted, {name: tensor.shape for name, tensor in state.items()
+                                if name.startswith(f'{tower}.')})
+    if misfits:
+        more = f' (and {len(misfits) - 1} more)' if len(misfits) > 1 else ''
+        raise ModelError(f'{weights.file} does not hold the weights of CLIP model '
+                         f"'{weights.model}': {misfits[0]}{more}")
+    copies = copy_tensors(weights.file, state, wanted, device)
+    module.load_state_dict({name.removeprefix(f'{tower}.'): tensor
+                            for name, tensor in copies.items()}, strict=True, assign=True)
+    if getattr(module, 'attn_mask', None) is not None:
+        module.attn_mask = module.build_causal_mask().to(device)  # type: ignore[operator]
+
+
+def _misfits(
+    wanted: 'dict[str, torch.Tensor]', found: 'dict[str, torch.Size]'
+) -> list[str]:
+    """Say what is not exactly as wanted among the tensors that a checkpoint has for a tower."""
+    return ([f'{name} has shape {tuple(found[name])} there and {tuple(tensor.shape)} in the model'
+             for name, tensor in wanted.items() if found.get(name, tensor.shape) != tensor.shape]
+            + [f'{name} is missing' for name in wanted if name not in found]
+            + [f'{name} is not part of the model' for name in found if name not in wanted])
+
+
+@contextlib.contextmanager
+def quiet_root_logger() -> Iterator[None]:
+    """Keep open_clip from warning of random weights, and from configuring the root logger.
+
+    It logs through ``logging.warning``, which gives a root logger without handlers one.
+    """
+    root = logging.getLogger()
+    handler = logging.NullHandler()
+
+    def is_from_elsewhere(record: logging.LogRecord) -> bool:
+        return 'open_clip' not in record.pathname or record.levelno >= logging.ERROR
+
+    root.addHandler(handler)
+    root.addFilter(is_from_elsewhere)
+    try:
+        yield
+    finally:
+        root.removeFilter(is_from_elsewhere)
+        root.removeHandler(handler)

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which CLIP is meant: its architecture, its file of weights and how they were trained."""
+
+import difflib
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.devices import check_precision
+from cliploc_ros.models.download import announce_start, download
+from cliploc_ros.models.files import check_weights_file, fingerprint_file, resolve_cache_dir
+
+_WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
+
+
+@dataclass(frozen=True)
+class ClipOptions:
+    """Which CLIP to load, and how to run it.
+
+    Parameters
+    ----------
+    model : str
+        Architecture, a name of ``open_clip.list_models()``.
+    pretrained : str
+        A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also says
+        how the weights were trained (activation, colour normalization); a path leaves the
+        architecture's own values.
+    checkpoint_path : str
+        Local file with the weights of the tag, instead of a download; '' downloads.
+    device : str
+        'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
+    precision : str
+        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'; of the image tower.
+    max_batch : int
+        Most crops in one forward pass; it bounds the memory.
+    cache_dir : str
+        Folder for downloads and label embeddings; '' is the user's cache.
+    download_timeout_s : float
+        Give up a download when no byte has arrived for so long [s].
+
+    Raises
+    ------
+    OptionsError
+        For values out of range.
+    """
+
+    model: str = 'ViT-L-14'
+    pretrained: str = 'openai'
+    checkpoint_path: str = ''
+    device: str = 'auto'
+    precision: str = 'auto'
+    max_batch: int = 64
+    cache_dir: str = ''
+    download_timeout_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_precision(self.precision)
+        if self.max_batch < 1:
+            raise OptionsError(f'max_batch must be at least 1, not {self.max_batch}')
+        if not self.download_timeout_s > 0.0:
+            raise OptionsError(f'download_timeout_s must be positive, not '
+                               f'{self.download_timeout_s}')
+
+
+@dataclass(frozen=True)
+class ClipWeights:
+    """A file of CLIP weights and what must be known to use it.
+
+    Parameters
+    ----------
+    model : str
+        Architecture, a name of ``open_clip.list_models()``.
+    file : Path
+        The weights.
+    quick_gelu : bool
+        Whether they were trained with OpenAI's approximate GELU.
+    preprocess : dict
+        ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
+        ``open_clip.create_model_and_transforms`` takes them; empty for its defaults.
+    embed_dim : int
+        Length of an embedding.
+    key : str
+        Identifies model and weights.
+    """
+
+    model: str
+    file: Path
+    quick_gelu: bool
+    preprocess: dict[str, Any]
+    embed_dim: int
+    key: str
+
+
+def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
+    """Find the weights that the options name, downloading them where they are not here yet.
+
+    Raises
+    ------
+    ModelError
+        For an unknown model or tag (the nearest names are listed), a file that is missing or
+        damaged, and a download that fails.
+    """
+    import open_clip
+
+    model = options.model.replace('/', '-')  # OpenAI wrote ViT-L/14
+    config = open_clip.get_model_config(model) if model in open_clip.list_models() else None
+    if config is None:
+        raise ModelError(f"unknown CLIP model '{options.model}'"
+                         f'{_nearest(model, open_clip.list_models())} '
+                         '(open_clip.list_models() names all)')
+    if {'hf_model_name', 'hf_tokenizer_name'} & config['text_cfg'].keys():
+        raise ModelError(f"CLIP model '{options.model}' takes its tokenizer from the transformers "
+                         "library, which is not supported: choose one like ViT-L-14 or RN50")
+    tag = open_clip.get_pretrained_cfg(model, options.pretrained)
+    file = Path(options.checkpoint_path or options.pretrained).expanduser().absolute()
+    if not tag and (options.checkpoint_path or not file.exists()):
+        raise _unknown_pretrained(model, options)
+    if tag and not options.checkpoint_path:
+        file = _cached_file(tag, options) or _download(model, tag, options)
+    check_weights_file(file)
+    quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or is_torchscript(file))
+    return ClipWeights(
+        model=model,
+        file=file,
+        quick_gelu=quick_gelu,
+        preprocess={f'image_{name}': tag[name] for name in
+                    ('mean', 'std', 'interpolation', 'resize_mode') if name in tag},
+        embed_dim=config['embed_dim'],
+        key=f'{model}:{"quick_gelu" if quick_gelu else "gelu"}:{fingerprint_file(file)}')
+
+
+def is_torchscript(file: Path) -> bool:
+    """Tell whether a file is a TorchScript archive: the form in which OpenAI published CLIP."""
+    if not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any(name.endswith('/constants.pkl') for name in archive.namelist())
+
+
+def fetch_clip_weights(model: str, pretrained: str, folder: str) -> str:
+    """Download the weights of a tag into open_clip's cache layout in a folder; return the file.
+
+    Runs in the child process of `cliploc_ros.models.download`.
+    """
+    import open_clip
+
+    announce_start()
+    return open_clip.download_pretrained(
+        open_clip.get_pretrained_cfg(model, pretrained), cache_dir=folder)
+
+
+def _unknown_pretrained(model: str, options: ClipOptions) -> ModelError:
+    import open_clip
+
+    name = options.pretrained
+    if os.sep in name or name.endswith(_WEIGHT_SUFFIXES):
+        return ModelError(f'{name} does not exist: check the path of the weights')
+    tags = open_clip.list_pretrained_tags_by_model(model)
+    return ModelError(f"unknown weights '{name}' for CLIP model '{model}'{_nearest(name, tags)}; "
+                      f"there are: {', '.join(tags) or 'none'}")
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    by_lower_case = {known_name.lower(): known_name for known_name in known}
+    near = difflib.get_close_matches(name.lower(), by_lower_case, n=4, cutoff=0.5)
+    return f': did you mean {", ".join(by_lower_case[match] for match in near)}?' if near else ''
+
+
+def _weights_folder(options: ClipOptions) -> Path:
+    return resolve_cache_dir(options.cache_dir) / 'weights'
+
+
+def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
+    """Return the file of an earlier download, here or in the hub's own cache.
+
+    Asking open_clip would ask the network first: a robot without one would wait at every start.
+    """
+    import huggingface_hub
+    from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
+
+    repository, name = os.path.split(tag.get('hf_hub', ''))
+    if not repository:
+        return None
+    names = ((str(Path(name).with_suffix('.safetensors')), name) if name
+             else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
+    for folder in (_weights_folder(options), None):
+        for candidate in names:
+            found = huggingface_hub.try_to_load_from_cache(repository, candidate, folder)
+            if isinstance(found, str):
+                return Path(found)
+    return None
+
+
+def _download(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
+    repository = os.path.split(tag.get('hf_hub', ''))[0]
+    source = f'https://huggingface.co/{repository}' if repository else tag.get('url', '')
+    remedy = (f'Without a network: download the weights from {source} on another machine and set '
+              'checkpoint_path to the file')
+    return download('cliploc_ros.models.clip_weights:fetch_clip_weights',
+                    [model, options.pretrained], _weights_folder(options), remedy,
+                    options.download_timeout_s)

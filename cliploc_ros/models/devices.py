@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a network runs and how precisely."""
+
+from typing import TYPE_CHECKING
+
+from cliploc_ros.errors import OptionsError
+
+if TYPE_CHECKING:
+    import torch
+
+PRECISIONS = ('auto', 'fp16', 'fp32')
+
+
+def check_precision(precision: str) -> None:
+    """Refuse with an OptionsError a precision that is none of PRECISIONS."""
+    if precision not in PRECISIONS:
+        raise OptionsError(f"precision '{precision}' is none of {', '.join(PRECISIONS)}")
+
+
+def resolve_device(device: str) -> 'torch.device':
+    """Return the torch device for 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
+
+    Raises
+    ------
+    OptionsError
+        For another name, or a GPU that torch does not see.
+    """
+    import torch
+
+    if device == 'auto':
+        device = 'cuda' if torch.cuda.is_available() else 'cpu'
+    try:
+        resolved = torch.device(device)
+    except RuntimeError:
+        resolved = None
+    if resolved is None or resolved.type not in ('cpu', 'cuda'):
+        raise OptionsError(f"device '{device}' is none of auto, cpu, cuda, cuda:0, cuda:1 ...")
+    if resolved.type == 'cuda' and (resolved.index or 0) >= torch.cuda.device_count():
+        raise OptionsError(f"device '{device}' is not there: torch {torch.__version__} sees "
+                           f"{torch.cuda.device_count()} GPUs; set the device to 'auto' or 'cpu'")
+    return resolved
+
+
+def resolve_precision(precision: str, device: 'torch.device') -> str:
+    """Return 'fp16' or 'fp32'; 'auto' means fp16 on a GPU and fp32 on a CPU."""
+    check_precision(precision)
+    if precision == 'auto':
+        return 'fp16' if device.type == 'cuda' else 'fp32'
+    return precision

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Label embeddings on disk: with them a robot wakes up without the text tower."""
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import time
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FORMAT = 1
+# A map of 1,000 labels takes 3 MB with ViT-L-14.
+_MAX_FILES = 32
+_STALE_S = 24 * 3600.0
+
+logger = logging.getLogger(__name__)
+
+
+class LabelCache:
+    """A folder of label embeddings, one ``.npz`` for each model and set of labels.
+
+    A file is named by the hash of the encoder's key (model, activation, fingerprint of the
+    weights) and of the labels, and holds both, so that a foreign or damaged file is noticed. One
+    file for the whole set, not one a label: embeddings then never depend on what was encoded
+    before, and a map edit costs one cold start. Files are written beside their place and
+    renamed, so that any number of processes may share the folder. A hit marks its file as used;
+    beyond 32 files the longest unused go.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the files are; made when first needed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load(self, key: str, labels: Sequence[str], embed_dim: int) -> NDArray[np.float32] | None:
+        """Return the embeddings (L, embed_dim) of L labels, or None when they must be encoded."""
+        file = self._file(key, labels)
+        if not file.exists():
+            return None
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                found = bytes(archive['identity'])
+                embeddings = np.asarray(archive['embeddings'])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            return self._ignore(file, error)
+        if found != _identity(key, labels):
+            return self._ignore(file, 'it belongs to other weights or labels')
+        if (embeddings.shape != (len(labels), embed_dim) or embeddings.dtype != np.float32
+                or not np.allclose(np.linalg.norm(embeddings, axis=1), 1.0, atol=1e-3)):
+            return self._ignore(file, 'its embeddings are not unit rows of the expected shape')
+        with contextlib.suppress(OSError):  # a read-only cache serves as well
+            os.utime(file)
+        return embeddings
+
+    def store(self, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]) -> None:
+        """Write the embeddings of labels; a failure costs the cache and nothing else."""
+        file = self._file(key, labels)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._prune()
+            self._write(file, key, labels, embeddings)
+        except OSError as error:
+            logger.warning('label embeddings are not cached, so the next start will be slow '
+                           'again: cannot write %s (%s)', file, error.strerror or error)
+
+    def _write(
+        self, file: Path, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]
+    ) -> None:
+        descriptor, name = tempfile.mkstemp(dir=self._folder, prefix='.', suffix='.tmp')
+        try:
+            with os.fdopen(descriptor, 'wb') as opened:
+                np.savez(opened, embeddings=embeddings,
+                         identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
+                opened.flush()
+                os.fsync(opened.fileno())
+            Path(name).replace(file)
+        finally:
+            Path(name).unlink(missing_ok=True)
+
+    def _prune(self) -> None:
+        """Make room for one file more, and clear what writers that were killed left behind."""
+        files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
+        stale = [file for file in self._folder.glob('.*.tmp')
+                 if _modified(file) < time.time() - _STALE_S]
+        for file in files[_MAX_FILES - 1:] + stale:
+            file.unlink(missing_ok=True)
+
+    def _file(self, key: str, labels: Sequence[str]) -> Path:
+        digest = hashlib.sha256(_identity(key, labels)).hexdigest()
+        return self._folder / f'labels-{digest[:32]}.npz'
+
+    @staticmethod
+    def _ignore(file: Path, reason: object) -> None:
+        logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
+                       file, reason)
+
+
+def _identity(key: str, labels: Sequence[str]) -> bytes:
+    return json.dumps([_FORMAT, key, list(labels)]).encode()
+
+
+def _modified(file: Path) -> float:
+    try:
+        return file.stat().st_mtime
+    except OSError:  # another process was faster
+        return 0.0

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""YOLO through ultralytics, which is kept from the network, from installing and from the home.
+
+The only module that imports ultralytics (AGPL-3.0). It sets ultralytics' environment variables
+before the import, so import it before anything else imports ultralytics.
+"""
+
+import atexit
+import difflib
+import logging
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.devices import check_precision, resolve_device, resolve_precision
+from cliploc_ros.models.download import announce_start, download
+from cliploc_ros.models.files import check_weights_file, resolve_cache_dir
+from cliploc_ros.models.images import check_image_rgb
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class YoloOptions:
+    """Which YOLO to load, and how to run it. The names are ultralytics' own.
+
+    Parameters
+    ----------
+    model : str
+        Path of a ``.pt`` file, or the name of a published one, which is downloaded once.
+    conf : float
+        Least confidence of a detection, 0 to 1.
+    iou : float
+        Overlap from which on the weaker of two boxes of a class is dropped, 0 to 1.
+    imgsz : int
+        The image's longer side is scaled to this for the network [px].
+    max_det : int
+        Most detections in an image; the most confident stay.
+    device : str
+        'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
+    precision : str
+        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'.
+    cache_dir : str
+        Folder for downloads; '' is the user's cache.
+    download_timeout_s : float
+        Give up a download when no byte has arrived for so long [s].
+
+    Raises
+    ------
+    OptionsError
+        For values out of range.
+    """
+
+    model: str = 'yolov8x.pt'
+    conf: float = 0.1
+    iou: float = 0.7
+    imgsz: int = 640
+    max_det: int = 300
+    device: str = 'auto'
+    precision: str = 'auto'
+    cache_dir: str = ''
+    download_timeout_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_precision(self.precision)
+        for name in ('conf', 'iou'):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
+        for name in ('imgsz', 'max_det'):
+            if getattr(self, name) < 1:
+                raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
+        if not self.download_timeout_s > 0.0:
+            raise OptionsError(f'download_timeout_s must be positive, not '
+                               f'{self.download_timeout_s}')
+
+
+class YoloDetector:
+    """An `ObjectDetector`: a detection model of ultralytics.
+
+    Ultralytics' checkpoints are pickles. With PyTorch 2.6 or newer they are read in ultralytics'
+    restricted mode (``weights_only=True`` and a list of known classes), so that a file can run
+    no code of its own; with an older PyTorch only load files from a source that you trust.
+
+    Parameters
+    ----------
+    options : YoloOptions
+        Which YOLO, and how to run it.
+
+    Raises
+    ------
+    ModelError
+        When the weights cannot be found, are damaged, or are no detection model.
+    OptionsError
+        When the device is not there.
+    """
+
+    def __init__(self, options: YoloOptions) -> None:
+        import torch
+
+        device = resolve_device(options.device)
+        file = _resolve_file(options)
+        threads = torch.get_num_threads()
+        self._model = _load(file)
+        stride = int(self._model.model.stride.max())
+        self._settings = {
+            'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
+            'imgsz': -(-options.imgsz // stride) * stride, 'device': str(device),
+            'verbose': False}
+        if resolve_precision(options.precision, device) == 'fp16':
+            self._settings |= _half_precision()
+        # The first pass sets up the predictor; better now than on the first image.
+        self.detect(np.zeros((stride, stride, 3), dtype=np.uint8))
+        # Ultralytics leaves one core free on a CPU, for the whole process.
+        torch.set_num_threads(threads)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Return the names of all classes that the model knows."""
+        return tuple(self._model.names.values())
+
+    def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
+        """Return the objects in an image (h, w, 3) uint8, the most confident first.
+
+        Raises
+        ------
+        ImageError
+            For an image of another shape or type, or without pixels.
+        """
+        check_image_rgb(image_rgb)
+        image_bgr = np.ascontiguousarray(image_rgb[..., ::-1])
+        boxes = self._model.predict(image_bgr, **self._settings)[0].boxes.cpu().numpy()
+        return Detections(
+            bboxes_xyxy=boxes.xyxy.astype(np.float64).reshape(-1, 4),
+            class_ids=tuple(self._model.names[int(index)] for index in boxes.cls),
+            scores=boxes.conf.astype(np.float64))
+
+
+def fetch_yolo_weights(name: str, folder: str) -> str:
+    """Download published weights into a folder with ultralytics' own function; return the file.
+
+    Runs in the child process of `cliploc_ros.models.download`.
+    """
+    _import_ultralytics()
+    from ultralytics.utils.downloads import attempt_download_asset
+
+    announce_start()
+    return attempt_download_asset(Path(folder) / name)
+
+
+@cache
+def _import_ultralytics() -> Any:
+    """Import ultralytics so that it neither asks the network, installs, nor writes to the home."""
+    import torch  # noqa: F401  (reads OMP_NUM_THREADS before ultralytics sets it to 1)
+
+    if 'ultralytics' in sys.modules:
+        logger.warning('ultralytics was imported before the detector: it may go to the network')
+    folder = tempfile.mkdtemp(prefix='cliploc_ros_ultralytics_')
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    threads = os.environ.get('OMP_NUM_THREADS')
+    os.environ.update(
+        YOLO_OFFLINE='true',  # no look-ups of DNS servers, no analytics
+        YOLO_AUTOINSTALL='false',  # no pip
+        YOLO_CONFIG_DIR=folder,  # its settings.json, else in ~/.config
+        YOLO_VERBOSE='false',
+        ULTRALYTICS_SAFE_LOAD='true')
+    import ultralytics
+
+    if threads is None:
+        os.environ.pop('OMP_NUM_THREADS', None)
+    ultralytics.settings.update({'sync': False})
+    # It logs to the standard output, past the loggers of the process.
+    ultralytics_logger = logging.getLogger('ultralytics')
+    ultralytics_logger.handlers.clear()
+    ultralytics_logger.propagate = True
+    ultralytics_logger.setLevel(logging.WARNING)
+    return ultralytics
+
+
+def _resolve_file(options: YoloOptions) -> Path:
+    """Return the file of weights that the options name, downloading it where it must be."""
+    file = Path(options.model).expanduser().absolute()
+    if file.exists() or Path(options.model).name != options.model:
+        check_weights_file(file)
+        return file
+    name = options.model if options.model.endswith('.pt') else f'{options.model}.pt'
+    folder = resolve_cache_dir(options.cache_dir) / 'weights'
+    if (folder / name).exists():
+        check_weights_file(folder / name)
+        return folder / name
+    _import_ultralytics()
+    from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
+
+    if name not in GITHUB_ASSETS_NAMES:
+        raise ModelError(f"'{options.model}' is neither a file here nor a published YOLO model"
+                         f'{_nearest(name, GITHUB_ASSETS_NAMES)}')
+    remedy = (f'Without a network: download {name} from https://github.com/ultralytics/assets/'
+              'releases on another machine and set the model to the path of the file')
+    return download('cliploc_ros.models.yolo_detector:fetch_yolo_weights', [name], folder, remedy,
+                    options.download_timeout_s)
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=4, cutoff=0.5)
+    return f': did you mean {", ".join(near)}?' if near else ''
+
+
+def _half_precision() -> dict[str, Any]:
+    from ultralytics.utils import DEFAULT_CFG_DICT
+
+    # The name changed within 8.4, and the old one warns with every image.
+    return {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of an error, without ultralytics' pictures."""
+    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
+    return lines[0].removeprefix('ERROR').strip() if lines else type(error).__name__
+
+
+def _load(file: Path) -> Any:
+    """Return ultralytics' model of a file of weights."""
+    ultralytics = _import_ultralytics()
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
+        # Ultralytics rewrites some paths (quotes, yolov5) and insists on the suffix.
+        neutral = Path(desk) / 'weights.pt'
+        neutral.symlink_to(file.resolve())
+        try:
+            model = ultralytics.YOLO(neutral)
+        except Exception as error:  # ultralytics raises what comes
+            raise ModelError(f'{file} is no detection model of YOLO: '
+                             f'{_reason(error).replace(str(neutral), "it")}') from error
+    if model.task != 'detect':
+        raise ModelError(f"{file} is a YOLO model for the task '{model.task}': one for 'detect' "
+                         'is needed')
+    return model
