@@ -56,11 +56,11 @@ pip_install() {
   local prefix=$1 file=$2 name hash
   shift 2
   name=$(basename "$file" .txt)
-  hash=$(hash_of "$file" "$root/script/constraints-jazzy.txt")
+  hash=$(hash_of "$file" "$root"/script/constraints*.txt)
   is_done "$prefix/.$name.done" "$hash" && return
   say "installing script/$name.txt with pip"
   run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --resume-retries 20 \
-    --disable-pip-version-check --no-input --requirement "$file" "$@"
+    --disable-pip-version-check --no-input --constraint "$root/script/constraints.txt" --requirement "$file" "$@"
   set_done "$prefix/.$name.done" "$hash"
 }
 
