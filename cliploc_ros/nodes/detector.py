@@ -29,7 +29,7 @@ class DetectorNode(WorkingNode):
 
     def __init__(self) -> None:
         super().__init__('detector')
-        self._parameters = NodeParameters(self, DETECTOR, detector_options)
+        self._settings = NodeParameters(self, DETECTOR, detector_options)
         self._detector = Retrying(self._load, _RETRY_PAUSE_S)
         self._images: LatestOnly[Image | CompressedImage] = LatestOnly(self.worker, self._detect)
         self._subscription: Subscription | None = None
@@ -40,23 +40,25 @@ class DetectorNode(WorkingNode):
         self.worker.submit(self._load_ahead)
 
     def _load(self) -> YoloDetector:
-        return YoloDetector(detector_options(self._parameters.snapshot()))
+        return YoloDetector(detector_options(self._settings.snapshot()))
 
     def _load_ahead(self) -> None:
         """Load the network before the first image needs it."""
         try:
             self._detector.get()
-            self.get_logger().info(f"detector ready: {self._parameters['model']}")
+            self.get_logger().info(f"detector ready: {self._settings['model']}")
         except CliplocError as error:
             self.get_logger().error(str(error))
 
     def _on_matched(self, info: QoSPublisherMatchedInfo) -> None:
         """Listen to images exactly while somebody listens to detections."""
         if info.current_count > 0 and self._subscription is None:
-            raw = self._parameters['image_transport'] == 'raw'
+            raw = self._settings['image_transport'] == 'raw'
+            topic = self.resolve_topic_name('image' if raw else 'image/compressed')
             self._subscription = self.create_subscription(
-                Image if raw else CompressedImage, 'image' if raw else 'image/compressed',
-                self._images.offer, qos.IMAGE, qos_overriding_options=qos.overridable())
+                Image if raw else CompressedImage, topic, self._images.offer,
+                qos.as_offered(qos.IMAGE, self, topic),
+                qos_overriding_options=qos.overridable())
         elif info.current_count == 0 and self._subscription is not None:
             self.destroy_subscription(self._subscription)
             self._subscription = None
@@ -65,7 +67,7 @@ class DetectorNode(WorkingNode):
         """Detect in one image and publish; in the worker's thread."""
         try:
             detector = self._detector.get()
-            detector.configure(detector_options(self._parameters.snapshot()))
+            detector.configure(detector_options(self._settings.snapshot()))
             detections = detector.detect(image_from_msg(msg))
         except CliplocError as error:
             self.get_logger().error(str(error), throttle_duration_sec=_LOG_PERIOD_S)

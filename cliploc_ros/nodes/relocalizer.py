@@ -42,7 +42,7 @@ class RelocalizerNode(WorkingNode):
 
     def __init__(self) -> None:
         super().__init__('relocalizer')
-        self._parameters = NodeParameters(self, RELOCALIZER, relocalizer_options)
+        self._settings = NodeParameters(self, RELOCALIZER, relocalizer_options)
         self._localizer: Retrying[Localizer] = Retrying(self._load)
         self._base = BaseFrame(self)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
@@ -50,7 +50,7 @@ class RelocalizerNode(WorkingNode):
                                                    qos.POSE)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
-        self._frames = FrameSource(self, self._parameters['image_transport'], self._on_frame)
+        self._frames = FrameSource(self, self._settings['image_transport'], self._on_frame)
         # Requests are answered one after another, each from frames newer than itself.
         requests = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, '~/relocalize', self._on_relocalize,
@@ -58,7 +58,7 @@ class RelocalizerNode(WorkingNode):
         self.create_service(Empty, 'reinitialize_global_localization', self._on_reinitialize,
                             qos_profile=qos.SERVICE, callback_group=requests)
         self.worker.submit(self._load_ahead)
-        if self._parameters['mode'] == 'continuous':
+        if self._settings['mode'] == 'continuous':
             self._frames.listening().__enter__()
 
     def release(self) -> None:
@@ -66,7 +66,7 @@ class RelocalizerNode(WorkingNode):
         self._frames.stop()
 
     def _load(self) -> Localizer:
-        return load_localizer(self, self._parameters.snapshot())
+        return load_localizer(self, self._settings.snapshot())
 
     def _load_ahead(self) -> None:
         """Load map and network before the first request needs them."""
@@ -94,7 +94,7 @@ class RelocalizerNode(WorkingNode):
             # A map or weights that were missing may have been mended since.
             self.worker.run(self._localizer.get)
             with self._frames.listening():
-                frame = self._frames.wait_for_fresh(self._parameters['timeout_s'])
+                frame = self._frames.wait_for_fresh(self._settings['timeout_s'])
             answer = self.worker.run(lambda: self._localize(frame))
         except CliplocError as error:
             answer = Answer(None, str(error))
@@ -104,7 +104,7 @@ class RelocalizerNode(WorkingNode):
         return answer
 
     def _on_frame(self, frame: Frame) -> None:
-        if self._parameters['mode'] == 'continuous':
+        if self._settings['mode'] == 'continuous':
             self._continuous.offer(frame)
 
     def _localize_and_log(self, frame: Frame) -> None:
@@ -116,7 +116,7 @@ class RelocalizerNode(WorkingNode):
 
     def _localize(self, frame: Frame) -> Answer:
         """Localize from one frame and publish what was found; in the worker's thread."""
-        values: Mapping[str, Any] = self._parameters.snapshot()
+        values: Mapping[str, Any] = self._settings.snapshot()
         localizer = self._localizer.get()
         found, times = localizer.localize(frame, values)
         header = Header(stamp=frame.image.header.stamp, frame_id=localizer.map_frame)

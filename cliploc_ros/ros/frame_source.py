@@ -127,7 +127,8 @@ class FrameSource:
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
                                             ('detections', Detection2DArray, qos.DETECTIONS_IN)):
             self._subscriptions.append(self._node.create_subscription(
-                message_type, self._topics[name], self._receiver(name), profile,
+                message_type, self._topics[name], self._receiver(name),
+                qos.as_offered(profile, self._node, self._resolved(name)),
                 callback_group=self._group, qos_overriding_options=qos.overridable()))
 
     def _close(self) -> None:

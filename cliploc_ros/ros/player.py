@@ -37,6 +37,8 @@ _POLL_S = 0.02
 #: Between a subscriber's appearance here and its readiness to receive: discovery has to
 #: complete in the other direction too, which no call of ROS tells.
 _DISCOVERY_S = 0.2
+#: At the end, acknowledgements take up to Fast DDS's heartbeat of 3 s, what was sent only this.
+DEFAULT_LINGER_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,9 @@ class PlayOptions:
         Publish the recording's time on /clock this often per second of real time.
     loop : bool
         Begin again at the end, until stopped.
+    linger_s : float
+        At the end, wait this long at most until all reliable subscribers have acknowledged
+        all messages [s].
     """
 
     rate: float = 1.0
@@ -68,6 +73,7 @@ class PlayOptions:
     remap: Mapping[str, str] = field(default_factory=dict)
     clock_hz: float | None = None
     loop: bool = False
+    linger_s: float = DEFAULT_LINGER_S
 
 
 @dataclass
@@ -80,12 +86,15 @@ class PlayReport:
         Messages by recorded topic name.
     passes : int
         How often the recording was played to its end.
+    unread : int
+        Messages that the recording claims to hold but that were not found in it.
     worst_lateness_s : float
         The longest that a message was published after its time [s].
     """
 
     counts: Counter[str] = field(default_factory=Counter)
     passes: int = 0
+    unread: int = 0
     worst_lateness_s: float = 0.0
 
 
@@ -180,6 +189,7 @@ class Player:
             if self._stop.is_set():
                 break
             report.passes += 1
+            report.unread = self._count_unread(played)
             if not self._options.loop:
                 self._wait_until_received()
                 break
@@ -236,11 +246,17 @@ class Player:
             self._publishers[message.topic].publish(message.data)
             report.counts[message.topic] += 1
 
+    def _count_unread(self, played: int) -> int:
+        if self.start_ns > self._reader.start_ns:
+            return 0  # the recording does not say how many messages it holds from there on
+        return max(sum(topic.message_count for topic in self.topics) - played, 0)
+
     def _wait_until_received(self) -> None:
-        deadline = time.monotonic() + 1.0
-        for publisher in self._publishers.values():
-            left_s = max(deadline - time.monotonic(), 0.0)
-            publisher.wait_for_all_acked(Duration(nanoseconds=round(left_s * NS_PER_S)))
+        deadline = time.monotonic() + self._options.linger_s
+        while not self._stop.is_set() and time.monotonic() < deadline:
+            if all(one.wait_for_all_acked(Duration()) for one in self._publishers.values()):
+                return
+            self._stop.wait(_POLL_S)
 
     def _named_publishers(self, names: Collection[str]) -> list[Publisher]:
         if unknown := [name for name in names if name not in self._publishers]:
