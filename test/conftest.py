@@ -78,3 +78,17 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f'needs the shared data folder, {SHARED_DATA} is absent')
     return SHARED_DATA
+
+
+@pytest.fixture(scope='session')
+def executables() -> Path:
+    """The folder of the installed executables: of the sourced workspace, or what setup left."""
+    from ament_index_python import get_package_prefix
+
+    try:
+        prefix = Path(get_package_prefix('cliploc_ros'))
+    except (KeyError, OSError):  # not in any sourced workspace; none sourced
+        prefix = PROJECT / 'install'
+    folder = prefix / 'lib' / 'cliploc_ros'
+    assert folder.is_dir(), f'{folder} is missing: run script/setup'
+    return folder

@@ -50,6 +50,14 @@ def relative(path: Path) -> str:
     return str(path.relative_to(PROJECT))
 
 
+def run_python(code: str, cwd: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=cwd, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_versions_are_equal():
     manifest = ElementTree.parse(PROJECT / 'package.xml').findtext('version')
     setup = re.search(r"version='(.+)'", (PROJECT / 'setup.py').read_text()).group(1)
@@ -64,11 +72,7 @@ def test_core_imports_neither_ros_nor_torch():
         '    importlib.import_module(module.name)\n'
         "print(sorted({'rclpy', 'torch', 'ultralytics', 'open_clip'} & set(sys.modules)))\n"
     )
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=PROJECT, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == '[]'
+    assert run_python(code, cwd=PROJECT).strip() == '[]'
 
 
 @pytest.mark.parametrize('path', [*SOURCES, *SCRIPTS, *INTERFACES], ids=relative)
@@ -84,21 +88,17 @@ def test_module_is_not_too_long(path):
 
 
 @pytest.mark.parametrize('name', EXECUTABLES)
-def test_executable_is_installed(name):
-    from ament_index_python import get_package_prefix
-
-    executable = Path(get_package_prefix('cliploc_ros'), 'lib', 'cliploc_ros', name)
-    assert os.access(executable, os.X_OK), f'{executable} is missing: run script/setup'
+def test_executable_is_installed(name, executables):
+    assert os.access(executables / name, os.X_OK), f'{name} is missing: run script/setup'
     (entry_point,) = importlib.metadata.distribution('cliploc_ros').entry_points.select(name=name)
     assert callable(entry_point.load())
 
 
-def test_installed_package_is_complete():
+def test_installed_package_is_complete(tmp_path):
     """Every module and interface definition of the source lies in the installed copy."""
-    from ament_index_python import get_package_prefix
-
-    prefix = Path(get_package_prefix('cliploc_ros'))
-    (installed,) = prefix.glob('lib/python3*/site-packages/cliploc_ros')
+    # Outside of the source tree, whose modules would come first.
+    code = 'import cliploc_ros; print(cliploc_ros.__path__[0])'
+    installed = Path(run_python(code, cwd=tmp_path).strip())
     for path in [*MODULES, *INTERFACES]:
         copy = installed / path.relative_to(PROJECT / 'cliploc_ros')
         assert copy.is_file(), f'{copy} is missing: run script/setup'
