@@ -4,7 +4,7 @@
 
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 
 from cliploc_ros.errors import CliplocError
@@ -35,6 +35,35 @@ def run_command(command: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split off the arguments from each ``--ros-args`` to its ``--``, which launch appends.
+
+    rclpy's own function would also take any OLD:=NEW away, a notation of ROS 2's beginnings.
+
+    Parameters
+    ----------
+    args : sequence of str
+        The command line without the program's name.
+
+    Returns
+    -------
+    plain_args : list of str
+        For the program.
+    ros_args : list of str
+        For ``rclpy.init``.
+    """
+    plain_args: list[str] = []
+    ros_args: list[str] = []
+    target = plain_args
+    for arg in args:
+        if arg == '--ros-args':
+            target = ros_args
+        target.append(arg)
+        if arg == '--' and target is ros_args:
+            target = plain_args
+    return plain_args, ros_args
 
 
 def interrupt_on_sigterm() -> None:

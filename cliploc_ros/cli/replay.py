@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import run_command
+from cliploc_ros.cli.command import run_command, split_ros_args
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.errors import OptionsError
 
@@ -88,6 +88,11 @@ def make_parser() -> argparse.ArgumentParser:
         '--wait-timeout', type=_not_negative, default=30.0, metavar='S',
         help='give up waiting for subscribers after S seconds (default: 30)',
     )
+    parser.add_argument(
+        '--wait-for-all-acked', type=_not_negative, default=0.3, metavar='S',
+        help='at the end, wait up to S seconds until reliable subscribers have acknowledged all '
+        'messages; acknowledgements may take 3 s (default: 0.3)',
+    )
     return parser
 
 
@@ -111,20 +116,17 @@ def replay(args: list[str], stop: threading.Event) -> int:
     CliplocError
         For a recording or an option that cannot be used, or where ROS is not there.
     """
-    if {'-h', '--help'} & set(args):  # shall work without ROS
-        make_parser().parse_args(args)
+    plain_args, ros_args = split_ros_args(args)
+    options = make_parser().parse_args(plain_args)
     try:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
-        from rclpy.utilities import remove_ros_args
     except ImportError as error:
         raise OptionsError(
             f'ROS 2 is not there to publish with ({error}): source it, or run script/setup'
         ) from error
     try:
-        plain_args = remove_ros_args([NODE_NAME, *args])[1:]
-        options = make_parser().parse_args(plain_args)
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=ros_args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # what rclpy makes of arguments that it cannot read
         raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
     try:
@@ -150,6 +152,7 @@ def _make_player(
         remap=dict(options.remap),
         clock_hz=options.clock,
         loop=options.loop,
+        linger_s=options.wait_for_all_acked,
     )
     # nothing spins this node, so it could not serve its parameters
     node = Node(NODE_NAME, start_parameter_services=False)
@@ -194,6 +197,12 @@ def _tell(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
         f'at most {report.worst_lateness_s * 1000:.1f} ms late',
         flush=True,
     )
+    if report.unread:
+        print(
+            f'warning: {report.unread} messages that the recording lists could not be found in '
+            'it; is it damaged?',
+            file=sys.stderr,
+        )
 
 
 def _positive(text: str) -> float:

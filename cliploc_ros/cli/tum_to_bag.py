@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import interrupt_on_sigterm, run_command
+from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.rosbag import STORAGES
@@ -36,7 +36,8 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Convert a sequence; return the exit code."""
-    options = make_parser().parse_args(_without_ros_args(sys.argv[1:] if args is None else args))
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
     interrupt_on_sigterm()
     return run_command(lambda: convert(options))
 
@@ -139,20 +140,6 @@ def report(
         print(f'without ground truth within 20 ms, and so without pose: {missing} images')
     if options.detections is not None and (missing := result.images - result.detections):
         print(f'without recorded detections, and so without message: {missing} images')
-
-
-def _without_ros_args(args: Sequence[str]) -> list[str]:
-    """Drop ``--ros-args ... [--]``, which launch appends to every executable."""
-    kept: list[str] = []
-    in_ros_args = False
-    for arg in args:
-        if in_ros_args:
-            in_ros_args = arg != '--'
-        elif arg == '--ros-args':
-            in_ros_args = True
-        else:
-            kept.append(arg)
-    return kept
 
 
 if __name__ == '__main__':

@@ -1,0 +1,377 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable replay: real recordings, a real process, a real listening node."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conftest import PROJECT, run, wait_until
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rosbags.interfaces import QosDurability, QosHistory, QosReliability
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.intrinsics import PRESETS
+from cliploc_ros.datasets.recorded_detections import read_recorded_detections
+from cliploc_ros.datasets.rosbag import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+
+START_NS = 1_700_000_000_123_456_789
+MS = 1_000_000
+# as `ros2 bag record` notes it: discovery does not tell history and depth
+RECORDED_QOS = RELIABLE_QOS._replace(history=QosHistory.UNKNOWN, depth=0)
+CLASSES = {
+    '/image': Image,
+    '/image/compressed': CompressedImage,
+    '/camera_info': CameraInfo,
+    '/detections': Detection2DArray,
+    '/ground_truth': PoseStamped,
+}
+
+
+def write_poses(path, offsets_ms, topics=None):
+    """Write a recording of poses at offsets [ms] on topics with their QoS, all at once."""
+    topics = topics or {'/pose': RECORDED_QOS}
+    with BagWriter(path, 'mcap') as bag:
+        for name, qos in topics.items():
+            bag.add_topic(name, bag_messages.POSE, qos)
+        for offset in offsets_ms:
+            stamp = START_NS + round(offset * MS)
+            message = bag_messages.pose_message(stamp, 'world', np.eye(4))
+            for name in topics:
+                bag.write(name, stamp, message)
+    return path
+
+
+def recorded(path):
+    """Return the serialized messages of a recording by topic."""
+    by_topic = {}
+    with BagReader(path) as reader:
+        for message in reader.messages():
+            by_topic.setdefault(message.topic, []).append(message.data)
+    return by_topic
+
+
+def offset_ms(data):
+    """Return how long after the recording's start a received pose is [ms]."""
+    return (bag_messages.stamp_ns(deserialize_message(data, PoseStamped)) - START_NS) / MS
+
+
+@pytest.mark.parametrize(
+    ('storage', 'form'), [('sqlite3', 'raw'), ('mcap', 'compressed')]
+)
+def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener, storage, form):
+    folder, bag = shared_data / 'tum_fr3_office', tmp_path / 'bag'
+    detections = read_recorded_detections(folder / 'detections.json')
+    options = ConversionOptions(storage, form)
+    convert_tum(read_tum(folder), PRESETS['fr3'], bag, options, detections)
+    expected = recorded(bag)
+    for topic in expected:
+        listener.listen(topic, CLASSES[topic])
+    done = run('replay', bag, '--rate', 16, '--wait-for-subscribers')
+    assert done.returncode == 0, done.stderr
+    wait_until(lambda: all(len(listener.received[one]) == len(expected[one]) for one in expected))
+    for topic, messages in expected.items():
+        for received, sent in zip(listener.received[topic], messages, strict=True):
+            # RTPS pads a payload to a multiple of four bytes
+            assert received[:len(sent)] == sent
+            assert len(received) - len(sent) < 4
+    assert 'published 67 messages on 4 topics' in done.stdout
+
+
+def test_messages_keep_their_times(tmp_path, listener):
+    """Irregular distances at double speed; errors must be small and must not add up."""
+    offsets = np.cumsum(np.random.default_rng(0).uniform(5, 120, 60))
+    bag = write_poses(tmp_path / 'bag', offsets)
+    listener.listen('/pose', PoseStamped)
+    done = run('replay', bag, '--rate', 2, '--wait-for-subscribers', '/pose')
+    assert done.returncode == 0, done.stderr
+    wait_until(lambda: len(listener.received['/pose']) == 60)
+    assert listener.received['/pose'] == recorded(bag)['/pose']
+    took_s = np.array(listener.times['/pose']) - listener.times['/pose'][0]
+    errors_s = took_s - (offsets - offsets[0]) / 1000 / 2
+    print(f'replay timing error: median {np.median(np.abs(errors_s)) * 1000:.2f} ms, '
+          f'greatest {np.abs(errors_s).max() * 1000:.2f} ms, {done.stdout.splitlines()[-1]}')
+    # generous, for machines under load; the median shows a wrong rate or drift all the same
+    assert np.median(np.abs(errors_s)) < 0.05
+    assert abs(errors_s[-1]) < 0.3
+
+
+def test_qos_is_as_recorded(tmp_path, listener, start):
+    best_effort = RECORDED_QOS._replace(reliability=QosReliability.BEST_EFFORT)
+    latched = RECORDED_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+    offered = {
+        '/reliable': (RECORDED_QOS, ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
+        '/sensor': (best_effort, ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
+        '/latched': (latched, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+        '/map': (LATCHED_QOS, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+    }
+    topics = {name: qos for name, (qos, *_) in offered.items()}
+    bag = write_poses(tmp_path / 'bag', [0, 600_000], topics)
+    process = start('replay', bag)
+    assert 'replaying' in process.stdout.readline()
+    endpoints = listener.node.get_publishers_info_by_topic
+    wait_until(lambda: all(endpoints(name) for name in offered))
+    for name, (_, reliability, durability) in offered.items():
+        (endpoint,) = endpoints(name)
+        assert endpoint.qos_profile.reliability == reliability, name
+        assert endpoint.qos_profile.durability == durability, name
+    # the first message is out; who comes now still gets the latched ones
+    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    listener.listen('/map', PoseStamped, late)
+    listener.listen('/latched', PoseStamped, late)
+    wait_until(lambda: listener.received['/map'] and listener.received['/latched'])
+    assert offset_ms(listener.received['/map'][0]) == 0
+
+
+def test_clock_runs_with_the_messages(tmp_path, listener):
+    bag = write_poses(tmp_path / 'bag', range(0, 2001, 100))
+    listener.listen('/clock', Clock)
+    listener.listen('/pose', PoseStamped)
+    done = run('replay', bag, '--clock', 100, '--rate', 2, '--wait-for-subscribers')
+    assert done.returncode == 0, done.stderr
+    wait_until(lambda: len(listener.received['/pose']) == 21)
+    clocks = [deserialize_message(data, Clock).clock for data in listener.received['/clock']]
+    stamps_ns = np.array([clock.sec * 10**9 + clock.nanosec for clock in clocks])
+    assert (np.diff(stamps_ns) > 0).all()
+    assert stamps_ns[0] >= START_NS
+    assert stamps_ns[-1] <= START_NS + 2000 * MS
+    # 1 s of real time at 100 Hz; ticks missed under load are skipped, never bunched
+    assert 50 <= len(stamps_ns) <= 101
+    assert set(np.diff(stamps_ns) % (20 * MS)) == {0}
+
+
+def test_clock_of_the_recording_gives_way(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add_topic('/clock', 'rosgraph_msgs/msg/Clock')
+        bag.add_topic('/pose', bag_messages.POSE)
+        bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
+        bag.write('/clock', 2, bytes([0, 1, 0, 0]) + bytes(8))
+    done = run('replay', tmp_path / 'bag', '--clock')
+    assert 'published 1 messages on 1 topics' in done.stdout
+
+
+def test_names_and_selection(tmp_path, listener):
+    topics = dict.fromkeys(('/a', '/b', '/c', '/d'), RECORDED_QOS)
+    bag = write_poses(tmp_path / 'bag', [0, 20], topics)
+    for name in ('/x/a', '/renamed', '/c', '/d', '/a', '/b'):
+        listener.listen(name, PoseStamped)
+    done = run(
+        'replay', bag, '--topics', 'a', '/b', '/d', '--exclude', '/d', '--remap', 'a:=x/a',
+        '--wait-for-subscribers', '/a', '/b',
+        '--ros-args', '-r', '/b:=/renamed', '-r', '__node:=player',
+    )
+    assert done.returncode == 0, done.stderr
+    wait_until(lambda: len(listener.received['/x/a']) == len(listener.received['/renamed']) == 2)
+    assert set(listener.received) == {'/x/a', '/renamed'}
+
+
+def test_start_offset_sends_what_is_latched_first(tmp_path, listener):
+    topics = {'/pose': RECORDED_QOS, '/map': LATCHED_QOS}
+    bag = write_poses(tmp_path / 'bag', [0, 100, 5000, 5050], topics)
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    listener.listen('/pose', PoseStamped)
+    listener.listen('/map', PoseStamped, latched)
+    done = run('replay', bag, '--start-offset', 4.9, '--wait-for-subscribers')
+    assert done.returncode == 0, done.stderr
+    wait_until(lambda: len(listener.received['/map']) + len(listener.received['/pose']) == 6)
+    assert [offset_ms(data) for data in listener.received['/pose']] == [5000, 5050]
+    assert [offset_ms(data) for data in listener.received['/map']] == [0, 100, 5000, 5050]
+
+
+def test_loop_goes_on_until_stopped(tmp_path, listener, start):
+    bag = write_poses(tmp_path / 'bag', [0, 50, 100])
+    listener.listen('/pose', PoseStamped)
+    process = start('replay', bag, '--loop', '--wait-for-subscribers')
+    wait_until(lambda: len(listener.received['/pose']) >= 9)
+    output = stop(process, signal.SIGINT)
+    assert re.search(r'stopped: published \d+ messages on 1 topics in .* s, \d+ passes', output)
+    assert [offset_ms(data) for data in listener.received['/pose'][:9]] == [0, 50, 100] * 3
+
+
+def stop(process, number):
+    """Signal a process; it shall end cleanly within 2 s."""
+    begin = time.monotonic()
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=10)
+    took_s = time.monotonic() - begin
+    assert process.returncode == 0, errors
+    assert took_s < 2
+    assert 'Traceback' not in errors
+    return output
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_a_long_pause(tmp_path, start, listener, number):
+    bag = write_poses(tmp_path / 'bag', [0, 600_000])
+    listener.listen('/pose', PoseStamped)
+    process = start('replay', bag, '--wait-for-subscribers')
+    wait_until(lambda: listener.received['/pose'])
+    assert 'stopped: published 1 messages' in stop(process, number)
+
+
+def test_signal_ends_the_wait_for_subscribers(tmp_path, start, listener):
+    bag = write_poses(tmp_path / 'bag', [0])
+    process = start('replay', bag, '--wait-for-subscribers', '--wait-timeout', 600)
+    wait_until(lambda: listener.node.get_publishers_info_by_topic('/pose'))
+    assert 'published 0 messages' in stop(process, signal.SIGTERM)
+
+
+def test_first_message_reaches_a_subscriber_waited_for(tmp_path, listener):
+    """Discovery is mutual: the subscriber must know the publisher, too, or loses the first."""
+    bag = write_poses(tmp_path / 'bag', [0, 1])
+    listener.listen('/pose', PoseStamped)
+    for count in range(1, 4):
+        assert run('replay', bag, '--wait-for-subscribers').returncode == 0
+        wait_until(lambda count=count: len(listener.received['/pose']) == 2 * count)
+
+
+def write_foreign(path, msgtype, definition, type_hash):
+    """Write a recording of a type that the package's own writer does not know."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection(
+            '/odd', msgtype, msgdef=definition, rihs01=type_hash,
+            offered_qos_profiles=[RECORDED_QOS],
+        )
+        bag.write(connection, START_NS, b'\x00\x01\x00\x00\x01\x00\x00\x00')
+    return path
+
+
+def assert_refused(done, *messages):
+    assert done.returncode == 1
+    *before, line = done.stderr.splitlines()
+    assert all('[rcl]' in one for one in before)  # which also says so, in its own way
+    assert line.startswith('error: ')
+    for message in messages:
+        assert message in line
+
+
+def test_missing_package_is_named(tmp_path):
+    bag = write_foreign(tmp_path / 'bag', 'my_msgs/msg/Odd', 'int32 x', 'RIHS01_' + '1' * 64)
+    assert_refused(
+        run('replay', bag), '/odd needs my_msgs/msg/Odd', 'package my_msgs', 'ros-jazzy-my-msgs',
+        '--exclude /odd',
+    )
+
+
+def test_other_definition_is_refused(tmp_path):
+    bag = write_foreign(
+        tmp_path / 'bag', 'std_msgs/msg/Int32', 'int32 value', 'RIHS01_' + '1' * 64
+    )
+    assert_refused(run('replay', bag), '/odd', 'another definition of std_msgs/msg/Int32')
+
+
+@pytest.mark.parametrize(
+    ('args', 'messages'),
+    [
+        (['--topics', '/image'], ['no topic /image', '/pose (geometry_msgs/msg/PoseStamped)']),
+        (['--exclude', '/pose'], ['no messages on the topics to play']),
+        (['--remap', '/image:=/x'], ['no topic /image']),
+        (['--remap', '/pose:=/1x'], ['--remap', '/1x']),
+        (['--start-offset', '99'], ['start offset 99.0 s', '0.100 s']),
+        (['--wait-for-subscribers', '--wait-timeout', '0.2'], ['no subscriber', '/pose']),
+        (['--wait-for-subscribers', '/image'], ['/image is not among', '/pose']),
+        (['--ros-args', '-r', 'nonsense'], ['nonsense']),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, args, messages):
+    bag = write_poses(tmp_path / 'bag', [0, 100])
+    assert_refused(run('replay', bag, *args), *messages)
+
+
+def test_bad_recordings_are_refused(tmp_path):
+    assert_refused(run('replay', tmp_path / 'none'), 'none: no such recording')
+    with BagWriter(tmp_path / 'empty') as bag:
+        bag.add_topic('/pose', bag_messages.POSE)
+    assert_refused(run('replay', tmp_path / 'empty'), 'empty: holds no messages')
+
+
+def test_recording_broken_in_the_middle(tmp_path):
+    with BagWriter(tmp_path / 'bag', 'sqlite3') as bag:
+        bag.add_topic('/pose', bag_messages.POSE)
+        for stamp in range(5000):
+            bag.write('/pose', stamp, bag_messages.pose_message(stamp, 'world', np.eye(4)))
+    (file,) = (tmp_path / 'bag').glob('*.db3')
+    data = bytearray(file.read_bytes())
+    data[300_000:350_000] = bytes(50_000)
+    file.write_bytes(data)
+    done = run('replay', tmp_path / 'bag')
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(f'error: {tmp_path / "bag"}: cannot be read')
+
+
+def test_messages_that_are_not_there_are_counted(tmp_path):
+    """Zeros in the midst of MCAP records read as records of no known kind."""
+    bag = write_poses(tmp_path / 'bag', np.arange(0, 500, 0.1))
+    (file,) = bag.glob('*.mcap')
+    data = bytearray(file.read_bytes())
+    data[300_000:300_100] = bytes(100)
+    file.write_bytes(data)
+    done = run('replay', bag)
+    published = int(re.search(r'published (\d+) messages', done.stdout)[1])
+    assert published < 5000
+    assert done.stderr == (
+        f'warning: {5000 - published} messages that the recording lists could not be found in '
+        'it; is it damaged?\n'
+    )
+
+
+@pytest.mark.parametrize(
+    'args', [['--rate', '0'], ['--rate', 'x'], ['--start-offset', '-1'], ['--remap', 'a'], []]
+)
+def test_usage_errors_show_the_usage(args):
+    done = run('replay', *(['bag', *args] if args else []))
+    assert done.returncode == 2
+    assert done.stderr.startswith('usage: replay BAG')
+
+
+def test_without_ros_help_works_and_the_rest_says_why(tmp_path):
+    program = (
+        "import sys; sys.modules['rclpy'] = None\n"
+        'from cliploc_ros.cli.replay import main; sys.exit(main(sys.argv[1:]))'
+    )
+
+    def run_without_ros(*args):
+        return subprocess.run(
+            [sys.executable, '-c', program, *args],
+            cwd=PROJECT, capture_output=True, text=True, timeout=30,
+        )
+
+    assert 'usage: replay BAG' in run_without_ros('--help').stdout
+    assert_refused(run_without_ros(str(tmp_path)), 'ROS 2 is not there', 'script/setup')
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_memory_does_not_grow_with_the_recording(tmp_path, storage):
+    image = bag_messages.image_message(0, 'camera', np.zeros((480, 640, 3), dtype=np.uint8))
+    peaks_mb = []
+    for count in (10, 150):
+        bag = tmp_path / f'bag_{count}'
+        with BagWriter(bag, storage) as writer:
+            writer.add_topic('/image', bag_messages.IMAGE)
+            for index in range(count):
+                writer.write('/image', index * MS, image)
+        program = (
+            # not getrusage, whose greatest size is inherited from this process
+            'import sys; from cliploc_ros.cli.replay import main; main(sys.argv[1:]);'
+            'print(open("/proc/self/status").read().split("VmHWM:")[1].split()[0])'
+        )
+        done = subprocess.run(
+            [sys.executable, '-c', program, bag],
+            cwd=PROJECT, capture_output=True, text=True, check=True, timeout=60,
+        )
+        assert f'published {count} messages' in done.stdout
+        peaks_mb.append(int(done.stdout.splitlines()[-1]) / 1024)
+    print(f'peak memory with 10 and 150 images of 0.9 MB: {peaks_mb} MB')
+    assert peaks_mb[1] - peaks_mb[0] < 40
