@@ -27,9 +27,11 @@ setup(
     ],
     python_requires='>=3.12',
     # Without version numbers: script/requirements.txt is the one place for those.
-    install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy'],
+    install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
     extras_require={
-        'models': ['open_clip_torch', 'torch', 'torchvision', 'ultralytics-opencv-headless'],
+        'models': [
+            'open_clip_torch', 'safetensors', 'torch', 'torchvision', 'ultralytics-opencv-headless',
+        ],
         'datasets': ['rosbags'],
         'test': ['hypothesis', 'pytest'],
     },
