@@ -95,16 +95,31 @@ class Camera:
             for _ in range(_NEWTON_STEPS):
                 normalized -= self._newton_step(normalized, points_px)
             missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
-        normalized[~(missed <= _MAX_ROUND_TRIP_PX)] = np.nan
+            # Beyond the fold of a lens model there are roots that no ray has.
+            sound = (missed <= _MAX_ROUND_TRIP_PX) & self._keeps_sides(normalized)
+        normalized[~sound] = np.nan
         return normalized
 
-    def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
-                     ) -> NDArray[np.float64]:
-        """Return by how much points (n, 2) overshoot those that project to given pixels."""
+    def _keeps_sides(self, normalized: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which points (n, 2) the lens neither mirrors nor moves across the middle."""
+        projected, along_x, along_y = self._linearized(normalized)
+        determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
+        distorted = (projected - (self.cx, self.cy)) / (self.fx, self.fy)
+        square = np.sum(normalized**2, axis=1)
+        return (determinant > 0) & (np.sum(normalized * distorted, axis=1) >= 0.01 * square)
+
+    def _linearized(self, normalized: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return pixels (n, 2) of points (n, 2), and how they move with each coordinate."""
         projected = self.project_normalized(normalized)
         along_x, along_y = (
             (self.project_normalized(normalized + step) - projected) / _NEWTON_DIFFERENCE
             for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
+        return projected, along_x, along_y
+
+    def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
+                     ) -> NDArray[np.float64]:
+        """Return by how much points (n, 2) overshoot those that project to given pixels."""
+        projected, along_x, along_y = self._linearized(normalized)
         missed = projected - points_px
         determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
         step = np.stack([missed[:, 0] * along_y[:, 1] - missed[:, 1] * along_y[:, 0],

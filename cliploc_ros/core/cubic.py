@@ -8,6 +8,9 @@ import numpy as np
 
 from cliploc_ros.core.compiled import compiled
 
+_DOUBLE_ROOT = 1e-12
+_ROUNDING = 4e-16
+
 
 @compiled
 def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
@@ -26,10 +29,14 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
     else:
         # The cube root of larger magnitude first: the other follows without cancellation.
         u = np.cbrt(-0.5 * q - copysign(sqrt(discriminant), q))
-        root = (u - p / (3.0 * u) if u != 0.0 else 0.0) - shift
+        depressed = u - p / (3.0 * u) if u != 0.0 else 0.0
+        if depressed < 0.0 and discriminant <= _DOUBLE_ROOT * q * q:
+            depressed *= -0.5  # the other two coincide, but for rounding, and are larger
+        root = depressed - shift
     for _ in range(2):
-        slope = (3.0 * root + 2.0 * c2) * root + c1
-        if slope == 0.0:
-            break
-        root -= (((root + c2) * root + c1) * root + c0) / slope
+        value = ((root + c2) * root + c1) * root + c0
+        terms = ((abs(root) + abs(c2)) * abs(root) + abs(c1)) * abs(root) + abs(c0)
+        if abs(value) <= _ROUNDING * terms:
+            break  # at a double root a further step would go anywhere
+        root -= value / ((3.0 * root + 2.0 * c2) * root + c1)
     return root

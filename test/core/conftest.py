@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Real queries and a real map for the tests of the method."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.datasets.queries import Queries, load_queries
+
+
+@pytest.fixture(scope='session')
+def thresholds() -> dict:
+    return yaml.safe_load((Path(__file__).parents[1] / 'thresholds.yaml').read_text())
+
+
+@pytest.fixture(scope='session')
+def office(shared_data) -> Path:
+    return shared_data / 'tum_fr3_office'
+
+
+@pytest.fixture(scope='session')
+def office_map(office) -> LandmarkMap:
+    return LandmarkMap.from_file(office / 'map.yaml')
+
+
+@pytest.fixture(scope='session')
+def queries(office, office_map) -> Queries:
+    return load_queries(office / 'queries.npz', office_map.landmark_ids)
+
+
+@pytest.fixture(scope='session')
+def observe(queries):
+    """Turn a recorded query frame into an observation."""
+    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
+
+    def make(frame) -> Observation:
+        return Observation(camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
+                           frame.similarities, frame.stamp_ns)
+    return make
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)

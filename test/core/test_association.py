@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cliploc_ros.core.association import (
+    balanced_order,
+    candidate_mask,
+    class_candidates,
+    nearest_candidates,
+    prosac_order,
+    same_class,
+)
+from cliploc_ros.errors import OptionsError
+
+SIMILARITIES = np.array([[0.9, 0.1, 0.5], [0.2, 0.8, 0.7]], dtype=np.float32)
+
+
+def test_nearest_candidates_come_best_first():
+    found = nearest_candidates(SIMILARITIES, 2)
+    assert found.pairs.tolist() == [[0, 0], [0, 2], [1, 1], [1, 2]]
+    assert found.ranks.tolist() == [0, 1, 0, 1]
+
+
+def test_prosac_order_falls_with_similarity():
+    order = prosac_order(nearest_candidates(SIMILARITIES, 2))
+    assert order.pairs.tolist() == [[0, 0], [1, 1], [1, 2], [0, 2]]
+
+
+def test_balanced_order_takes_all_first_neighbours_first():
+    many = np.array([[0.9, 0.8, 0.7], [0.3, 0.2, 0.1]], dtype=np.float32)
+    order = balanced_order(nearest_candidates(many, 3))
+    assert order.pairs.tolist() == [[0, 0], [1, 0], [0, 1], [1, 1], [0, 2], [1, 2]]
+
+
+@given(st.integers(1, 8), st.integers(1, 12), st.data())
+def test_balanced_order_is_balanced(detections, landmarks, data):
+    k = data.draw(st.integers(1, landmarks))
+    similarities = np.random.default_rng(0).random((detections, landmarks), dtype=np.float32)
+    order = balanced_order(nearest_candidates(similarities, k))
+    # after each round of first, second, ... neighbours every detection has had equally many
+    for rank in range(k):
+        head = order.detections[:(rank + 1) * detections]
+        assert (np.bincount(head, minlength=detections) == rank + 1).all()
+
+
+def test_equal_similarities_keep_the_map_order():
+    found = nearest_candidates(np.zeros((1, 5), dtype=np.float32), 5)
+    assert found.landmarks.tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize('k', [0, 4])
+def test_k_must_fit_the_map(k):
+    with pytest.raises(OptionsError, match='the map has 3 landmarks'):
+        nearest_candidates(SIMILARITIES, k)
+
+
+def test_classes_the_map_does_not_know_match_nothing():
+    mask = same_class(('cup', 'zebra', ''), ('chair', 'cup', 'cup'))
+    assert mask.tolist() == [[False, True, True], [False] * 3, [False] * 3]
+    assert class_candidates(mask).pairs.tolist() == [[0, 1], [0, 2]]
+
+
+def test_mask_of_candidates():
+    mask = candidate_mask(nearest_candidates(SIMILARITIES, 1), (2, 3))
+    assert mask.tolist() == [[True, False, False], [False, True, False]]

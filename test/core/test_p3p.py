@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.p3p import solve_p3p
+
+coordinates = st.floats(-5.0, 5.0)
+
+
+def random_problem(rng):
+    """Three points of random bearings and depths in front of a camera at a random pose."""
+    seen = rng.uniform(-1, 1, (3, 3))
+    seen[:, 2] = rng.uniform(0.5, 6.0, 3)
+    seen[:, :2] *= seen[:, 2:]
+    rotation = Rotation.from_rotvec(rng.normal(size=3) * 2).as_matrix()
+    translation = rng.normal(size=3) * 2
+    return seen, (seen - translation) @ rotation, rotation, translation
+
+
+def bearings_of(seen):
+    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+
+
+def nearest(rotations, translations, rotation, translation):
+    """How far the nearest of some poses is from another, as the largest difference."""
+    return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
+                for r, t in zip(rotations, translations, strict=True)), default=np.inf)
+
+
+def test_recovers_random_poses(rng):
+    worst = 0.0
+    for _ in range(10_000):
+        seen, points, rotation, translation = random_problem(rng)
+        worst = max(worst, nearest(*solve_p3p(bearings_of(seen), points), rotation, translation))
+    print(f'\n10,000 random poses recovered to {worst:.1e}')
+    assert worst < 1e-8
+
+
+def test_finds_what_opencv_finds(rng):
+    found = 0
+    for _ in range(2_000):
+        seen, points, _, _ = random_problem(rng)
+        bearings = bearings_of(seen)
+        rotations, translations = solve_p3p(bearings, points)
+        image = np.ascontiguousarray((seen[:, :2] / seen[:, 2:])[:, None])
+        _, vectors, theirs = cv2.solveP3P(np.ascontiguousarray(points[:, None]), image,
+                                          np.eye(3), None, cv2.SOLVEPNP_AP3P)
+        for vector, translation in zip(vectors, theirs, strict=True):
+            rotation = cv2.Rodrigues(vector)[0]
+            again = bearings_of(points @ rotation.T + translation.ravel())
+            if np.abs(again - bearings).max() > 1e-6:
+                continue  # not a solution: OpenCV's own rounding near a double root
+            found += 1
+            assert nearest(rotations, translations, rotation, translation.ravel()) < 1e-4
+    assert found > 3_000
+
+
+def test_every_pose_found_is_a_solution_and_none_is_found_twice(rng):
+    for _ in range(2_000):
+        seen, points, _, _ = random_problem(rng)
+        bearings = bearings_of(seen)
+        rotations, translations = solve_p3p(bearings, points)
+        for index, (rotation, translation) in enumerate(zip(rotations, translations,
+                                                            strict=True)):
+            assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-8
+            assert np.linalg.det(rotation) > 0
+            again = bearings_of(points @ rotation.T + translation)
+            assert np.abs(again - bearings).max() < 1e-9
+            assert nearest(rotations[:index], translations[:index], rotation,
+                           translation) > 1e-9
+
+
+@given(st.lists(st.tuples(coordinates, coordinates, coordinates), min_size=3, max_size=3),
+       st.lists(st.tuples(coordinates, coordinates), min_size=3, max_size=3))
+def test_any_input_gives_finite_poses_or_none(points, image):
+    seen = np.concatenate([np.array(image), np.ones((3, 1))], axis=1)
+    rotations, translations = solve_p3p(bearings_of(seen), np.array(points))
+    assert np.isfinite(rotations).all()
+    assert np.isfinite(translations).all()
+
+
+@pytest.mark.parametrize('points', [
+    np.zeros((3, 3)),
+    np.array([[0.0, 0, 5], [0, 0, 5], [1, 0, 5]]),
+    np.array([[0.0, 0, 5], [1, 0, 5], [2, 0, 5]]),
+    np.full((3, 3), np.nan),
+])
+def test_degenerate_triangles_have_no_pose(points):
+    bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0, 1], [0.4, 0, 1]]))
+    assert len(solve_p3p(bearings, points)[0]) == 0

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.transforms import invert_transform, pose_error, transform_from_pose
+from cliploc_ros.errors import OptionsError
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+
+@pytest.fixture
+def room(rng) -> LandmarkMap:
+    """Twelve objects of three classes, scattered before the camera."""
+    count = 12
+    quats = rng.normal(size=(count, 4))
+    return LandmarkMap(
+        'map', tuple(f'thing_{i}' for i in range(count)),
+        tuple(f'thing {i}' for i in range(count)), tuple('abc'[i % 3] for i in range(count)),
+        np.c_[rng.uniform(-2, 2, (count, 2)), rng.uniform(3, 6, count)],
+        rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
+
+
+@pytest.fixture
+def truth():
+    return transform_from_pose(np.array([0.3, -0.2, -0.5]), np.array([0.02, -0.05, 0.03, 0.998]))
+
+
+@pytest.fixture
+def observation(room, truth) -> Observation:
+    """What a perfect detector and a good encoder see of the room."""
+    outlines = project_ellipsoids(invert_transform(truth), room.centers, room.shapes)
+    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    similarities = np.full((len(room), len(room)), 0.2, dtype=np.float32)
+    np.fill_diagonal(similarities, np.linspace(0.3, 0.4, len(room)))
+    return Observation(CAMERA, Detections(boxes, room.class_ids, np.full(len(room), 0.9)),
+                       similarities, 123)
+
+
+METHODS = [('class', 'bf'), ('class', 'ransac')] + [
+    (matching, algorithm) for matching in ('clip', 'hybrid') for algorithm in ALGORITHMS]
+
+
+@pytest.mark.parametrize(('matching', 'algorithm'), METHODS)
+def test_every_method_finds_a_perfect_view(matching, algorithm, room, truth, observation):
+    options = RelocalizerOptions(matching=matching, algorithm=algorithm, iterations=2000)
+    result = Relocalizer(room, options).relocalize([observation])
+    assert result.accepted
+    # box centres and ellipsoid centres differ slightly by perspective
+    assert pose_error(result.map_from_camera, truth) < (0.05, 1.0)
+    assert len(result.matches) == 12
+    assert all(match.detection == match.landmark for match in result.matches)
+    assert result.stamp_ns == 123
+    assert np.linalg.eigvalsh(result.covariance).min() > 0
+
+
+def test_equal_seeds_repeat_and_negative_ones_vary(room, observation):
+    def scores(seed):
+        options = RelocalizerOptions(algorithm='ransac', iterations=5, random_seed=seed)
+        return [Relocalizer(room, options).relocalize([observation]).score for _ in range(5)]
+    assert len(set(scores(1))) == 1
+    assert len(set(scores(-1))) > 1
+
+
+def test_hypotheses_are_distinct_and_best_first(room, observation):
+    hypotheses = Relocalizer(room, RelocalizerOptions(algorithm='bf')).relocalize(
+        [observation]).hypotheses
+    assert len(hypotheses) > 1
+    scores = [hypothesis.score for hypothesis in hypotheses]
+    assert scores == sorted(scores, reverse=True)
+    for row, one in enumerate(hypotheses):
+        for other in hypotheses[:row]:
+            distance, angle = pose_error(one.map_from_camera, other.map_from_camera)
+            assert distance > 0.5 or angle > 20.0
+
+
+def only(observation, rows):
+    rows = np.array(rows, dtype=np.int64)
+    return Observation(observation.camera, observation.detections.select(rows),
+                       observation.similarities[rows], observation.stamp_ns)
+
+
+@pytest.mark.parametrize('rows', [[], [0], [0, 1]])
+def test_fewer_than_three_boxes_give_no_pose(rows, room, observation):
+    result = Relocalizer(room, RelocalizerOptions()).relocalize([only(observation, rows)])
+    assert not result.accepted
+    assert not result.solved
+    assert f'{len(rows)} detections' in result.reason
+
+
+def test_three_boxes_give_a_pose_that_is_refused(room, observation):
+    result = Relocalizer(room, RelocalizerOptions()).relocalize([only(observation, [0, 1, 2])])
+    assert result.solved
+    assert not result.accepted
+
+
+def test_a_frame_of_unknown_classes_is_refused(room, observation):
+    strange = Observation(CAMERA, Detections(observation.detections.bboxes_xyxy, ('zebra',) * 12,
+                                             observation.detections.scores))
+    options = RelocalizerOptions(matching='class', algorithm='bf')
+    result = Relocalizer(room, options).relocalize([strange])
+    assert not result.accepted
+    assert 'correspondence candidates' in result.reason
+
+
+def test_boxes_where_the_lens_has_no_inverse_are_left_out(room, observation):
+    folded = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 'plumb_bob', (-2.0, 0.0, 0.0, 0.0))
+    detections = Detections(np.array([[0.0, 0, 10, 10]] * 12), room.class_ids, np.ones(12))
+    result = Relocalizer(room, RelocalizerOptions()).relocalize(
+        [Observation(folded, detections, observation.similarities)])
+    assert not result.accepted
+
+
+def test_bf_stops_when_its_time_is_over_and_says_so(room, observation):
+    options = RelocalizerOptions(matching='class', algorithm='bf', time_budget_s=0.0)
+    result = Relocalizer(room, options).relocalize([observation])
+    assert 0.0 < result.coverage < 1.0
+
+
+def test_missing_or_misshaped_similarities_are_named(room, observation):
+    relocalizer = Relocalizer(room, RelocalizerOptions())
+    for similarities in (None, observation.similarities[:, :3]):
+        with pytest.raises(OptionsError, match=r'needs similarities of shape \(12, 12\)'):
+            relocalizer.relocalize([Observation(CAMERA, observation.detections, similarities)])
+
+
+def test_one_observation_at_a_time(room, observation):
+    with pytest.raises(OptionsError, match='one observation'):
+        Relocalizer(room, RelocalizerOptions()).relocalize([observation, observation])
+
+
+def test_k_larger_than_the_map_is_refused(room):
+    with pytest.raises(OptionsError, match='k = 13, but the map has 12 landmarks'):
+        Relocalizer(room, RelocalizerOptions(k=13))
+
+
+@pytest.mark.parametrize('change', [
+    {'matching': 'magic'}, {'algorithm': 'luck'},
+    {'algorithm': 'b-prosac', 'matching': 'class'}, {'k': 0}, {'iterations': 0},
+    {'iou_threshold': 1.5}, {'iou_threshold': float('nan')}, {'time_budget_s': -1.0},
+    {'min_inliers': 2}, {'min_evidence': -1.0}])
+def test_impossible_options_are_named(change):
+    with pytest.raises(OptionsError, match=next(iter(change))):
+        RelocalizerOptions(**change)
+
+
+def test_usable_detections_leave_out_what_cannot_be_seen():
+    boxes = np.array([[10, 10, 50, 50], [np.nan, 0, 1, 1], [50, 50, 10, 10], [700, 10, 720, 30],
+                      [-20, -20, 5, 5], [-1e30, 0, 1e30, 9], [60, 60, 90, np.inf],
+                      [20, 20, 20, 40]], dtype=np.float64)
+    detections = Detections(boxes, tuple('abcdefgh'), np.linspace(0.1, 0.8, 8))
+    assert detections.usable(640, 480, 50).class_ids == ('a', 'e')
+    assert detections.usable(640, 480, 1).class_ids == ('e',)
