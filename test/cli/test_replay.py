@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PROJECT, run, wait_until
+from executables import PROJECT, run, wait_until
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -226,15 +226,6 @@ def test_signal_ends_the_wait_for_subscribers(tmp_path, start, listener):
     process = start('replay', bag, '--wait-for-subscribers', '--wait-timeout', 600)
     wait_until(lambda: listener.node.get_publishers_info_by_topic('/pose'))
     assert 'published 0 messages' in stop(process, signal.SIGTERM)
-
-
-def test_first_message_reaches_a_subscriber_waited_for(tmp_path, listener):
-    """Discovery is mutual: the subscriber must know the publisher, too, or loses the first."""
-    bag = write_poses(tmp_path / 'bag', [0, 1])
-    listener.listen('/pose', PoseStamped)
-    for count in range(1, 4):
-        assert run('replay', bag, '--wait-for-subscribers').returncode == 0
-        wait_until(lambda count=count: len(listener.received['/pose']) == 2 * count)
 
 
 def write_foreign(path, msgtype, definition, type_hash):

@@ -11,7 +11,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from conftest import PROJECT, SIZE, run, wait_until
+from executables import PROJECT, SIZE, run, wait_until
 
 from cliploc_ros.cli.tum_to_bag import main
 from cliploc_ros.core.transforms import pose_error
