@@ -174,7 +174,7 @@ def _play(player: 'Player', options: argparse.Namespace, stop: threading.Event) 
     )
     begin = time.monotonic()
     with tqdm(
-        total=round(length_s, 1), unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+        total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
         disable=None,  # without a terminal there is nothing to draw on
     ) as bar:
         report = player.play(_progress(bar, player.start_ns))
