@@ -30,7 +30,8 @@ setup(
     install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
     extras_require={
         'models': [
-            'open_clip_torch', 'safetensors', 'torch', 'torchvision', 'ultralytics-opencv-headless',
+            'open_clip_torch', 'safetensors', 'torch', 'torchvision',
+            'ultralytics-opencv-headless',
         ],
         'datasets': ['rosbags'],
         'test': ['hypothesis', 'pytest'],
