@@ -1,3 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Neural networks behind two small protocols: an object detector, an image-text encoder."""
+"""Neural networks behind two small protocols: an object detector, an image-text encoder.
+
+To import this package imports neither torch nor open_clip nor ultralytics: that happens when an
+encoder or a detector is made.
+"""
+
+from cliploc_ros.models.clip_encoder import ClipEncoder, LoadedEncoder, load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.images import visible_boxes
+from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
+from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+
+__all__ = [
+    'ClipEncoder', 'ClipOptions', 'ImageTextEncoder', 'LoadedEncoder', 'ObjectDetector',
+    'YoloDetector', 'YoloOptions', 'load_encoder', 'visible_boxes']

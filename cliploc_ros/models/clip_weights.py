@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which CLIP is meant: its architecture, its file of weights and how they were trained."""
 
+import contextlib
 import difflib
 import os
 import zipfile
@@ -143,16 +144,21 @@ def is_torchscript(file: Path) -> bool:
         return any(name.endswith('/constants.pkl') for name in archive.namelist())
 
 
-def fetch_clip_weights(model: str, pretrained: str, folder: str) -> str:
-    """Download the weights of a tag into open_clip's cache layout in a folder; return the file.
+def fetch_from_hub(repository: str, names: str, folder: str) -> str:
+    """Download the first of some comma-separated files that a repository has; return the file.
 
-    Runs in the child process of `cliploc_ros.models.download`.
+    Runs in the child process of `cliploc_ros.models.download`. It is what open_clip does, without
+    importing torch for it.
     """
-    import open_clip
+    import huggingface_hub
+    from huggingface_hub.errors import EntryNotFoundError
 
     announce_start()
-    return open_clip.download_pretrained(
-        open_clip.get_pretrained_cfg(model, pretrained), cache_dir=folder)
+    *alternatives, last = names.split(',')
+    for name in alternatives:
+        with contextlib.suppress(EntryNotFoundError):
+            return huggingface_hub.hf_hub_download(repository, name, cache_dir=folder)
+    return huggingface_hub.hf_hub_download(repository, last, cache_dir=folder)
 
 
 def _unknown_pretrained(model: str, options: ClipOptions) -> ModelError:
@@ -162,8 +168,8 @@ def _unknown_pretrained(model: str, options: ClipOptions) -> ModelError:
     if os.sep in name or name.endswith(_WEIGHT_SUFFIXES):
         return ModelError(f'{name} does not exist: check the path of the weights')
     tags = open_clip.list_pretrained_tags_by_model(model)
-    return ModelError(f"unknown weights '{name}' for CLIP model '{model}'{_nearest(name, tags)}; "
-                      f"there are: {', '.join(tags) or 'none'}")
+    return ModelError(f"unknown weights '{name}' for CLIP model '{model}'{_nearest(name, tags)} "
+                      f"(there are: {', '.join(tags) or 'none'})")
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
@@ -176,32 +182,41 @@ def _weights_folder(options: ClipOptions) -> Path:
     return resolve_cache_dir(options.cache_dir) / 'weights'
 
 
-def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
-    """Return the file of an earlier download, here or in the hub's own cache.
-
-    Asking open_clip would ask the network first: a robot without one would wait at every start.
-    """
-    import huggingface_hub
+def _hub_files(tag: dict[str, Any]) -> tuple[str, list[str]]:
+    """Return the repository of a tag's weights and the names they may have there, best first."""
     from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
 
     repository, name = os.path.split(tag.get('hf_hub', ''))
-    if not repository:
-        return None
-    names = ((str(Path(name).with_suffix('.safetensors')), name) if name
-             else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
+    if not name:
+        return repository, [HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME]
+    return repository, [str(Path(name).with_suffix('.safetensors')), name]
+
+
+def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
+    """Return the file of an earlier download, here or in the hub's own cache.
+
+    To ask the hub would be to ask the network first: a robot without one would wait at each start.
+    """
+    import huggingface_hub
+
+    repository, names = _hub_files(tag)
     for folder in (_weights_folder(options), None):
-        for candidate in names:
-            found = huggingface_hub.try_to_load_from_cache(repository, candidate, folder)
+        for name in names if repository else ():
+            found = huggingface_hub.try_to_load_from_cache(repository, name, folder)
             if isinstance(found, str):
                 return Path(found)
     return None
 
 
 def _download(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
-    repository = os.path.split(tag.get('hf_hub', ''))[0]
-    source = f'https://huggingface.co/{repository}' if repository else tag.get('url', '')
-    remedy = (f'Without a network: download the weights from {source} on another machine and set '
-              'checkpoint_path to the file')
-    return download('cliploc_ros.models.clip_weights:fetch_clip_weights',
-                    [model, options.pretrained], _weights_folder(options), remedy,
+    repository, names = _hub_files(tag)
+    what = f"the weights '{options.pretrained}' of CLIP model '{model}'"
+    if not repository:
+        raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
+                         'checkpoint_path to the file')
+    remedy = (f'Without a network: download {names[0]} or {names[1]} from '
+              f'https://huggingface.co/{repository} on another machine and set checkpoint_path '
+              'to the file')
+    return download('cliploc_ros.models.clip_weights:fetch_from_hub',
+                    [repository, ','.join(names)], _weights_folder(options), what, remedy,
                     options.download_timeout_s)

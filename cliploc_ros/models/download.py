@@ -9,6 +9,7 @@ the library's own retries together. A process can be ended whatever it waits for
 import contextlib
 import importlib
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -21,13 +22,21 @@ from pathlib import Path
 import cliploc_ros
 from cliploc_ros.errors import ModelError
 
-# The child imports torch before it can ask for a byte: on a small board that takes its time.
+# A child may import torch before it asks for a byte: on a small board that takes its time.
 _START_LIMIT_S = 120.0
 _POLL_S = 0.2
+_LOG_PERIOD_S = 10.0
+
+logger = logging.getLogger(__name__)
 
 
 def download(
-    fetcher: str, arguments: Sequence[str], folder: Path, remedy: str, stall_timeout_s: float
+    fetcher: str,
+    arguments: Sequence[str],
+    folder: Path,
+    what: str,
+    remedy: str,
+    stall_timeout_s: float,
 ) -> Path:
     """Download a file with a library's own function, in a process of its own.
 
@@ -40,6 +49,8 @@ def download(
         What to fetch, in the fetcher's terms.
     folder : Path
         Where the file goes; its growth is what counts as progress.
+    what : str
+        Name of what is downloaded, for the log and the error.
     remedy : str
         What the user can do without a network, for the error.
     stall_timeout_s : float
@@ -55,7 +66,7 @@ def download(
     ModelError
         When the download fails or stalls.
     """
-    what = ' '.join(arguments)
+    logger.info('downloading %s into %s', what, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -114,15 +125,20 @@ def _wait_while_it_grows(
 ) -> bool:
     """Return True when the child has ended, False when it has stalled."""
     deadline = time.monotonic() + _START_LIMIT_S
-    size = None
+    next_log = time.monotonic() + _LOG_PERIOD_S
+    before, size = _folder_bytes(folder), None
     while True:
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(_POLL_S)
             return True
+        now = time.monotonic()
         if started.exists() and size != (size := _folder_bytes(folder)):
-            deadline = time.monotonic() + stall_timeout_s
-        if time.monotonic() > deadline:
+            deadline = now + stall_timeout_s
+        if now > deadline:
             return False
+        if size is not None and now > next_log:
+            next_log = now + _LOG_PERIOD_S
+            logger.info('downloaded %.0f MB so far', (size - before) / 1e6)
 
 
 def _folder_bytes(folder: Path) -> int:

@@ -10,7 +10,7 @@ Each start is a process of its own. Without ``--checkpoint`` the weights are ran
 import argparse
 import gc
 import json
-import resource
+import re
 import subprocess
 import sys
 import tempfile
@@ -94,8 +94,8 @@ def _start_and_report(kind: str, options: ClipOptions) -> StartupResult:
     kept = _start_open_clip(options) if kind == KINDS[0] else load_encoder(options, _LABELS)
     seconds = time.perf_counter() - started
     gc.collect()
-    parameters = [thing for thing in gc.get_objects() if isinstance(thing, torch.nn.Parameter)
-                  and not thing.is_meta]
+    parameters = [thing for thing in gc.get_objects()
+                  if issubclass(type(thing), torch.nn.Parameter) and not thing.is_meta]
     del kept
     return StartupResult(
         kind=kind, seconds=seconds, peak_mib=_peak_mib(), imports_mib=imports_mib,
@@ -120,7 +120,10 @@ def _as_pair(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # Not ru_maxrss: through exec it keeps the peak of the process that started this one.
+    match = re.search(r'VmHWM:\s+(\d+) kB', Path('/proc/self/status').read_text())
+    assert match
+    return int(match[1]) / 1024
 
 
 def main() -> None:

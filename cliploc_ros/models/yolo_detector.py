@@ -90,9 +90,10 @@ class YoloOptions:
 class YoloDetector:
     """An `ObjectDetector`: a detection model of ultralytics.
 
-    Ultralytics' checkpoints are pickles. With PyTorch 2.6 or newer they are read in ultralytics'
-    restricted mode (``weights_only=True`` and a list of known classes), so that a file can run
-    no code of its own; with an older PyTorch only load files from a source that you trust.
+    Ultralytics' checkpoints are pickles, which can run code of their own. They are read in
+    ultralytics' restricted mode (``weights_only=True`` and a list of known classes), which
+    refuses that. An ultralytics without this mode, or a PyTorch before 2.6, falls back to plain
+    pickles: then a warning says to load only files from a source that you trust.
 
     Parameters
     ----------
@@ -163,7 +164,7 @@ def fetch_yolo_weights(name: str, folder: str) -> str:
 @cache
 def _import_ultralytics() -> Any:
     """Import ultralytics so that it neither asks the network, installs, nor writes to the home."""
-    import torch  # noqa: F401  (reads OMP_NUM_THREADS before ultralytics sets it to 1)
+    import torch  # first: it reads OMP_NUM_THREADS, which ultralytics sets to 1
 
     if 'ultralytics' in sys.modules:
         logger.warning('ultralytics was imported before the detector: it may go to the network')
@@ -186,6 +187,10 @@ def _import_ultralytics() -> Any:
     ultralytics_logger.handlers.clear()
     ultralytics_logger.propagate = True
     ultralytics_logger.setLevel(logging.WARNING)
+    if not (getattr(ultralytics.utils, 'SAFE_LOAD', False)
+            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint')):
+        logger.warning('ultralytics %s with torch %s runs code that weights may hold: load only '
+                       'files that you trust', ultralytics.__version__, torch.__version__)
     return ultralytics
 
 
@@ -208,8 +213,8 @@ def _resolve_file(options: YoloOptions) -> Path:
                          f'{_nearest(name, GITHUB_ASSETS_NAMES)}')
     remedy = (f'Without a network: download {name} from https://github.com/ultralytics/assets/'
               'releases on another machine and set the model to the path of the file')
-    return download('cliploc_ros.models.yolo_detector:fetch_yolo_weights', [name], folder, remedy,
-                    options.download_timeout_s)
+    return download('cliploc_ros.models.yolo_detector:fetch_yolo_weights', [name], folder, name,
+                    remedy, options.download_timeout_s)
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""CLIP's embeddings equal open_clip's own, from every form of checkpoint."""
+
+import gc
+import logging
+import shutil
+import warnings
+import weakref
+
+import numpy as np
+import open_clip
+import pytest
+import torch
+from clip_reference import SMALL_CONFIG, make_small_reference
+from open_clip.model import convert_to_custom_text_state_dict
+from open_clip.transformer import QuickGELU
+from safetensors.torch import save_file
+
+from cliploc_ros.errors import CliplocError, ImageError
+from cliploc_ros.models import ClipOptions, load_encoder
+from cliploc_ros.models.clip_checkpoint import copy_tensors, read_state_dict
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.images import crop_bounds
+
+LABELS = ['a red mug', 'keyboard', 'a red mug', 'a stack of books beside the monitor', '']
+BBOXES = np.array([
+    [100.0, 50, 300, 250], [0, 0, 640, 480], [-40, -30, 90.5, 60.2], [600.1, 10, 900, 470.9],
+    [300, 200, 301, 201], [10.5, 400, 200, 410], [320, 0, 335, 200], [5, 5, 45, 480]])
+
+
+def options(reference, tmp_path, **changes) -> ClipOptions:
+    return ClipOptions(**{'model': reference.name, 'pretrained': str(reference.file),
+                          'device': 'cpu', 'cache_dir': str(tmp_path), **changes})
+
+
+def load_image_encoder(clip_options: ClipOptions) -> ClipEncoder:
+    return ClipEncoder(resolve_clip_weights(clip_options), clip_options)
+
+
+def difference(first: np.ndarray, second: np.ndarray) -> float:
+    return float(np.abs(first - second).max())
+
+
+@pytest.fixture(scope='module')
+def small_encoder(small_clip, tmp_path_factory) -> ClipEncoder:
+    return load_encoder(options(small_clip, tmp_path_factory.mktemp('cache')), LABELS).encoder
+
+
+def test_embeddings_equal_those_of_open_clip(large_clip, tmp_path, image_rgb):
+    encoder, label_embeddings = load_encoder(options(large_clip, tmp_path), LABELS)
+    crops = encoder.encode_crops(image_rgb, BBOXES)
+    assert crops.dtype == label_embeddings.dtype == np.float32
+    assert crops.shape == (len(BBOXES), encoder.embed_dim) == (8, 512)
+    expected = large_clip.crops(image_rgb, crop_bounds(BBOXES, 640, 480))
+    errors = {'crops': difference(crops, expected),
+              'labels': difference(label_embeddings, large_clip.labels(LABELS)),
+              'labels from the cache': difference(
+                  load_encoder(options(large_clip, tmp_path), LABELS[::-1]).label_embeddings,
+                  large_clip.labels(LABELS)[::-1])}
+    print(f'\nlargest difference to open_clip: {errors}')
+    assert max(errors.values()) < 1e-5
+    assert np.allclose(np.linalg.norm(crops, axis=1), 1.0, atol=1e-6)
+
+
+def test_batches_do_not_change_embeddings(small_clip, small_encoder, tmp_path, image_rgb):
+    batched = load_image_encoder(options(small_clip, tmp_path, max_batch=3))
+    assert difference(batched.encode_crops(image_rgb, BBOXES),
+                      small_encoder.encode_crops(image_rgb, BBOXES)) < 1e-5
+
+
+def test_nothing_to_encode(small_clip, small_encoder, tmp_path, image_rgb):
+    assert small_encoder.encode_crops(image_rgb, np.empty((0, 4))).shape == (0, 64)
+    assert small_encoder.encode_labels([]).shape == (0, 64)
+    assert load_encoder(options(small_clip, tmp_path), []).label_embeddings.shape == (0, 64)
+
+
+def test_many_labels_are_encoded_in_batches(small_clip, small_encoder):
+    labels = [f'thing number {number}' for number in range(70)]
+    assert difference(small_encoder.encode_labels(labels), small_clip.labels(labels)) < 1e-5
+
+
+def test_very_long_crops_cost_little(small_clip, small_encoder):
+    image = np.random.default_rng(0).integers(0, 255, (4, 4000, 3), dtype=np.uint8)
+    crop = small_encoder.encode_crops(image, np.array([[0.0, 1, 4000, 2]]))
+    # Its middle is what open_clip would have seen of it.
+    expected = small_clip.crops(image, np.array([[1992, 1, 2008, 2]]))
+    assert difference(crop, expected) < 1e-5
+
+
+def test_long_labels_are_named(small_encoder, caplog):
+    small_encoder.encode_labels(['short', 'very ' * 80 + 'long'])
+    assert len(caplog.records) == 1
+    assert 'very very' in caplog.text and 'first 75' in caplog.text
+
+
+@pytest.mark.parametrize('image', [
+    np.zeros((0, 10, 3), np.uint8), np.zeros((10, 10, 3)), np.zeros((10, 10), np.uint8)])
+def test_bad_image(small_encoder, image):
+    with pytest.raises(ImageError):
+        small_encoder.encode_crops(image, np.array([[0.0, 0, 5, 5]]))
+
+
+@pytest.mark.parametrize('bbox', [
+    [np.nan, 0, 5, 5], [700, 0, 800, 5], [9, 9, 5, 5], [0, 0, np.inf, 5]])
+def test_bad_box(small_encoder, image_rgb, bbox):
+    with pytest.raises(CliplocError, match='box 1'):
+        small_encoder.encode_crops(image_rgb, np.array([[0, 0, 5, 5], bbox], dtype=float))
+
+
+def test_half_precision(small_clip, small_encoder, tmp_path, image_rgb):
+    half = load_image_encoder(options(small_clip, tmp_path, precision='fp16'))
+    crops = half.encode_crops(image_rgb, BBOXES[:2])
+    assert 0.0 < difference(crops, small_encoder.encode_crops(image_rgb, BBOXES[:2])) < 5e-3
+    assert np.allclose(np.linalg.norm(crops, axis=1), 1.0, atol=1e-6)
+
+
+def write_training_checkpoint(model, file):
+    state = {f'module.{name}': tensor for name, tensor in model.state_dict().items()}
+    torch.save({'epoch': 3, 'name': 'run', 'state_dict': state}, file)
+
+
+def write_old_pickle(model, file):
+    torch.save(model.state_dict(), file, _use_new_zipfile_serialization=False)
+
+
+def write_safetensors(model, file):
+    save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, file)
+
+
+def write_custom_text(model, file):
+    torch.save(convert_to_custom_text_state_dict(model.state_dict()), file)
+
+
+@pytest.mark.parametrize(('write', 'suffix'), [
+    (write_training_checkpoint, '.pt'), (write_old_pickle, '.pt'),
+    (write_safetensors, '.safetensors'), (write_custom_text, '.bin')])
+def test_forms_of_checkpoints(small_clip, tmp_path, write, suffix):
+    file = tmp_path / f'weights{suffix}'
+    write(small_clip.model, file)
+    expected, found = read_state_dict(small_clip.file), read_state_dict(file)
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+    copies = copy_tensors(file, found, expected, torch.device('cpu'))
+    assert copies.keys() == expected.keys() and not found
+    assert all(torch.equal(copies[name], tensor) for name, tensor in expected.items())
+
+
+def test_weights_stored_in_half(small_clip, small_encoder, tmp_path, image_rgb):
+    file = tmp_path / 'half.safetensors'
+    save_file({name: tensor.half().contiguous()
+               for name, tensor in small_clip.model.state_dict().items()}, file)
+    encoder, label_embeddings = load_encoder(
+        options(small_clip, tmp_path, pretrained=str(file)), LABELS)
+    assert {tensor.dtype for tensor in encoder._model.visual.parameters()} == {torch.float32}
+    assert difference(encoder.encode_crops(image_rgb, BBOXES),
+                      small_encoder.encode_crops(image_rgb, BBOXES)) < 5e-3
+    assert difference(label_embeddings, small_clip.labels(LABELS)) < 5e-3
+
+
+def write_torchscript(model, file):
+    root = torch.nn.Module()
+    for name, tensor in model.state_dict().items():
+        *path, leaf = name.split('.')
+        module = root
+        for part in path:
+            if not hasattr(module, part):
+                module.add_module(part, torch.nn.Module())
+            module = getattr(module, part)
+        module.register_buffer(leaf, tensor)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        torch.jit.script(root).save(file)
+
+
+def with_quick_gelu(reference):
+    model, _, preprocess = open_clip.create_model_and_transforms(
+        reference.name, pretrained=str(reference.file), force_quick_gelu=True)
+    return type(reference)(reference.name, reference.file, model.eval(), preprocess,
+                           reference.tokenizer)
+
+
+def test_openai_torchscript_archive(small_clip, tmp_path, image_rgb):
+    file = tmp_path / 'ViT.pt'
+    write_torchscript(small_clip.model, file)
+    encoder, label_embeddings = load_encoder(
+        options(small_clip, tmp_path, pretrained=str(file)), LABELS)
+    # Whoever published in this form trained with OpenAI's activation.
+    reference = with_quick_gelu(small_clip)
+    bounds = crop_bounds(BBOXES, 640, 480)
+    crops = reference.crops(image_rgb, bounds)
+    assert difference(encoder.encode_crops(image_rgb, BBOXES), crops) < 1e-5
+    assert difference(label_embeddings, reference.labels(LABELS)) < 1e-5
+    assert difference(crops, small_clip.crops(image_rgb, bounds)) > 1e-4
+
+
+def test_a_tag_says_how_weights_were_trained(large_clip, tmp_path):
+    tagged = options(large_clip, tmp_path, pretrained='openai',
+                     checkpoint_path=str(large_clip.file))
+    tower = load_image_encoder(tagged)._model.visual
+    assert {type(block.mlp.gelu) for block in tower.transformer.resblocks} == {QuickGELU}
+    weights, plain, laion = map(resolve_clip_weights, (
+        tagged, options(large_clip, tmp_path),
+        options(large_clip, tmp_path, pretrained='laion2b_s34b_b79k',
+                checkpoint_path=str(large_clip.file))))
+    assert weights.quick_gelu and not plain.quick_gelu and weights.key != plain.key
+    assert laion.key == plain.key
+
+
+def test_a_tower_with_computed_tensors_is_loaded_by_open_clip(tmp_path, image_rgb):
+    # Its rotary embeddings are in no checkpoint. Its text tower is CLIP's: a small one will do.
+    config = open_clip.get_model_config('PE-Core-T-16-384')
+    config['text_cfg'] |= SMALL_CONFIG['text_cfg']
+    rotary = make_small_reference('small-rotary', config, tmp_path)
+    encoder, label_embeddings = load_encoder(options(rotary, tmp_path), LABELS)
+    whole = np.array([[0, 0, 640, 480]])
+    assert difference(encoder.encode_crops(image_rgb, whole),
+                      rotary.crops(image_rgb, whole)) < 1e-5
+    assert difference(label_embeddings, rotary.labels(LABELS)) < 1e-5
+
+
+def test_the_text_tower_is_gone(small_clip, tmp_path):
+    def text_towers() -> int:
+        gc.collect()
+        return sum(issubclass(type(thing), open_clip.transformer.TextTransformer)
+                   for thing in gc.get_objects())
+
+    before = text_towers()
+    encoder, _ = load_encoder(options(small_clip, tmp_path), LABELS)
+    assert text_towers() == before
+    held = weakref.ref(encoder._model)
+    parameters = {name for name, tensor in encoder._model.named_parameters()
+                  if not tensor.is_meta}
+    assert parameters and all(name.startswith('visual.') for name in parameters)
+    del encoder
+    gc.collect()
+    assert held() is None
+
+
+def test_weights_may_change_on_disk_while_they_run(small_clip, tmp_path, image_rgb):
+    file = tmp_path / 'weights.pt'
+    shutil.copy(small_clip.file, file)
+    encoder = load_image_encoder(options(small_clip, tmp_path, pretrained=str(file)))
+    before = encoder.encode_crops(image_rgb, BBOXES)
+    with file.open('r+b') as opened:  # in place, as scp does: a mapped file would kill us
+        opened.truncate(1000)
+    assert np.array_equal(encoder.encode_crops(image_rgb, BBOXES), before)
+
+
+def test_other_weights_have_another_key(small_clip, tmp_path):
+    other = tmp_path / 'other.pt'
+    state = {name: tensor.clone() for name, tensor in small_clip.model.state_dict().items()}
+    state['visual.proj'] += 1e-3
+    torch.save(state, other)
+    keys = {resolve_clip_weights(options(small_clip, tmp_path, pretrained=str(file))).key
+            for file in (small_clip.file, other)}
+    assert len(keys) == 2
+
+
+def test_open_clip_does_not_configure_our_logging(small_clip, tmp_path):
+    root = logging.getLogger()
+    handlers = root.handlers[:]
+    root.handlers.clear()
+    try:
+        load_encoder(options(small_clip, tmp_path), LABELS)
+        assert root.handlers == [] and root.filters == []
+    finally:
+        root.handlers[:] = handlers

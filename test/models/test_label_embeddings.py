@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Label embeddings on disk: found again, never trusted blindly, never fatal."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.models.label_embeddings import LabelCache
+
+KEY = 'ViT-B-32:gelu:0123'
+LABELS = ['a red mug', 'tasse bleue é', "it's \0 odd"]
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+def unit_rows(count: int, seed: int = 0) -> np.ndarray:
+    rows = np.random.default_rng(seed).normal(size=(count, 16)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+@pytest.fixture
+def cache(tmp_path) -> LabelCache:
+    return LabelCache(tmp_path / 'deep' / 'labels')
+
+
+def stored_file(cache: LabelCache) -> Path:
+    cache.store(KEY, LABELS, unit_rows(3))
+    file, = cache._folder.iterdir()
+    return file
+
+
+def test_stored_is_found(cache):
+    cache.store(KEY, LABELS, unit_rows(3))
+    assert np.array_equal(cache.load(KEY, LABELS, 16), unit_rows(3))
+
+
+@pytest.mark.parametrize(('key', 'labels'), [
+    ('ViT-B-32:gelu:0124', LABELS), (KEY, LABELS[:2]), (KEY, LABELS[::-1]),
+    (KEY, ['a red mug', 'tasse bleue e', "it's \0 odd"]),
+])
+def test_other_weights_or_labels_are_not_found(cache, key, labels, caplog):
+    cache.store(KEY, LABELS, unit_rows(3))
+    assert cache.load(key, labels, 16) is None
+    assert not caplog.records
+
+
+@pytest.mark.parametrize('damage', [
+    lambda file: file.write_bytes(b''),
+    lambda file: file.write_bytes(file.read_bytes()[:200]),
+    lambda file: file.write_bytes(file.read_bytes()[:-30]),
+    lambda file: file.write_bytes(file.read_bytes().replace(unit_rows(3)[1].tobytes(), b'x' * 64)),
+    lambda file: file.write_bytes(b'no archive at all'),
+    lambda file: file.write_bytes(pickle.dumps({'embeddings': 1})),
+    lambda file: np.savez(file, other=np.zeros(3)),
+    lambda file: np.savez(file, identity=np.array([object()]), embeddings=unit_rows(3)),
+    lambda file: np.savez(file, identity=np.zeros(3, np.uint8), embeddings=unit_rows(3)),
+], ids=['empty', 'truncated', 'no directory', 'flipped bytes', 'text', 'pickle', 'foreign',
+        'objects', 'other identity'])
+def test_damaged_file_is_ignored_and_replaced(cache, damage, caplog):
+    file = stored_file(cache)
+    damage(file)
+    assert cache.load(KEY, LABELS, 16) is None
+    assert 'cannot be used' in caplog.text and str(file) in caplog.text
+    cache.store(KEY, LABELS, unit_rows(3))
+    assert np.array_equal(cache.load(KEY, LABELS, 16), unit_rows(3))
+
+
+@pytest.mark.parametrize('rows', [
+    unit_rows(2), unit_rows(3) * 2, unit_rows(3).astype(np.float64),
+    np.full((3, 16), np.nan, np.float32), unit_rows(3)[:, :8]])
+def test_wrong_embeddings_are_ignored(cache, rows, caplog):
+    cache.store(KEY, LABELS, rows)
+    assert cache.load(KEY, LABELS, 16) is None
+    assert 'not unit rows' in caplog.text
+
+
+def test_a_file_in_the_way_costs_only_the_cache(tmp_path, caplog):
+    (tmp_path / 'labels').write_text('in the way')
+    cache = LabelCache(tmp_path / 'labels')
+    cache.store(KEY, LABELS, unit_rows(3))
+    assert cache.load(KEY, LABELS, 16) is None
+    assert 'not cached' in caplog.text
+
+
+def test_a_full_disk_costs_only_the_cache(tmp_path):
+    # A limit on the size of files gives the error of write() that a full disk gives.
+    code = f"""
+import logging, resource, numpy as np
+from pathlib import Path
+from cliploc_ros.models.label_embeddings import LabelCache
+logging.basicConfig()
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+cache = LabelCache(Path({str(tmp_path)!r}))
+cache.store('key', ['label'], np.ones((1, 512), np.float32))
+assert cache.load('key', ['label'], 512) is None
+"""
+    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, capture_output=True,
+                          text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert 'not cached' in done.stderr and 'File too large' in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_many_processes_share_a_folder(tmp_path):
+    code = f"""
+import sys, numpy as np
+from pathlib import Path
+from cliploc_ros.models.label_embeddings import LabelCache
+cache = LabelCache(Path({str(tmp_path)!r}))
+rows = np.eye(4, 512, dtype=np.float32)
+for turn in range(100):
+    cache.store('key', list('abcd'), rows)
+    found = cache.load('key', list('abcd'), 512)
+    assert found is not None and np.array_equal(found, rows)
+"""
+    children = [subprocess.Popen([sys.executable, '-c', code], cwd=PROJECT, text=True,
+                                 stderr=subprocess.PIPE) for _ in range(4)]
+    for child in children:
+        _, errors = child.communicate(timeout=60)
+        assert child.returncode == 0 and not errors, errors
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_longest_unused_files_go(cache):
+    for number in range(40):
+        cache.store(KEY, [f'label {number}'], unit_rows(1))
+        newest = max(cache._folder.glob('*.npz'), key=lambda file: file.stat().st_mtime_ns)
+        os.utime(newest, (number, number))
+        # One that is used at each start stays however old it is.
+        assert cache.load(KEY, ['label 0'], 16) is not None
+    assert len(list(cache._folder.iterdir())) == 32
+    assert cache.load(KEY, ['label 1'], 16) is None
+    assert cache.load(KEY, ['label 39'], 16) is not None
+
+
+def test_what_killed_writers_left_is_cleared(cache):
+    file = stored_file(cache)
+    old, young = file.with_name('.old.tmp'), file.with_name('.young.tmp')
+    old.touch()
+    young.touch()
+    os.utime(old, (0, 0))
+    cache.store(KEY, ['another'], unit_rows(1))
+    assert not old.exists() and young.exists()

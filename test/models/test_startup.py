@@ -1,0 +1,21 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a first start of CLIP and a start with a warm cache cost."""
+
+from cliploc_ros.models import ClipOptions
+from cliploc_ros.models.measure_startup import KINDS, format_results, measure_startup
+
+
+def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):
+    options = ClipOptions(large_clip.name, str(large_clip.file), device='cpu',
+                          cache_dir=str(tmp_path))
+    first, warm = results = [measure_startup(kind, options) for kind in KINDS[1:]]
+    print(f'\n{format_results(results)}')
+    whole_mib = sum(each.numel() * 4 for each in large_clip.model.parameters()) / 2**20
+    assert first.weights_mib == warm.weights_mib < whole_mib - 200
+    assert not first.holds_text_tower and not warm.holds_text_tower
+    # The towers come one after the other, straight from the file: never both, never one twice.
+    assert first.peak_mib - first.imports_mib < whole_mib
+    assert warm.peak_mib - warm.imports_mib < whole_mib
+    # The image tower is the larger: both starts end at its peak, the first with some rest.
+    assert warm.peak_mib < first.peak_mib + 16

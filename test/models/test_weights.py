@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Weights that are missing, damaged, of another model, or behind a network that is not there."""
+
+import http.server
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cliploc_ros.errors import CliplocError, ModelError, OptionsError
+from cliploc_ros.models import ClipOptions, YoloDetector, YoloOptions, load_encoder
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.files import fingerprint_file, resolve_cache_dir
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+def options(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:
+    return ClipOptions(model, str(file), device='cpu', cache_dir=str(tmp_path), **changes)
+
+
+def refusal(clip_options: ClipOptions) -> str:
+    with pytest.raises(ModelError) as caught:
+        load_encoder(clip_options, ['a label'])
+    message = str(caught.value)
+    assert '\n' not in message and len(message) < 1000
+    return message
+
+
+@pytest.mark.parametrize(('content', 'message'), [
+    (b'', 'is empty'),
+    (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
+    (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
+    (b'just text', 'holds no weights'),
+    (bytes(range(256)) * 40, 'holds no weights'),
+    (b'PK\x03\x04' + bytes(1000), 'truncated or corrupt'),
+    (b'\x80\x02garbage', 'is no checkpoint of CLIP'),
+    (pickle.dumps([1, 2, 3], protocol=2), 'weights.pt'),
+])
+def test_files_that_are_no_weights(tmp_path, content, message):
+    file = tmp_path / 'weights.pt'
+    file.write_bytes(content)
+    text = refusal(options('ViT-B-32', file, tmp_path))
+    assert message in text and str(file) in text
+
+
+def test_missing_files(tmp_path):
+    assert 'gone.pt does not exist' in refusal(options('ViT-B-32', 'gone.pt', tmp_path))
+    assert '/no/where does not exist' in refusal(options('ViT-B-32', '/no/where', tmp_path))
+    assert '/no/x.pt does not exist' in refusal(
+        options('ViT-B-32', 'openai', tmp_path, checkpoint_path='/no/x.pt'))
+    assert 'is a folder' in refusal(options('ViT-B-32', tmp_path, tmp_path))
+
+
+@pytest.mark.parametrize('share', [0.0001, 0.5, 0.999])
+def test_truncated_checkpoint(small_clip, truncated, tmp_path, share):
+    file = truncated(small_clip.file, share)
+    text = refusal(options(small_clip.name, file, tmp_path))
+    assert 'truncated or corrupt' in text and 'download it again' in text and str(file) in text
+
+
+@pytest.mark.parametrize('share', [0.00002, 0.5, 0.999])
+def test_truncated_safetensors(small_clip, truncated, tmp_path, share):
+    from safetensors.torch import save_file
+
+    whole = tmp_path / 'weights.safetensors'
+    save_file({name: tensor.contiguous()
+               for name, tensor in small_clip.model.state_dict().items()}, whole)
+    text = refusal(options(small_clip.name, truncated(whole, share), tmp_path))
+    assert 'truncated or corrupt' in text
+
+
+def test_weights_of_another_clip(small_clip, tmp_path):
+    text = refusal(options('ViT-B-32', small_clip.file, tmp_path))
+    assert str(small_clip.file) in text and "'ViT-B-32'" in text
+    assert 'has shape' in text and 'more)' in text
+    text = refusal(options('RN50', small_clip.file, tmp_path))
+    assert 'does not hold the weights' in text
+
+
+@pytest.mark.parametrize('lost', ['visual.proj', 'ln_final.weight'])
+def test_weights_that_lack_a_tensor(small_clip, tmp_path, lost):
+    state = small_clip.model.state_dict()
+    state.pop(lost)
+    torch.save(state, tmp_path / 'weights.pt')
+    text = refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
+    assert f'{lost} is missing' in text
+
+
+def test_weights_with_a_tensor_too_many(small_clip, tmp_path):
+    torch.save({**small_clip.model.state_dict(), 'visual.extra': torch.zeros(3)},
+               tmp_path / 'weights.pt')
+    text = refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
+    assert 'visual.extra is not part of the model' in text
+
+
+def test_weights_that_are_not_finite(small_clip, tmp_path):
+    state = {name: torch.full_like(tensor, float('nan'))
+             for name, tensor in small_clip.model.state_dict().items()}
+    torch.save(state, tmp_path / 'weights.pt')
+    assert 'not finite' in refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
+
+
+class Hostile:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, proof: Path) -> None:
+        self.proof = proof
+
+    def __reduce__(self):
+        return os.system, (f'touch {self.proof}',)
+
+
+@pytest.mark.parametrize('zipped', [True, False])
+def test_pickled_code_is_never_run(tmp_path, zipped):
+    file, proof = tmp_path / 'weights.pt', tmp_path / 'proof'
+    torch.save({'visual.proj': Hostile(proof)}, file, _use_new_zipfile_serialization=zipped)
+    assert 'is no checkpoint of CLIP' in refusal(options('ViT-B-32', file, tmp_path))
+    with pytest.raises(ModelError, match='is no detection model'):
+        YoloDetector(YoloOptions(str(file), device='cpu'))
+    assert not proof.exists()
+
+
+def test_a_detector_is_no_clip(shared_data, tmp_path):
+    text = refusal(options('ViT-B-32', shared_data / 'weights/yolov8n_coco.pt', tmp_path))
+    assert 'is no checkpoint of CLIP' in text and 'ultralytics' in text
+
+
+def test_unknown_names(tmp_path):
+    text = refusal(options('ViT-L14', 'openai', tmp_path))
+    assert "'ViT-L14'" in text and 'ViT-L-14' in text
+    text = refusal(options('ViT-B-32', 'laoin2b', tmp_path))
+    assert 'did you mean laion2b' in text and 'openai' in text
+    text = refusal(options('ViT-B-32', 'opnai', tmp_path, checkpoint_path=str(tmp_path)))
+    assert 'did you mean openai' in text
+    assert 'transformers' in refusal(options('ViT-B-16-SigLIP', 'webli', tmp_path))
+    # OpenAI's own spelling
+    assert 'gone.pt' in refusal(options('ViT-B/32', 'gone.pt', tmp_path))
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'device': 'tpu'}, "device 'tpu'"), ({'device': 'cuda:99'}, "device 'cuda:99' is not there"),
+    ({'precision': 'int8'}, "precision 'int8'"), ({'max_batch': 0}, 'max_batch'),
+    ({'download_timeout_s': float('nan')}, 'download_timeout_s'),
+])
+def test_options_out_of_range(small_clip, tmp_path, change, message):
+    values = {'model': small_clip.name, 'pretrained': str(small_clip.file), 'device': 'cpu',
+              'cache_dir': str(tmp_path), **change}
+    with pytest.raises(OptionsError, match=message):
+        load_encoder(ClipOptions(**values), [])
+
+
+def test_fingerprint(tmp_path):
+    file = tmp_path / 'weights'
+    file.write_bytes(np.random.default_rng(0).bytes(20_000_000))
+    first = fingerprint_file(file)
+    assert fingerprint_file(file) == first
+    content = bytearray(file.read_bytes())
+    for offset in (0, len(content) // 2, len(content) - 1):
+        changed = content[:]
+        # A retrained tensor is longer than the gap between two blocks.
+        changed[offset:offset + 400_000] = bytes(len(changed[offset:offset + 400_000]))
+        file.write_bytes(changed)
+        assert fingerprint_file(file) != first, offset
+    file.write_bytes(content[:-1])
+    assert fingerprint_file(file) != first
+    file.write_bytes(b'')
+    fingerprint_file(file)
+
+
+def test_cache_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.delenv('XDG_CACHE_HOME', raising=False)
+    assert resolve_cache_dir('') == tmp_path / '.cache/cliploc_ros'
+    monkeypatch.setenv('XDG_CACHE_HOME', 'relative is to be ignored')
+    assert resolve_cache_dir('') == tmp_path / '.cache/cliploc_ros'
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'xdg'))
+    assert resolve_cache_dir('') == tmp_path / 'xdg/cliploc_ros'
+    assert resolve_cache_dir('~/mine') == tmp_path / 'mine'
+
+
+@pytest.fixture
+def silent_port():
+    """Yield a port that swallows connections: packets are dropped, not refused."""
+    with socket.socket() as listener:
+        listener.bind(('127.0.0.1', 0))
+        listener.listen(0)
+        # With the queue full, the kernel drops whoever asks next.
+        fillers = [socket.socket() for _ in range(4)]
+        for filler in fillers:
+            filler.setblocking(False)
+            filler.connect_ex(listener.getsockname())
+        yield listener.getsockname()[1]
+        for filler in fillers:
+            filler.close()
+
+
+def test_no_network_for_clip(monkeypatch, silent_port, tmp_path):
+    monkeypatch.setenv('HF_HOME', str(tmp_path / 'hub'))
+    monkeypatch.setenv('HF_ENDPOINT', f'http://127.0.0.1:{silent_port}')
+    monkeypatch.setenv('NO_PROXY', '127.0.0.1')
+    started = time.monotonic()
+    text = refusal(options('ViT-L-14', 'openai', tmp_path, download_timeout_s=2.0))
+    print(f'\ngave up after {time.monotonic() - started:.1f} s: {text}')
+    assert "the weights 'openai' of CLIP model 'ViT-L-14': no byte arrived for 2 s" in text
+    assert 'on another machine' in text and 'checkpoint_path' in text
+    assert time.monotonic() - started < 45.0
+
+
+def test_no_network_for_yolo(monkeypatch, tmp_path):
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        port = free.getsockname()[1]
+    monkeypatch.setenv('HTTPS_PROXY', f'http://127.0.0.1:{port}')  # refuses
+    started = time.monotonic()
+    with pytest.raises(CliplocError, match=r'cannot download yolov8n\.pt') as caught:
+        YoloDetector(YoloOptions('yolov8n', device='cpu', cache_dir=str(tmp_path)))
+    assert 'on another machine' in str(caught.value)
+    assert time.monotonic() - started < 45.0
+    assert list((tmp_path / 'weights').iterdir()) == []
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """As much of a model hub as a download needs."""
+
+    weights = b''
+    requests: list[str]
+
+    def do_HEAD(self):
+        self.requests.append(self.path)
+        self.send_response(200)
+        self.send_header('ETag', '"0123456789abcdef"')
+        self.send_header('X-Repo-Commit', '0' * 40)
+        self.send_header('Content-Length', str(len(self.weights)))
+        self.end_headers()
+
+    def do_GET(self):
+        self.do_HEAD()
+        self.wfile.write(self.weights)
+
+    def log_message(self, *arguments):
+        pass
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    from safetensors.torch import save
+
+    Hub.weights = save({'visual.proj': torch.zeros(64, 64)})
+    Hub.requests = []
+    monkeypatch.setenv('HF_HOME', str(tmp_path / 'hub'))
+    monkeypatch.setenv('NO_PROXY', '127.0.0.1')
+    with http.server.ThreadingHTTPServer(('127.0.0.1', 0), Hub) as server:
+        monkeypatch.setenv('HF_ENDPOINT', f'http://127.0.0.1:{server.server_port}')
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield Hub
+        server.shutdown()
+
+
+def test_a_download_is_made_once(hub, tmp_path):
+    first = resolve_clip_weights(options('ViT-B-32', 'openai', tmp_path / 'cache'))
+    assert first.file.read_bytes() == hub.weights
+    assert (tmp_path / 'cache/weights') in first.file.parents
+    hub.requests.clear()
+    again = resolve_clip_weights(options('ViT-B-32', 'openai', tmp_path / 'cache'))
+    assert again == first and again.quick_gelu
+    # A robot without a network does not wait for one.
+    assert hub.requests == []
+
+
+def test_a_download_ends_with_the_node(silent_port, tmp_path):
+    code = f"""
+from pathlib import Path
+from cliploc_ros.models.download import download
+download('cliploc_ros.models.clip_weights:fetch_from_hub', ['timm/model', 'weights,others'],
+         Path({str(tmp_path)!r}), 'weights', '', 100.0)"""
+    environment = {**os.environ, 'HF_ENDPOINT': f'http://127.0.0.1:{silent_port}',
+                   'HF_HOME': str(tmp_path / 'hub')}
+    node = subprocess.Popen([sys.executable, '-c', code], cwd=PROJECT, env=environment)
+    try:
+        download = wait_for(lambda: children(node.pid))[0]
+    finally:
+        node.send_signal(signal.SIGKILL)
+        node.wait()
+    wait_for(lambda: not Path(f'/proc/{download}').exists())
+
+
+def children(pid: int) -> list[int]:
+    found = Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+    return [int(child) for child in found
+            if b'cliploc_ros.models.download' in Path(f'/proc/{child}/cmdline').read_bytes()]
+
+
+def wait_for(condition, limit_s: float = 60.0):
+    deadline = time.monotonic() + limit_s
+    while not (result := condition()):
+        assert time.monotonic() < deadline, 'nothing happened'
+        time.sleep(0.05)
+    return result

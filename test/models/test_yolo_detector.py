@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A real YOLOv8n on real images; ultralytics stays off the network, the home and pip."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from cliploc_ros.errors import ImageError, ModelError, OptionsError
+from cliploc_ros.models import YoloDetector, YoloOptions
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope='session')
+def weights(shared_data) -> Path:
+    return shared_data / 'weights/yolov8n_coco.pt'
+
+
+@pytest.fixture(scope='session')
+def detector(weights) -> YoloDetector:
+    return YoloDetector(YoloOptions(str(weights), device='cpu'))
+
+
+@pytest.fixture(scope='session')
+def office_rgb(shared_data) -> np.ndarray:
+    first = sorted((shared_data / 'tum_fr3_office/rgb').iterdir())[0]
+    return cv2.cvtColor(cv2.imread(str(first)), cv2.COLOR_BGR2RGB)
+
+
+def test_what_stands_in_the_office(detector, office_rgb):
+    found = detector.detect(office_rgb)
+    confident = {name for name, score in zip(found.class_ids, found.scores, strict=True)
+                 if score > 0.4}
+    print(f'\n{len(found)} objects, confident of {sorted(confident)}')
+    assert confident >= {'chair', 'bottle'}
+    assert set(found.class_ids) <= set(detector.class_names) and len(detector.class_names) == 80
+    assert found.bboxes_xyxy.shape == (len(found), 4) == (len(found.scores), 4)
+    assert found.bboxes_xyxy.dtype == found.scores.dtype == np.float64
+    assert (found.scores >= 0.1).all() and (np.diff(found.scores) <= 0).all()
+    left, top, right, bottom = found.bboxes_xyxy.T
+    assert ((left >= 0) & (left < right) & (right <= 640)).all()
+    assert ((top >= 0) & (top < bottom) & (bottom <= 480)).all()
+
+
+def test_boxes_are_pixels_of_the_image_as_it_came(detector, office_rgb):
+    found = detector.detect(office_rgb)
+    large = detector.detect(cv2.resize(office_rgb, (1280, 960)))
+    chair, large_chair = (each.bboxes_xyxy[each.class_ids.index('chair')]
+                          for each in (found, large))
+    assert np.abs(2 * chair - large_chair).max() < 40
+
+
+def test_colours_are_not_swapped(detector, office_rgb):
+    found, swapped = detector.detect(office_rgb), detector.detect(office_rgb[..., ::-1])
+    assert found.scores.sum() > swapped.scores.sum()
+
+
+def test_options_reach_the_network(weights, office_rgb):
+    few = YoloDetector(YoloOptions(
+        str(weights), conf=0.5, max_det=3, imgsz=300, device='cpu')).detect(office_rgb)
+    assert 0 < len(few) <= 3 and (few.scores >= 0.5).all()
+
+
+def test_half_precision(weights, detector, office_rgb):
+    half = YoloDetector(YoloOptions(str(weights), precision='fp16', device='cpu'))
+    assert abs(len(half.detect(office_rgb)) - len(detector.detect(office_rgb))) <= 3
+
+
+def test_nothing_to_see(detector):
+    found = detector.detect(np.zeros((48, 64, 3), np.uint8))
+    assert len(found) == 0 and found.bboxes_xyxy.shape == (0, 4) and found.scores.shape == (0,)
+
+
+@pytest.mark.parametrize('size', [(1, 1), (1, 2000), (2000, 1), (33, 17)])
+def test_odd_sizes(detector, size):
+    detector.detect(np.full((*size, 3), 90, np.uint8))
+
+
+@pytest.mark.parametrize('image', [
+    np.zeros((0, 0, 3), np.uint8), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)),
+    np.zeros((4, 4, 4), np.uint8), None])
+def test_bad_image(detector, image):
+    with pytest.raises(ImageError):
+        detector.detect(image)
+
+
+def test_threads_are_left_alone(weights):
+    before = torch.get_num_threads()
+    YoloDetector(YoloOptions(str(weights), device='cpu'))
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize('name', ["o'neil's", 'yolov5s.pt', 'yolov3/best.weights', 'a b.pt'])
+def test_names_of_files_do_not_matter(weights, office_rgb, tmp_path, name):
+    file = tmp_path / name
+    file.parent.mkdir(exist_ok=True)
+    shutil.copy(weights, file)
+    assert len(YoloDetector(YoloOptions(str(file), device='cpu')).detect(office_rgb)) > 5
+
+
+def refusal(file: Path) -> str:
+    with pytest.raises(ModelError) as caught:
+        YoloDetector(YoloOptions(str(file), device='cpu'))
+    message = str(caught.value)
+    assert str(file) in message and '\n' not in message and message.isascii()
+    return message
+
+
+@pytest.mark.parametrize('share', [0.001, 0.5, 0.999])
+def test_truncated(weights, truncated, share):
+    assert 'truncated or corrupt' in refusal(truncated(weights, share))
+
+
+def test_files_that_are_no_yolo(small_clip, tmp_path):
+    assert 'is no detection model of YOLO' in refusal(small_clip.file)
+    assert 'does not exist' in refusal(tmp_path / 'gone.pt')
+    assert 'is a folder' in refusal(tmp_path)
+    (tmp_path / 'text.pt').write_text('text')
+    assert 'holds no weights' in refusal(tmp_path / 'text.pt')
+
+
+@pytest.mark.parametrize('task', ['classify', 'segment'])
+def test_models_for_another_task(detector, tmp_path, task):
+    from ultralytics import YOLO
+
+    other = YOLO({'classify': 'yolov8n-cls.yaml', 'segment': 'yolov8n-seg.yaml'}[task])
+    torch.save({'model': other.model}, tmp_path / 'other.pt')
+    assert f"for the task '{task}'" in refusal(tmp_path / 'other.pt')
+
+
+def test_unknown_name():
+    with pytest.raises(ModelError, match=r'did you mean .*yolov8x\.pt'):
+        YoloDetector(YoloOptions('yolo8x.pt', device='cpu'))
+
+
+@pytest.mark.parametrize('change', [
+    {'conf': 1.5}, {'iou': -0.1}, {'imgsz': 0}, {'max_det': 0}, {'precision': 'int8'},
+    {'conf': float('nan')}, {'download_timeout_s': 0.0}])
+def test_options_out_of_range(change):
+    with pytest.raises(OptionsError, match=next(iter(change))):
+        YoloOptions(**change)
+
+
+WATCHED_RUN = """
+import json, os, sys
+events = []
+def watch(event, arguments):
+    if event in ('socket.connect', 'socket.getaddrinfo', 'socket.gethostbyname', 'os.system'):
+        events.append(f'{event} {arguments}')
+    elif event == 'subprocess.Popen' and 'pip' in str(arguments):
+        events.append(f'{event} {arguments}')
+    elif event == 'socket.sendto':
+        events.append(f'{event} {arguments}')
+sys.addaudithook(watch)
+
+import numpy as np
+from cliploc_ros.models import YoloDetector, YoloOptions
+detector = YoloDetector(YoloOptions(sys.argv[1], device='cpu'))
+for _ in range(3):
+    detector.detect(np.full((480, 640, 3), 99, np.uint8))
+
+import threading
+import ultralytics
+import ultralytics.utils.events as analytics
+print(json.dumps({'events': events, 'analytics': analytics.events.enabled,
+                  'threads': threading.active_count(),
+                  'restricted': ultralytics.utils.SAFE_LOAD,
+                  'omp': os.environ.get('OMP_NUM_THREADS')}))
+"""
+
+
+def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
+    home, here, temporary = (tmp_path / name for name in ('home', 'here', 'temporary'))
+    for folder in (home, here, temporary):
+        folder.mkdir()
+    # Not as a test: ultralytics is silent where it sees pytest.
+    environment = {name: value for name, value in os.environ.items()
+                   if not name.startswith(('PYTEST', 'YOLO', 'XDG', 'OMP', 'ULTRALYTICS'))}
+    environment |= {'HOME': str(home), 'PYTHONPATH': str(PROJECT), 'TMPDIR': str(temporary),
+                    'TORCHINDUCTOR_CACHE_DIR': str(tmp_path / 'torch')}
+    done = subprocess.run([sys.executable, '-c', WATCHED_RUN, str(weights)], cwd=here,
+                          env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    # One line: ultralytics printed nothing.
+    assert json.loads(done.stdout) == {
+        'events': [], 'analytics': False, 'threads': 1, 'restricted': True, 'omp': None}
+    assert [*home.rglob('*')] == [*here.rglob('*')] == []
+    assert [*temporary.glob('cliploc_ros*')] == []
