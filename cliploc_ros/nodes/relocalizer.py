@@ -59,7 +59,7 @@ class RelocalizerNode(WorkingNode):
                             qos_profile=qos.SERVICE, callback_group=requests)
         self.worker.submit(self._load_ahead)
         if self._settings['mode'] == 'continuous':
-            self._frames.listening().__enter__()
+            self._frames.open()
 
     def release(self) -> None:
         """Let go the request that waits for frames."""

@@ -69,20 +69,28 @@ class FrameSource:
         self._newest: Frame | None = None
         self._stopped = False
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Hold the subscriptions open; the first to come opens them, the last closes them."""
+    def open(self) -> None:
+        """Listen until closed as often as opened."""
         with self._changed:
             self._listeners += 1
             if self._listeners == 1:
-                self._open()
+                self._subscribe()
+
+    def close(self) -> None:
+        """End what one open began; with the last one the subscriptions end."""
+        with self._changed:
+            self._listeners -= 1
+            if self._listeners == 0:
+                self._unsubscribe()
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen for the length of a with statement."""
+        self.open()
         try:
             yield
         finally:
-            with self._changed:
-                self._listeners -= 1
-                if self._listeners == 0:
-                    self._close()
+            self.close()
 
     def wait_for_fresh(self, timeout_s: float) -> Frame:
         """Return the first complete frame whose image arrives from now on.
@@ -120,7 +128,7 @@ class FrameSource:
         newest = self._newest
         return newest if newest is not None and newest.received_at >= moment else None
 
-    def _open(self) -> None:
+    def _subscribe(self) -> None:
         self._pairing.clear()
         self._newest = None
         for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
@@ -131,7 +139,7 @@ class FrameSource:
                 qos.as_offered(profile, self._node, self._resolved(name)),
                 callback_group=self._group, qos_overriding_options=qos.overridable()))
 
-    def _close(self) -> None:
+    def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()

@@ -2,45 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import invert_transform, pose_error, transform_from_pose
+from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.errors import OptionsError
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+@pytest.fixture
+def room() -> LandmarkMap:
+    return make_room()
 
 
 @pytest.fixture
-def room(rng) -> LandmarkMap:
-    """Twelve objects of three classes, scattered before the camera."""
-    count = 12
-    quats = rng.normal(size=(count, 4))
-    return LandmarkMap(
-        'map', tuple(f'thing_{i}' for i in range(count)),
-        tuple(f'thing {i}' for i in range(count)), tuple('abc'[i % 3] for i in range(count)),
-        np.c_[rng.uniform(-2, 2, (count, 2)), rng.uniform(3, 6, count)],
-        rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
-
-
-@pytest.fixture
-def truth():
-    return transform_from_pose(np.array([0.3, -0.2, -0.5]), np.array([0.02, -0.05, 0.03, 0.998]))
-
-
-@pytest.fixture
-def observation(room, truth) -> Observation:
+def observation(room) -> Observation:
     """What a perfect detector and a good encoder see of the room."""
-    outlines = project_ellipsoids(invert_transform(truth), room.centers, room.shapes)
-    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
     similarities = np.full((len(room), len(room)), 0.2, dtype=np.float32)
     np.fill_diagonal(similarities, np.linspace(0.3, 0.4, len(room)))
-    return Observation(CAMERA, Detections(boxes, room.class_ids, np.full(len(room), 0.9)),
-                       similarities, 123)
+    return Observation(CAMERA, see_room(room), similarities, 123)
 
 
 METHODS = [('class', 'bf'), ('class', 'ransac')] + [
@@ -48,12 +31,12 @@ METHODS = [('class', 'bf'), ('class', 'ransac')] + [
 
 
 @pytest.mark.parametrize(('matching', 'algorithm'), METHODS)
-def test_every_method_finds_a_perfect_view(matching, algorithm, room, truth, observation):
+def test_every_method_finds_a_perfect_view(matching, algorithm, room, observation):
     options = RelocalizerOptions(matching=matching, algorithm=algorithm, iterations=2000)
     result = Relocalizer(room, options).relocalize([observation])
     assert result.accepted
     # box centres and ellipsoid centres differ slightly by perspective
-    assert pose_error(result.map_from_camera, truth) < (0.05, 1.0)
+    assert pose_error(result.map_from_camera, MAP_FROM_CAMERA) < (0.05, 1.0)
     assert len(result.matches) == 12
     assert all(match.detection == match.landmark for match in result.matches)
     assert result.stamp_ns == 123
