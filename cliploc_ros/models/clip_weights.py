@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which CLIP is meant: its architecture, its file of weights and how they were trained."""
 
-import contextlib
 import difflib
 import os
 import zipfile
@@ -151,13 +150,17 @@ def fetch_from_hub(repository: str, names: str, folder: str) -> str:
     importing torch for it.
     """
     import huggingface_hub
-    from huggingface_hub.errors import EntryNotFoundError
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 
     announce_start()
     *alternatives, last = names.split(',')
     for name in alternatives:
-        with contextlib.suppress(EntryNotFoundError):
+        try:
             return huggingface_hub.hf_hub_download(repository, name, cache_dir=folder)
+        except LocalEntryNotFoundError:  # the hub was not reached: no reason to ask it again
+            raise
+        except EntryNotFoundError:
+            continue
     return huggingface_hub.hf_hub_download(repository, last, cache_dir=folder)
 
 

@@ -78,7 +78,7 @@ def download(
                              stall_timeout_s)
         result = json.loads(report.read_text()) if report.exists() else {'error': failure}
     if 'path' not in result:
-        raise ModelError(f'cannot download {what}: {result["error"]}. {remedy}')
+        raise ModelError(f'cannot download {what}: {result["error"].rstrip(".")}. {remedy}')
     return Path(result['path'])
 
 

@@ -158,7 +158,10 @@ def fetch_yolo_weights(name: str, folder: str) -> str:
     from ultralytics.utils.downloads import attempt_download_asset
 
     announce_start()
-    return attempt_download_asset(Path(folder) / name)
+    try:
+        return attempt_download_asset(Path(folder) / name)
+    except ConnectionError as error:
+        raise ConnectionError(_reason(error)) from error
 
 
 @cache

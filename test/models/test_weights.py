@@ -221,7 +221,8 @@ def test_no_network_for_yolo(monkeypatch, tmp_path):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         port = free.getsockname()[1]
-    monkeypatch.setenv('HTTPS_PROXY', f'http://127.0.0.1:{port}')  # refuses
+    # A port where nothing listens refuses at once.
+    monkeypatch.setenv('HTTPS_PROXY', f'http://127.0.0.1:{port}')
     started = time.monotonic()
     with pytest.raises(CliplocError, match=r'cannot download yolov8n\.pt') as caught:
         YoloDetector(YoloOptions('yolov8n', device='cpu', cache_dir=str(tmp_path)))
@@ -234,10 +235,16 @@ class Hub(http.server.BaseHTTPRequestHandler):
     """As much of a model hub as a download needs."""
 
     weights = b''
+    name = 'open_clip_model.safetensors'
     requests: list[str]
 
     def do_HEAD(self):
         self.requests.append(self.path)
+        if not self.path.endswith(self.name):
+            self.send_response(404)
+            self.send_header('X-Error-Code', 'EntryNotFound')
+            self.end_headers()
+            return
         self.send_response(200)
         self.send_header('ETag', '"0123456789abcdef"')
         self.send_header('X-Repo-Commit', '0' * 40)
@@ -256,6 +263,7 @@ class Hub(http.server.BaseHTTPRequestHandler):
 def hub(monkeypatch, tmp_path):
     from safetensors.torch import save
 
+    torch.save({'visual.proj': torch.zeros(64, 64)}, tmp_path / 'a.pt')
     Hub.weights = save({'visual.proj': torch.zeros(64, 64)})
     Hub.requests = []
     monkeypatch.setenv('HF_HOME', str(tmp_path / 'hub'))
@@ -265,6 +273,13 @@ def hub(monkeypatch, tmp_path):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield Hub
         server.shutdown()
+
+
+def test_weights_in_the_older_format_are_downloaded(hub, monkeypatch, tmp_path):
+    monkeypatch.setattr(hub, 'name', 'open_clip_pytorch_model.bin')
+    monkeypatch.setattr(hub, 'weights', (tmp_path / 'a.pt').read_bytes())
+    weights = resolve_clip_weights(options('ViT-B-32', 'openai', tmp_path / 'cache'))
+    assert weights.file.name == hub.name
 
 
 def test_a_download_is_made_once(hub, tmp_path):
