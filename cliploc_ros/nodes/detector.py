@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
@@ -17,6 +16,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, image_from_msg
 from cliploc_ros.ros.parameters import NodeParameters, Value
 from cliploc_ros.ros.process import WorkingNode, run_node
+from cliploc_ros.ros.subscription import AdaptiveSubscription
 from cliploc_ros.ros.tables import DETECTOR
 from cliploc_ros.ros.worker import LatestOnly, Retrying
 
@@ -32,7 +32,7 @@ class DetectorNode(WorkingNode):
         self._settings = NodeParameters(self, DETECTOR, detector_options)
         self._detector = Retrying(self._load, _RETRY_PAUSE_S)
         self._images: LatestOnly[Image | CompressedImage] = LatestOnly(self.worker, self._detect)
-        self._subscription: Subscription | None = None
+        self._subscription: AdaptiveSubscription | None = None
         self._publisher = self.create_publisher(
             Detection2DArray, 'detections', qos.DETECTIONS_OUT,
             event_callbacks=PublisherEventCallbacks(matched=self._on_matched),
@@ -54,13 +54,11 @@ class DetectorNode(WorkingNode):
         """Listen to images exactly while somebody listens to detections."""
         if info.current_count > 0 and self._subscription is None:
             raw = self._settings['image_transport'] == 'raw'
-            topic = self.resolve_topic_name('image' if raw else 'image/compressed')
-            self._subscription = self.create_subscription(
-                Image if raw else CompressedImage, topic, self._images.offer,
-                qos.as_offered(qos.IMAGE, self, topic),
-                qos_overriding_options=qos.overridable())
+            self._subscription = AdaptiveSubscription(
+                self, Image if raw else CompressedImage, 'image' if raw else 'image/compressed',
+                self._images.offer, qos.IMAGE)
         elif info.current_count == 0 and self._subscription is not None:
-            self.destroy_subscription(self._subscription)
+            self._subscription.destroy()
             self._subscription = None
 
     def _detect(self, msg: Image | CompressedImage) -> None:

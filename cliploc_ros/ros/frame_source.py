@@ -11,7 +11,6 @@ from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
@@ -19,6 +18,7 @@ from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.pairing import ExactPairing
+from cliploc_ros.ros.subscription import AdaptiveSubscription
 
 # What may wait for its counterparts: a second of 1080p images, or slow detections of them.
 _MAX_WAITING = 60
@@ -64,7 +64,7 @@ class FrameSource:
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
         self._changed = threading.Condition()
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: list[AdaptiveSubscription] = []
         self._listeners = 0
         self._newest: Frame | None = None
         self._stopped = False
@@ -134,14 +134,13 @@ class FrameSource:
         for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
                                             ('detections', Detection2DArray, qos.DETECTIONS_IN)):
-            self._subscriptions.append(self._node.create_subscription(
-                message_type, self._topics[name], self._receiver(name),
-                qos.as_offered(profile, self._node, self._resolved(name)),
-                callback_group=self._group, qos_overriding_options=qos.overridable()))
+            self._subscriptions.append(AdaptiveSubscription(
+                self._node, message_type, self._topics[name], self._receiver(name), profile,
+                self._group))
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+            subscription.destroy()
         self._subscriptions.clear()
         self._pairing.clear()
         self._newest = None

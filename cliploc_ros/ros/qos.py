@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quality of service by name. All can be overridden by ``qos_overrides`` parameters."""
 
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 
-# The newest frame is the one that counts. A best-effort reader matches every camera, but loses
-# large images even on one machine; see as_offered.
+# Inputs are best effort unless all their publishers are reliable, see AdaptiveSubscription.
+# Of images the newest is the one that counts.
 IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
                    reliability=ReliabilityPolicy.BEST_EFFORT,
                    durability=DurabilityPolicy.VOLATILE)
@@ -22,15 +21,6 @@ POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
 # Requests are answered one after another; so many may wait.
 SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                      reliability=ReliabilityPolicy.RELIABLE)
-
-
-def as_offered(profile: QoSProfile, node: Node, topic: str) -> QoSProfile:
-    """Return a profile that is reliable if all publishers of the topic offer it now."""
-    offered = [info.qos_profile.reliability for info in node.get_publishers_info_by_topic(topic)]
-    reliable = bool(offered) and all(r == ReliabilityPolicy.RELIABLE for r in offered)
-    return QoSProfile(
-        history=profile.history, depth=profile.depth, durability=profile.durability,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else profile.reliability)
 
 
 def overridable() -> QoSOverridingOptions:

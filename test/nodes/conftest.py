@@ -14,8 +14,10 @@ import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import CAMERA, make_room, see_room, write_map
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -23,6 +25,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.core.transforms import transform_from_pose
 from cliploc_ros.ros.conversions import detections_to_msg
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -112,10 +115,30 @@ class Tester(Node):
         wait_for(condition, what, patience_s, self.spin)
 
     def connect(self):
-        """Wait until the relocalizer answers, and hears what it publishes."""
+        """Wait until one relocalizer answers, and is heard."""
+        self.wait(lambda: len(self.get_publishers_info_by_topic('/relocalizer/pose')) == 1,
+                  'one relocalizer')
         self.wait(self._relocalize.service_is_ready, 'the service relocalize')
         self.wait(self._reinitialize.service_is_ready, 'the service reinitialize')
-        self.wait(lambda: self.count_publishers('/relocalizer/pose') > 0, 'the publisher of poses')
+
+    def call(self, service_type, name, request):
+        """Call any service; return its answer."""
+        client = self.create_client(service_type, name)
+        self.wait(client.service_is_ready, name)
+        answer = self.answer(client.call_async(request))
+        self.destroy_client(client)
+        return answer
+
+    def set_parameter(self, name, value):
+        """Set a parameter of the relocalizer; return rclpy's result."""
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, '/relocalizer/set_parameters', request).results[0]
+
+    def listened_to(self):
+        """Return how many subscriptions there are to what this node publishes."""
+        return sum(publisher.get_subscription_count() for publisher in (
+            self.images, self.compressed, self.infos, self.detections))
 
     def ask(self):
         """Send a wake-up request; return its future."""
@@ -128,26 +151,30 @@ class Tester(Node):
         self.wait(future.done, 'an answer')
         return future.result()
 
-    def wait_until_heard(self):
-        """Wait until the relocalizer listens to frames."""
-        self.wait(lambda: min(self.infos.get_subscription_count(),
-                              self.detections.get_subscription_count(),
-                              self.images.get_subscription_count()
-                              + self.compressed.get_subscription_count()) > 0,
-                  'the relocalizer to listen')
+    def publish(self, messages):
+        """Publish messages, each on the topic of its type."""
+        for message in messages:
+            {Image: self.images, CompressedImage: self.compressed, CameraInfo: self.infos,
+             Detection2DArray: self.detections}[type(message)].publish(message)
 
-    def publish(self, frame):
-        image, info, detections = frame
-        (self.compressed if isinstance(image, CompressedImage) else self.images).publish(image)
-        self.infos.publish(info)
-        self.detections.publish(detections)
+    def feed_until(self, condition, frame, what='an answer'):
+        """Publish a frame again and again, as a camera would, until a condition holds."""
+        def work():
+            self.publish(frame)
+            for _ in range(5):
+                self.spin()
+        wait_for(condition, what, work=work)
 
     def relocalize(self, frame):
-        """Ask, publish one frame when asked for it, and return the answer."""
+        """Ask, publish a frame until there is an answer, and return it."""
         future = self.ask()
-        self.wait_until_heard()
-        self.publish(frame)
-        return self.answer(future)
+        self.feed_until(future.done, frame)
+        return future.result()
+
+
+def transform_of(pose):
+    p, q = pose.position, pose.orientation
+    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def make_frame(detections=None, stamp_s=100.0):
@@ -172,11 +199,17 @@ def ros():
     rclpy.try_shutdown()
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def tester(ros):
     node = Tester()
     yield node
     node.destroy_node()
+
+
+@pytest.fixture(autouse=True)
+def forget(tester):
+    for kept in (tester.poses, tester.initial_poses, tester.hypotheses):
+        kept.clear()
 
 
 @pytest.fixture(scope='session')
@@ -186,9 +219,8 @@ def room_map(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def start(tmp_path):
-    """Start modules of the package as processes; all are ended with the test."""
+def starter(folder):
+    """Return a function that starts modules as processes, and the list of those it started."""
     started = []
 
     def run(module, *arguments, parameters=None, **environment):
@@ -196,19 +228,53 @@ def start(tmp_path):
         for name, value in (parameters or {}).items():
             ros_arguments += ['-p', f'{name}:={value}']
         process = Process(module, [*arguments, *ros_arguments],
-                          tmp_path / f'{module}_{len(started)}.log', **environment)
+                          folder / f'{module}_{len(started)}.log', **environment)
         started.append(process)
         return process
+    return run, started
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start modules of the package as processes; all are ended with the test."""
+    run, started = starter(tmp_path)
     yield run
     for process in started:
         process.stop(signal.SIGKILL)
 
 
-@pytest.fixture
-def relocalizer(start, tester, room_map):
+@pytest.fixture(scope='module')
+def start_shared(tmp_path_factory):
+    """The same for processes that several tests ask."""
+    run, started = starter(tmp_path_factory.mktemp('shared'))
+    yield run
+    for process in started:
+        process.stop(signal.SIGKILL)
+
+
+def class_matching(room_map, **parameters):
+    """Parameters of a relocalizer that needs no network."""
+    return {'map_file': room_map, 'matching': 'class', 'algorithm': 'bf', **parameters}
+
+
+@pytest.fixture(scope='module')
+def relocalizer(start_shared, tester, room_map):
     """A relocalizer that matches classes in the simulated room, ready to be asked."""
-    process = start('nodes.relocalizer', parameters={
-        'map_file': room_map, 'matching': 'class', 'algorithm': 'bf', 'timeout_s': 5.0})
+    process = start_shared('nodes.relocalizer', parameters=class_matching(room_map))
     process.wait_for_output('ready after')
     tester.connect()
-    return process
+    yield process
+    assert process.alive, process.output()
+    assert 'Traceback' not in process.output()
+
+
+@pytest.fixture
+def own_relocalizer(start, tester, room_map):
+    """Start a relocalizer with parameters of the test's own; ready, or with its error logged."""
+    def run(*arguments, expect='ready after', **parameters):
+        process = start('nodes.relocalizer', *arguments,
+                        parameters=class_matching(room_map, **parameters))
+        process.wait_for_output(expect)
+        tester.connect()
+        return process
+    return run

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every bad input is named in the answer, and the node lives on."""
+
+import numpy as np
+import pytest
+from conftest import make_frame
+
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.ros.conversions import detections_to_msg
+
+NAN, INF = float('nan'), float('inf')
+
+
+def bad_image(**changes):
+    def change(image, info, detections):
+        for name, value in changes.items():
+            setattr(image, name, value)
+    return change
+
+
+def bad_info(**changes):
+    def change(image, info, detections):
+        for name, value in changes.items():
+            setattr(info, name, value)
+    return change
+
+
+def bad_boxes(boxes, class_id='a'):
+    def change(image, info, detections):
+        rows = np.array(boxes, dtype=np.float64).reshape(-1, 4)
+        detections.detections = detections_to_msg(
+            Detections(rows, (class_id,) * len(rows), np.full(len(rows), 0.5)),
+            detections.header).detections
+    return change
+
+
+MANY_BOXES = np.random.default_rng(0).uniform((0, 0, 200, 200), (200, 200, 400, 400), (5000, 4))
+BAD_FRAMES = {
+    'unknown encoding': (bad_image(encoding='yuv422'), "encoding 'yuv422' is none of"),
+    'no width': (bad_image(width=0), 'image size 0x480'),
+    'no size': (bad_image(width=0, height=0, data=b''), 'image size 0x0'),
+    'huge size': (bad_image(width=2**31, height=2**31), 'image size'),
+    'short step': (bad_image(step=10), 'step 10 is shorter'),
+    'long step': (bad_image(step=2**31), 'but 480 rows'),
+    'short data': (bad_image(data=b'123'), 'image data has 3 bytes'),
+    'zero K': (bad_info(k=np.zeros(9)), 'camera_info: K: fx=0'),
+    'NaN in K': (bad_info(k=np.full(9, np.nan)), 'camera_info: K: fx=nan'),
+    'K of another size': (bad_info(width=320, height=240), 'camera_info is for 320x240'),
+    'unknown lens': (bad_info(distortion_model='mystery', d=[0.1]), "'mystery' is none of"),
+    'too few coefficients': (bad_info(d=[0.1, 0.2]), '4 or 5 coefficients'),
+    'infinite coefficient': (bad_info(d=[INF] * 5), 'not finite'),
+    'no boxes': (bad_boxes([]), '0 detections'),
+    'NaN boxes': (bad_boxes([[NAN] * 4] * 5), '0 detections'),
+    'inverted boxes': (bad_boxes([[50, 50, 10, 10]] * 5), '0 detections'),
+    'boxes outside': (bad_boxes([[900, 900, 950, 950]] * 5), '0 detections'),
+    'infinite boxes': (bad_boxes([[-1e308, 0, 1e308, 9]] * 5), '0 detections'),
+    'unknown classes': (bad_boxes([[10, 10, 50, 50]] * 5, 'zebra'), 'correspondence candidates'),
+    'two boxes': (bad_boxes([[10, 10, 50, 50], [70, 10, 90, 50]]), '2 detections'),
+    'thousands of boxes': (bad_boxes(MANY_BOXES), 'refused'),
+}
+
+
+@pytest.mark.parametrize('name', BAD_FRAMES)
+def test_bad_frames(relocalizer, tester, name):
+    tester.set_parameter('time_budget_s', 1.0)
+    change, reason = BAD_FRAMES[name]
+    frame = make_frame()
+    change(*frame)
+    answer = tester.relocalize(frame)
+    assert not answer.success
+    assert reason in answer.message, answer.message
+    assert 'internal error' not in answer.message
+    assert tester.relocalize(make_frame(stamp_s=101.0)).success
+
+
+@pytest.mark.parametrize(('topics', 'reason'), [
+    ((), 'no image'),
+    (('camera_info', 'detections'), 'no image'),
+    (('image', 'detections'), 'no camera_info'),
+    (('image', 'camera_info'), 'no detections'),
+    (('image', 'camera_info', 'detections of another image'), 'stamps never match'),
+])
+def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
+    image, info, detections = make_frame(stamp_s=5.0)
+    messages = {'image': image, 'camera_info': info, 'detections': detections,
+                'detections of another image': make_frame(stamp_s=5.001)[2]}
+    assert tester.set_parameter('timeout_s', 1.5).successful
+    answer = tester.relocalize([messages[topic] for topic in topics])
+    assert tester.set_parameter('timeout_s', 10.0).successful
+    assert not answer.success
+    assert 'no fresh frame within 1.5 s' in answer.message
+    assert reason in answer.message
+    assert tester.relocalize(make_frame(stamp_s=6.0)).success
+
+
+@pytest.mark.parametrize(('name', 'value', 'reason'), [
+    ('algorithm', 'luck', 'is none of bf, ransac'),
+    ('algorithm', 'b-prosc', "did you mean 'b-prosac'"),
+    ('algorithm', 'prosac', "which matching 'class' has none of"),
+    ('iterations', 0, '0 must be 1 to'),
+    ('iterations', 'many', 'Wrong parameter type'),
+    ('iou_threshold', NAN, 'nan must be 0 to 1'),
+    ('timeout_s', -1.0, 'must be'),
+    ('matching', 'clip', 'read-only'),
+    ('base_from_camera', [1.0] * 7, 'not of unit length'),
+    ('base_from_camera', [NAN] * 7, 'must be 7 numbers'),
+    ('map.frame_id', 'other', ''),
+])
+def test_bad_parameters_at_run_time(relocalizer, tester, name, value, reason):
+    result = tester.set_parameter(name, value)
+    assert not result.successful
+    assert reason in result.reason
+    assert tester.relocalize(make_frame()).success
+
+
+def test_parameters_change_at_run_time(relocalizer, tester):
+    assert tester.set_parameter('min_inliers', 13).successful
+    answer = tester.relocalize(make_frame())
+    assert not answer.success
+    assert '13 are needed' in answer.message
+    assert tester.set_parameter('min_inliers', 4).successful
+    assert tester.relocalize(make_frame()).success

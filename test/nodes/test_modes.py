@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The relocalizer as a process: its inputs, modes and frames, floods, and its end."""
+
+import signal
+import time
+
+import cv2
+import numpy as np
+import pytest
+from conftest import make_frame, transform_of
+from scene import MAP_FROM_CAMERA
+from sensor_msgs.msg import CompressedImage
+
+from cliploc_ros.core.transforms import pose_error, transform_from_pose
+
+
+def test_the_map_can_come_as_parameters(start, tester, room_map):
+    process = start('nodes.relocalizer', '--ros-args', '--params-file', room_map, '-p',
+                    'matching:=class', '-p', 'algorithm:=bf')
+    process.wait_for_output('12 landmarks')
+    tester.connect()
+    assert tester.relocalize(make_frame()).success
+
+
+def test_compressed_images(own_relocalizer, tester):
+    own_relocalizer(image_transport='compressed')
+    image, info, detections = make_frame()
+    data = cv2.imencode('.jpg', np.zeros((480, 640, 3), dtype=np.uint8))[1].tobytes()
+    good = CompressedImage(header=image.header, format='jpeg', data=data)
+    assert tester.relocalize((good, info, detections)).success
+    for broken in (b'', b'not a picture', data[:100]):
+        bad = CompressedImage(header=image.header, format='jpeg', data=broken)
+        answer = tester.relocalize((bad, info, detections))
+        assert not answer.success
+        assert 'does not decode' in answer.message
+    assert tester.relocalize((good, info, detections)).success
+
+
+def test_continuous_mode_publishes_without_being_asked(own_relocalizer, tester):
+    process = own_relocalizer(mode='continuous')
+    for stamp_s in (1, 2, 1):
+        tester.feed_until(
+            lambda s=stamp_s: tester.poses and tester.poses[-1].header.stamp.sec == s,
+            make_frame(stamp_s=float(stamp_s)), 'a pose')
+    assert not tester.initial_poses  # a running localizer is never reset unasked
+    assert tester.relocalize(make_frame(stamp_s=3.0)).success
+    tester.wait(lambda: tester.initial_poses, 'an initial pose')
+    assert process.stop()[0] == 0
+
+
+def test_the_mount_moves_the_pose(own_relocalizer, tester):
+    own_relocalizer(base_frame='base_link',
+                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: tester.poses, 'a pose')
+    base = MAP_FROM_CAMERA @ transform_from_pose(np.array([0, 0, -1.0]), np.array([0, 0, 0, 1.0]))
+    assert pose_error(transform_of(tester.poses[0].pose.pose), base) < (0.08, 1.0)
+
+
+@pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('asked', [False, True])
+def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
+    process = own_relocalizer()
+    if asked:
+        tester.ask()
+        tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
+    code, seconds = process.stop(signal_number)
+    assert code == 0, process.output()
+    assert seconds < 2.0
+    assert 'Traceback' not in process.output()
+
+
+def test_a_flood_of_images_is_survived_in_bounded_memory(own_relocalizer, tester):
+    process = own_relocalizer(mode='continuous')
+    image, _, _ = make_frame()
+    tester.wait(lambda: tester.images.get_subscription_count() > 0, 'the relocalizer to listen')
+    before, start = process.memory_mib(), time.monotonic()
+    for number in range(10_000):
+        image.header.stamp.sec = number
+        tester.images.publish(image)
+    seconds = time.monotonic() - start
+    assert tester.relocalize(make_frame(stamp_s=20_000.0)).success
+    peak = process.memory_mib('VmHWM')
+    print(f'\n10,000 images of 0.9 MB in {seconds:.1f} s: {before:.0f} MiB before, at most '
+          f'{peak:.0f} MiB')
+    assert peak - before < 512

@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The relocalizer as a process: requests and answers."""
+
+import time
+
+import numpy as np
+from conftest import make_frame, transform_of
+from scene import MAP_FROM_CAMERA
+
+from cliploc_ros.core.transforms import pose_error
+
+
+def test_a_request_is_answered_with_a_pose(relocalizer, tester):
+    answer = tester.relocalize(make_frame(stamp_s=12.5))
+    assert answer.success
+    assert answer.message.startswith('accepted: x 0.3')
+    tester.wait(lambda: tester.poses and tester.initial_poses and tester.hypotheses, 'poses')
+    pose = tester.poses[0]
+    assert pose == tester.initial_poses[0]
+    assert (pose.header.frame_id, pose.header.stamp.sec, pose.header.stamp.nanosec) == (
+        'map', 12, 500_000_000)
+    assert pose_error(transform_of(pose.pose.pose), MAP_FROM_CAMERA) < (0.05, 1.0)
+    covariance = np.array(pose.pose.covariance).reshape(6, 6)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert tester.hypotheses[0].poses[0] == pose.pose.pose
+
+
+def test_the_navigation_stacks_own_service_wakes_up_too(relocalizer, tester):
+    tester.feed_until(tester.ask_reinitialize().done, make_frame())
+    tester.wait(lambda: tester.initial_poses, 'an initial pose')
+
+
+def test_between_requests_nothing_is_listened_to(relocalizer, tester):
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')
+    before, start = relocalizer.cpu_s(), time.monotonic()
+    tester.wait(lambda: time.monotonic() - start > 2.0, 'two seconds')
+    idle = (relocalizer.cpu_s() - before) / (time.monotonic() - start)
+    print(f'\nidle between requests: {100 * idle:.1f} % of a core, '
+          f'{relocalizer.memory_mib():.0f} MiB')
+    assert idle < 0.05
+
+
+def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
+    for stamp_s in (50.0, 10.0, 3600.0, 0.0):
+        assert tester.relocalize(make_frame(stamp_s=stamp_s)).success
+    newer, older = make_frame(stamp_s=80.0), make_frame(stamp_s=70.0)
+    future = tester.ask()
+    tester.feed_until(future.done, [newer[0], older[0], older[1], newer[1], older[2]])
+    assert future.result().success
+    tester.wait(lambda: tester.poses[-1].header.stamp.sec == 70, 'the older frame')
+
+
+def test_two_requests_at_once_are_both_answered(relocalizer, tester):
+    futures = [tester.ask(), tester.ask(), tester.ask_reinitialize()]
+    tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
+    assert futures[0].result().success
+    assert futures[1].result().success
