@@ -115,17 +115,22 @@ class YoloDetector:
         file = _resolve_file(options)
         threads = torch.get_num_threads()
         self._model = _load(file)
-        stride = int(self._model.model.stride.max())
-        self._settings = {
-            'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
-            'imgsz': -(-options.imgsz // stride) * stride, 'device': str(device),
-            'verbose': False}
-        if resolve_precision(options.precision, device) == 'fp16':
-            self._settings |= _half_precision()
+        self._stride = int(self._model.model.stride.max())
+        self._device = device
+        self.configure(options)
         # The first pass sets up the predictor; better now than on the first image.
-        self.detect(np.zeros((stride, stride, 3), dtype=np.uint8))
+        self.detect(np.zeros((self._stride, self._stride, 3), dtype=np.uint8))
         # Ultralytics leaves one core free on a CPU, for the whole process.
         torch.set_num_threads(threads)
+
+    def configure(self, options: YoloOptions) -> None:
+        """Run from now on with other options; which model, and where, stays."""
+        self._settings = {
+            'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
+            'imgsz': -(-options.imgsz // self._stride) * self._stride,
+            'device': str(self._device), 'verbose': False}
+        if resolve_precision(options.precision, self._device) == 'fp16':
+            self._settings |= _half_precision()
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -49,16 +49,18 @@ class Localizer:
     ----------
     landmark_map : LandmarkMap
     observer : Observer or None
+    relocalizer : Relocalizer
+        Of the map, with these options.
     options : RelocalizerOptions
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
-                 options: RelocalizerOptions) -> None:
+                 relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
         self._map = landmark_map
         self._observer = observer
+        self._relocalizer = relocalizer
         self._options = options
-        self._relocalizer = Relocalizer(landmark_map, options)
-        self._relocalizer.warm_up()
+        relocalizer.warm_up()
 
     @property
     def map_frame(self) -> str:
@@ -119,13 +121,14 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     """
     options = relocalizer_options(values)
     landmark_map = load_map(node, values['map_file'])
+    relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer = None
     if options.needs_similarities:
         from cliploc_ros.models.clip_encoder import load_encoder
         from cliploc_ros.models.clip_weights import ClipOptions
         observer = Observer(*load_encoder(
             ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
-                        checkpoint_path=values['clip_checkpoint'], device=values['device'],
+                        checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
                         cache_dir=values['cache_dir']),
             landmark_map.labels))
-    return Localizer(landmark_map, observer, options)
+    return Localizer(landmark_map, observer, relocalizer, options)

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The life of a node's process: the only caller of rclpy.init."""
 
+import logging
 import sys
+import traceback
 from collections.abc import Callable
 
 import rclpy
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 
@@ -13,6 +16,23 @@ from cliploc_ros.ros.worker import Worker, leave
 
 # One for a request that waits, one for frames, one for parameters and the rest.
 _THREADS = 3
+
+
+class RosLogHandler(logging.Handler):
+    """Passes what the package's modules without ROS log on to a node's logger."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(logging.INFO)
+        self._logger = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one record at its level."""
+        if record.levelno >= logging.ERROR:
+            self._logger.error(record.getMessage())
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(record.getMessage())
+        else:
+            self._logger.info(record.getMessage())
 
 
 class WorkingNode(Node):
@@ -27,9 +47,25 @@ class WorkingNode(Node):
     def __init__(self, name: str) -> None:
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self.worker = Worker(self.get_logger().error)
+        package_logger = logging.getLogger('cliploc_ros')
+        package_logger.setLevel(logging.INFO)
+        package_logger.addHandler(RosLogHandler(self))
 
     def release(self) -> None:
         """Let go whoever waits in this node: the process ends."""
+
+
+def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
+    """Execute callbacks until the process is told to end; no failure of one ends the node."""
+    while node.context.ok():
+        try:
+            executor.spin_once()
+        except InvalidHandle:
+            # A subscription was destroyed while rclpy gathered what to wait for: it gathers
+            # again.
+            continue
+        except Exception:
+            node.get_logger().error(f'internal error: {traceback.format_exc()}')
 
 
 def run_node(make_node: Callable[[], WorkingNode]) -> int:
@@ -41,7 +77,7 @@ def run_node(make_node: Callable[[], WorkingNode]) -> int:
         node = make_node()
         node.context.on_shutdown(node.release)
         executor.add_node(node)
-        executor.spin()
+        _spin(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

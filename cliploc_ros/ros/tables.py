@@ -67,7 +67,7 @@ RELOCALIZER = (
                  read_only=True),
     ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
                  read_only=True),
-    ParameterRow('clip_checkpoint', '', 'Local file with the weights of that tag; empty: '
+    ParameterRow('clip_checkpoint_path', '', 'Local file with the weights of that tag; empty: '
                  'download them once.', read_only=True),
     _DEVICE,
     _CACHE_DIR,

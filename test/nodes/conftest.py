@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from std_srvs.srv import Empty, Trigger
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.transforms import transform_from_pose
-from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
 
 PROJECT = Path(__file__).resolve().parents[2]
 # How long a test waits for what must come; only failures take so long.
@@ -135,6 +136,19 @@ class Tester(Node):
             parameters=[Parameter(name, value=value).to_parameter_msg()])
         return self.call(SetParameters, '/relocalizer/set_parameters', request).results[0]
 
+    @contextmanager
+    def hearing_detections(self):
+        """Keep the first detections of every stamp [ns] that anybody publishes meanwhile."""
+        heard = {}
+        subscription = self.create_subscription(
+            Detection2DArray, 'detections',
+            lambda msg: heard.setdefault(stamp_ns(msg.header.stamp), detections_from_msg(msg)),
+            RELIABLE)
+        try:
+            yield heard
+        finally:
+            self.destroy_subscription(subscription)
+
     def listened_to(self):
         """Return how many subscriptions there are to what this node publishes."""
         return sum(publisher.get_subscription_count() for publisher in (
@@ -240,7 +254,7 @@ def start(tmp_path):
     run, started = starter(tmp_path)
     yield run
     for process in started:
-        process.stop(signal.SIGKILL)
+        process.stop()
 
 
 @pytest.fixture(scope='module')
@@ -249,7 +263,7 @@ def start_shared(tmp_path_factory):
     run, started = starter(tmp_path_factory.mktemp('shared'))
     yield run
     for process in started:
-        process.stop(signal.SIGKILL)
+        process.stop()
 
 
 def class_matching(room_map, **parameters):

@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The 17 real TUM frames as a recording, through real nodes, one wake-up request a frame."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from conftest import PROJECT, make_frame, transform_of
+
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.datasets.intrinsics import PRESETS
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.ros.conversions import stamp_ns
+
+FRAMES = 17
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    return shared_data / 'tum_fr3_office'
+
+
+@pytest.fixture(scope='module')
+def limits():
+    return yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['recording']
+
+
+@pytest.fixture(scope='module')
+def convert(office, tmp_path_factory):
+    """Convert the TUM folder with its own tool; return the recording."""
+    def run(name, *arguments, monkeypatch):
+        output = tmp_path_factory.mktemp('recording') / name
+        monkeypatch.setattr('sys.argv', ['tum_to_bag', str(office), str(output), '--intrinsics',
+                                         'fr3', *map(str, arguments)])
+        assert tum_to_bag() == 0
+        return output
+    return run
+
+
+def core_answer(office, detections):
+    """What the core says of detections, without any ROS."""
+    relocalizer = Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
+                              RelocalizerOptions(matching='class', algorithm='bf'))
+    return relocalizer.relocalize([Observation(PRESETS['fr3'],
+                                               detections.usable(640, 480, 50))])
+
+
+def wake_up_on_every_frame(tester):
+    """Ask until every frame of a looping recording was answered; the answers by stamp.
+
+    Which frame an answer is about stands in the stamp of the hypotheses published with it.
+    """
+    answers = {}
+    tester.hypotheses.clear()
+    while len(answers) < FRAMES:
+        heard = len(tester.hypotheses)
+        answer = tester.answer(tester.ask())
+        assert answer.message.startswith(('accepted', 'refused')), answer.message
+        tester.wait(lambda n=heard: len(tester.hypotheses) > n, 'the hypotheses')
+        hypotheses = tester.hypotheses[-1]
+        answers[stamp_ns(hypotheses.header.stamp)] = (answer, hypotheses)
+    return answers
+
+
+def judge(answers, sequence):
+    """Print and return success at 1 m over frames with ground truth, and wrong accepts."""
+    errors, wrong = [], 0
+    for stamp, (answer, hypotheses) in sorted(answers.items()):
+        truth = sequence.pose_at(stamp)
+        if truth is None:
+            continue
+        error = pose_error(transform_of(hypotheses.poses[0]), truth)[0] if hypotheses.poses \
+            else np.inf
+        errors.append(error)
+        wrong += answer.success and error > 1.0
+        print(f'{stamp / 1e9:.3f}: {error:6.2f} m, {answer.message[:60]}')
+    success = np.mean(np.array(errors) < 1.0)
+    print(f'{len(errors)} frames with ground truth: success at 1 m {success:.2f}, '
+          f'{wrong} accepted and wrong')
+    return success, wrong
+
+
+def test_recorded_detections(office, convert, limits, start, tester, monkeypatch):
+    print()
+    recording = convert('boxes', '--detections', office / 'detections.json',
+                        monkeypatch=monkeypatch)
+    start('nodes.relocalizer', parameters={
+        'map_file': office / 'map.yaml', 'matching': 'class', 'algorithm': 'bf'
+    }).wait_for_output('ready after')
+    tester.connect()
+    start('cli.replay', recording, '--loop', '--rate', '3')
+    with tester.hearing_detections() as heard:
+        answers = wake_up_on_every_frame(tester)
+    for stamp, (answer, hypotheses) in answers.items():
+        expected = core_answer(office, heard[stamp])
+        assert answer.success == expected.accepted
+        assert len(hypotheses.poses) == len(expected.hypotheses)
+        for pose, hypothesis in zip(hypotheses.poses, expected.hypotheses, strict=True):
+            assert transform_of(pose) == pytest.approx(hypothesis.map_from_camera, abs=1e-9)
+    success, wrong = judge(answers, read_tum(office))
+    assert success >= limits['recorded_detections']['success_at_1m']
+    assert wrong <= limits['recorded_detections']['accepted_wrong_by_1m']
+
+
+def box_iou(box, others):
+    overlap = np.prod(np.maximum(0.0, np.minimum(box[2:], others[:, 2:])
+                                 - np.maximum(box[:2], others[:, :2])), axis=1)
+    areas = np.prod(others[:, 2:] - others[:, :2], axis=1)
+    return overlap / (np.prod(box[2:] - box[:2]) + areas - overlap)
+
+
+def recall_of(recorded, detected):
+    """Print by class, and return, how many recorded boxes have a detection of IoU over .5."""
+    found = {}
+    for frame in recorded['frames']:
+        stamp = int(frame['timestamp'].replace('.', '') + '000')
+        detections = detected.get(stamp)
+        for box in frame['detections'] if detections is not None else []:
+            same = detections.bboxes_xyxy[[name == box['class_id']
+                                           for name in detections.class_ids]]
+            overlaps = box_iou(np.array(box['bbox_xyxy']), same)
+            found.setdefault(box['class_id'], []).append(bool((overlaps > 0.5).any()))
+    for class_id, hits in sorted(found.items()):
+        print(f'{class_id}: {sum(hits)} of {len(hits)} recorded boxes detected')
+    return np.mean([hit for hits in found.values() for hit in hits])
+
+
+def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, limits, start,
+                                               tester, monkeypatch):
+    print()
+    recording = convert('images', monkeypatch=monkeypatch)
+    start('nodes.detector', parameters={
+        'model': shared_data / 'weights/yolov8n_coco.pt'}).wait_for_output('detector ready')
+    start('nodes.relocalizer', parameters={
+        'map_file': office / 'map.yaml', 'matching': 'class', 'algorithm': 'ransac',
+        'iterations': 5000}).wait_for_output('ready after')
+    tester.connect()
+    start('cli.replay', recording, '--loop', '--rate', '2')
+    with tester.hearing_detections() as detected:
+        answers = wake_up_on_every_frame(tester)
+        tester.wait(lambda: len(detected) == FRAMES, 'detections of every frame')
+    recall = recall_of(json.loads((office / 'detections.json').read_text()), detected)
+    print(f'recall over all classes {recall:.2f}')
+    assert recall >= limits['yolov8n']['recall_of_recorded_boxes']
+    success, wrong = judge(answers, read_tum(office))
+    assert success >= limits['yolov8n']['success_at_1m']
+    assert wrong <= limits['yolov8n']['accepted_wrong_by_1m']
+
+
+def test_the_detector_works_only_while_something_listens(shared_data, start, tester):
+    detector = start('nodes.detector', parameters={
+        'model': shared_data / 'weights/yolov8n_coco.pt'})
+    detector.wait_for_output('detector ready')
+    tester.wait(lambda: tester.count_publishers('/detections') == 2, 'the detector to publish')
+    assert tester.images.get_subscription_count() == 0
+    with tester.hearing_detections() as detected:
+        tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the detector to listen')
+        tester.feed_until(lambda: detected, [make_frame(stamp_s=7.0)[0]], 'detections')
+        assert list(detected) == [7_000_000_000]
+        bad = make_frame(stamp_s=8.0)[0]
+        bad.encoding = 'yuv422'
+        tester.feed_until(lambda: "encoding 'yuv422' is none of" in detector.output(), [bad],
+                          'the bad image to be named')
+        tester.feed_until(lambda: 9_000_000_000 in detected, [make_frame(stamp_s=9.0)[0]],
+                          'detections after a bad image')
+        assert 8_000_000_000 not in detected
+    tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
+    code, seconds = detector.stop()
+    assert code == 0
+    assert seconds < 2.0
+
+
+@pytest.mark.parametrize(('model', 'reason'), [
+    ('/nowhere/yolo.pt', '/nowhere/yolo.pt'), ('yolov9000.pt', 'neither a file here nor'),
+    (__file__, 'test_recording.py')])
+def test_a_detector_without_weights_says_so_and_lives(start, tester, model, reason):
+    detector = start('nodes.detector', parameters={'model': model})
+    detector.wait_for_output('[ERROR]')
+    assert reason in detector.output()
+    assert 'Traceback' not in detector.output()
+    assert detector.alive
+    assert detector.stop()[0] == 0
