@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector node: images in, detections out, and only while something listens."""
 
-import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from sensor_msgs.msg import CompressedImage, Image
@@ -80,10 +79,10 @@ def detector_options(values: Mapping[str, Value]) -> YoloOptions:
     return YoloOptions(**fields)
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Run the node until it is told to stop."""
-    return run_node(DetectorNode)
+    run_node(DetectorNode)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer node: from image and detections to the robot's pose, when asked."""
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -143,10 +142,10 @@ def _summary(found: Relocalization) -> str:
             f'{found.tried} hypotheses')
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Run the node until it is told to stop."""
-    return run_node(RelocalizerNode)
+    run_node(RelocalizerNode)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

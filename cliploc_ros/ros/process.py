@@ -2,17 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The life of a node's process: the only caller of rclpy.init."""
 
+import atexit
 import logging
+import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable
+from typing import NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 
-from cliploc_ros.ros.worker import Worker, leave
+from cliploc_ros.ros.worker import Worker
 
 # One for a request that waits, one for frames, one for parameters and the rest.
 _THREADS = 3
@@ -68,8 +72,8 @@ def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
             node.get_logger().error(f'internal error: {traceback.format_exc()}')
 
 
-def run_node(make_node: Callable[[], WorkingNode]) -> int:
-    """Spin a node until SIGINT or SIGTERM; return 0, or end the process with it within 2 s."""
+def run_node(make_node: Callable[[], WorkingNode]) -> NoReturn:
+    """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
     rclpy.init(args=sys.argv)
     executor = MultiThreadedExecutor(num_threads=_THREADS)
     node = None
@@ -81,10 +85,23 @@ def run_node(make_node: Callable[[], WorkingNode]) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        ended = True
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
         if node is not None:
             node.release()
-            ended = node.worker.stop()
+            node.worker.stop()
+            # Others would take a node that does not say good-bye for alive, and wait for it.
+            node.destroy_node()
         rclpy.try_shutdown()
-    leave(ended)
-    return 0
+    _leave()
+
+
+def _leave() -> NoReturn:
+    """End the process now.
+
+    A thread inside a network cannot be stopped, and Python would wait for it, and then take
+    seconds to take torch apart.
+    """
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)

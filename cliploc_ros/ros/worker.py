@@ -2,19 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work beside the executor: the node answers while a network runs."""
 
-import os
-import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from cliploc_ros.errors import CliplocError, InternalError, StoppedError
 
 # How long a running network may delay the end of its process.
-_GRACE_S = 1.0
+_GRACE_S = 0.2
 
 
 class Worker:
@@ -64,13 +62,10 @@ class Worker:
             raise InternalError(f'internal error: {type(error).__name__}: {error} (the traceback '
                                 'is in the log)') from error
 
-    def stop(self) -> bool:
-        """Drop what waits; return whether the running task ended in time."""
+    def stop(self) -> None:
+        """Drop what waits, and give the running task a moment to end."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-        deadline = time.monotonic() + _GRACE_S
-        while self._running and time.monotonic() < deadline:
-            time.sleep(0.01)
-        return not self._running
+        wait(list(self._running), _GRACE_S)
 
 
 class LatestOnly[T]:
@@ -141,12 +136,3 @@ class Retrying[T]:
             self._error, self._failed_at = error, time.monotonic()
             raise
         return self._made[0]
-
-
-def leave(worker_ended: bool) -> None:
-    """End the process with exit code 0, even while a network still runs in its thread."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if not worker_ended:
-        # A thread inside a network cannot be stopped, and Python would wait for it.
-        os._exit(0)

@@ -1,0 +1,272 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import cv2
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
+from scene import MAP_FROM_CAMERA
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
+from vision_msgs.msg import (
+    Detection2D,
+    Detection2DArray,
+    ObjectHypothesis,
+    ObjectHypothesisWithPose,
+)
+
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.transforms import pose_error, transform_from_pose
+from cliploc_ros.errors import CameraError, ImageError
+from cliploc_ros.ros.conversions import (
+    camera_from_msg,
+    detections_from_msg,
+    detections_to_msg,
+    image_from_msg,
+    pose_array_msg,
+    pose_to_msg,
+    pose_with_covariance_msg,
+    stamp_ns,
+)
+
+HEADER = Header(frame_id='camera', stamp=Time(sec=12, nanosec=34))
+# Two rows of three pixels, red first.
+PIXELS = np.array([[[1, 2, 3], [4, 5, 6], [7, 8, 9]],
+                   [[250, 251, 252], [253, 254, 255], [0, 128, 64]]], dtype=np.uint8)
+GREY = np.array([[10, 20, 30], [255, 0, 128]], dtype=np.uint8)
+PADDING = 99
+# The bytes of the first row, as each encoding lays them out.
+FIRST_ROWS = {
+    'rgb8': [1, 2, 3, 4, 5, 6, 7, 8, 9],
+    'bgr8': [3, 2, 1, 6, 5, 4, 9, 8, 7],
+    '8UC3': [3, 2, 1, 6, 5, 4, 9, 8, 7],
+    'rgba8': [1, 2, 3, 77, 4, 5, 6, 77, 7, 8, 9, 77],
+    'bgra8': [3, 2, 1, 77, 6, 5, 4, 77, 9, 8, 7, 77],
+    '8UC4': [3, 2, 1, 77, 6, 5, 4, 77, 9, 8, 7, 77],
+}
+SECOND_ROWS = {
+    'rgb8': [250, 251, 252, 253, 254, 255, 0, 128, 64],
+    'bgr8': [252, 251, 250, 255, 254, 253, 64, 128, 0],
+    '8UC3': [252, 251, 250, 255, 254, 253, 64, 128, 0],
+    'rgba8': [250, 251, 252, 7, 253, 254, 255, 7, 0, 128, 64, 7],
+    'bgra8': [252, 251, 250, 7, 255, 254, 253, 7, 64, 128, 0, 7],
+    '8UC4': [252, 251, 250, 7, 255, 254, 253, 7, 64, 128, 0, 7],
+}
+
+
+def image_msg(encoding, rows, padding=0, trailing=0):
+    data = b''.join(bytes(row) + bytes([PADDING] * padding) for row in rows)
+    return Image(header=HEADER, height=len(rows), width=3, encoding=encoding,
+                 step=len(rows[0]) + padding, data=data + bytes([PADDING] * trailing))
+
+
+@pytest.mark.parametrize('padding', [0, 1, 5])
+@pytest.mark.parametrize('encoding', FIRST_ROWS)
+def test_colour_images(encoding, padding):
+    msg = image_msg(encoding, [FIRST_ROWS[encoding], SECOND_ROWS[encoding]], padding)
+    image = image_from_msg(msg)
+    np.testing.assert_array_equal(image, PIXELS)
+    assert image.dtype == np.uint8 and image.flags.c_contiguous
+
+
+@pytest.mark.parametrize('padding', [0, 1, 5])
+@pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
+def test_grey_images(encoding, padding):
+    image = image_from_msg(image_msg(encoding, GREY.tolist(), padding))
+    np.testing.assert_array_equal(image, np.stack([GREY] * 3, axis=2))
+
+
+def test_bytes_after_the_last_row_are_left_alone():
+    image = image_from_msg(image_msg('mono8', GREY.tolist(), trailing=7))
+    np.testing.assert_array_equal(image[:, :, 0], GREY)
+
+
+def test_an_image_survives_the_wire():
+    msg = image_msg('rgb8', [FIRST_ROWS['rgb8'], SECOND_ROWS['rgb8']], padding=2)
+    np.testing.assert_array_equal(
+        image_from_msg(deserialize_message(serialize_message(msg), Image)), PIXELS)
+
+
+@given(width=st.integers(1, 7), height=st.integers(1, 5), padding=st.integers(0, 9),
+       encoding=st.sampled_from(['mono8', *FIRST_ROWS]), seed=st.integers(0, 2**32 - 1))
+def test_pixels_stay_where_they_are(width, height, padding, encoding, seed):
+    channels = 1 if encoding == 'mono8' else len(FIRST_ROWS[encoding]) // 3
+    rows = np.random.default_rng(seed).integers(
+        0, 256, (height, width * channels + padding), dtype=np.uint8)
+    msg = Image(height=height, width=width, encoding=encoding, step=rows.shape[1],
+                data=rows.tobytes())
+    image = image_from_msg(msg)
+    assert image.shape == (height, width, 3)
+    green = 0 if channels == 1 else 1
+    np.testing.assert_array_equal(image[:, :, 1], rows[:, green:width * channels:channels])
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'encoding': 'bayer_rggb8'}, "encoding 'bayer_rggb8' is none of rgb8"),
+    ({'encoding': ''}, "encoding '' is none of"),
+    ({'width': 0}, 'image size 0x2'), ({'height': 0}, 'image size 3x0'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'image size 4294967295x4294967295'),
+    ({'step': 8}, 'step 8 is shorter than a row of 3 rgb8 pixels'),
+    ({'step': 2**32 - 1}, 'image data has 18 bytes'),
+    ({'data': b'\0' * 17}, 'image data has 17 bytes, but 2 rows of 9 bytes are 18'),
+    ({'data': b''}, 'image data has 0 bytes')])
+def test_images_that_cannot_be(changes, message):
+    msg = image_msg('rgb8', [FIRST_ROWS['rgb8'], SECOND_ROWS['rgb8']])
+    for name, value in changes.items():
+        setattr(msg, name, value)
+    with pytest.raises(ImageError, match=message):
+        image_from_msg(msg)
+
+
+def compressed(extension, image_bgr):
+    return CompressedImage(format=extension,
+                           data=cv2.imencode(f'.{extension}', image_bgr)[1].tobytes())
+
+
+def test_png_keeps_every_pixel():
+    np.testing.assert_array_equal(image_from_msg(compressed('png', PIXELS[:, :, ::-1])), PIXELS)
+    np.testing.assert_array_equal(image_from_msg(compressed('png', GREY))[:, :, 2], GREY)
+
+
+def test_jpeg_keeps_colours_in_their_order():
+    red = np.full((32, 48, 3), (10, 20, 230), dtype=np.uint8)
+    image = image_from_msg(compressed('jpg', red))
+    assert image.shape == (32, 48, 3)
+    np.testing.assert_allclose(image[16, 24], [230, 20, 10], atol=8)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_image_are_refused(data):
+    with pytest.raises(ImageError, match=r"compressed image \('jpeg'.* does not decode"):
+        image_from_msg(CompressedImage(format='jpeg', data=data))
+
+
+def camera_info(**changes):
+    fields = {'width': 640, 'height': 480, 'distortion_model': 'plumb_bob',
+              'd': [0.1, -0.2, 0.001, 0.002, 0.0],
+              'k': [500.0, 0.0, 320.0, 0.0, 510.0, 240.0, 0.0, 0.0, 1.0],
+              'p': [400.0, 0.0, 300.0, -48.0, 0.0, 410.0, 200.0, 0.0, 0.0, 0.0, 1.0, 0.0]}
+    return CameraInfo(header=HEADER, **(fields | changes))
+
+
+def test_a_raw_image_has_k_and_distortion():
+    camera = camera_from_msg(camera_info(), (640, 480), rectified=False)
+    assert (camera.width, camera.height) == (640, 480)
+    assert camera.matrix.tolist() == [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+    assert (camera.distortion_model, camera.distortion) == (
+        'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.0))
+
+
+def test_a_rectified_image_has_p_and_no_distortion():
+    for model in ('plumb_bob', 'of my own'):
+        camera = camera_from_msg(camera_info(distortion_model=model), (640, 480), rectified=True)
+        assert camera.matrix.tolist() == [[400, 0, 300], [0, 410, 200], [0, 0, 1]]
+        assert camera.distortion == ()
+
+
+def test_a_size_that_is_not_given_is_the_images():
+    camera = camera_from_msg(camera_info(width=0, height=0), (320, 200), rectified=False)
+    assert (camera.width, camera.height) == (320, 200)
+
+
+@pytest.mark.parametrize(('changes', 'rectified', 'message'), [
+    ({'width': 1280, 'height': 960}, False, 'for 1280x960 px, but the image has 640x480'),
+    ({'height': 400}, True, 'for 640x400 px, but the image has 640x480'),
+    ({'k': [0.0] * 9}, False, 'camera_info: K: fx=0 fy=0'),
+    ({'p': [0.0] * 12}, True, 'camera_info: P: fx=0 fy=0'),
+    ({'k': [float('nan')] * 9}, False, 'camera_info: K: fx=nan'),
+    ({'distortion_model': 'of my own'}, False, "K: distortion model 'of my own' is none of"),
+    ({'d': [0.1] * 3}, False, 'K: .* 4 or 5 coefficients, not 3'),
+    ({'d': [float('inf')] * 5}, False, 'K: distortion .* not finite')])
+def test_cameras_that_cannot_be(changes, rectified, message):
+    with pytest.raises(CameraError, match=message):
+        camera_from_msg(camera_info(**changes), (640, 480), rectified)
+
+
+COORDINATES = st.floats(-1e5, 1e5)
+DETECTIONS = st.lists(st.tuples(
+    st.tuples(COORDINATES, COORDINATES, COORDINATES, COORDINATES),
+    st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=20),
+    st.floats(0.0, 1.0)), max_size=8)
+
+
+@given(DETECTIONS)
+def test_detections_come_back_over_the_wire(found):
+    boxes = np.array([box for box, _, _ in found], dtype=np.float64).reshape(-1, 4)
+    sent = Detections(boxes, tuple(name for _, name, _ in found),
+                      np.array([score for _, _, score in found], dtype=np.float64))
+    msg = deserialize_message(serialize_message(detections_to_msg(sent, HEADER)),
+                              Detection2DArray)
+    assert msg.header == HEADER
+    assert all(detection.header == HEADER for detection in msg.detections)
+    received = detections_from_msg(msg)
+    np.testing.assert_allclose(received.bboxes_xyxy, sent.bboxes_xyxy, rtol=0, atol=1e-9)
+    assert received.class_ids == sent.class_ids
+    np.testing.assert_array_equal(received.scores, sent.scores)
+
+
+def test_one_detection_in_numbers():
+    sent = Detections(np.array([[10.0, 20.0, 50.0, 100.0]]), ('cup',), np.array([0.75]))
+    detection, = detections_to_msg(sent, HEADER).detections
+    centre = detection.bbox.center.position
+    assert (centre.x, centre.y, detection.bbox.size_x, detection.bbox.size_y) == (30, 60, 40, 80)
+    result, = detection.results
+    assert (result.hypothesis.class_id, result.hypothesis.score) == ('cup', 0.75)
+
+
+def classified(*hypotheses):
+    return Detection2D(results=[
+        ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(class_id=class_id, score=score))
+        for class_id, score in hypotheses])
+
+
+def test_the_most_confident_class_counts():
+    msg = Detection2DArray(detections=[
+        classified(('cup', 0.2), ('vase', 0.7), ('bowl', 0.1)), classified(),
+        classified(('chair', 0.5))])
+    received = detections_from_msg(msg)
+    assert received.class_ids == ('vase', '', 'chair')
+    assert received.scores.tolist() == [0.7, 0.0, 0.5]
+
+
+@pytest.mark.parametrize('hypotheses', [(('cup', 0.9), ('vase', float('nan'))),
+                                        (('vase', float('nan')), ('cup', 0.9))])
+def test_a_score_that_is_no_number_hides_no_other_class(hypotheses):
+    received = detections_from_msg(Detection2DArray(detections=[classified(*hypotheses)]))
+    assert (received.class_ids, received.scores.tolist()) == (('cup',), [0.9])
+
+
+def test_no_detections_are_no_rows():
+    received = detections_from_msg(Detection2DArray())
+    assert received.bboxes_xyxy.shape == (0, 4)
+    assert (received.class_ids, received.scores.shape) == ((), (0,))
+
+
+def test_stamps_are_exact():
+    assert stamp_ns(Time(sec=12, nanosec=34)) == 12_000_000_034
+    assert stamp_ns(Time(sec=2**31 - 1, nanosec=999_999_999)) == 2_147_483_647_999_999_999
+    assert stamp_ns(Time(sec=-1, nanosec=5)) == -999_999_995
+
+
+@given(st.tuples(COORDINATES, COORDINATES, COORDINATES),
+       st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1))
+def test_a_pose_comes_back(position, quat_xyzw):
+    pose = transform_from_pose(np.array(position), np.array(quat_xyzw))
+    msg = pose_to_msg(pose)
+    p, q = msg.position, msg.orientation
+    again = transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+    distance, angle_deg = pose_error(again, pose)
+    assert distance == 0.0 and angle_deg < 1e-5
+    assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1.0) and q.w >= 0.0
+
+
+def test_pose_messages_keep_header_covariance_and_order():
+    covariance = np.arange(36.0).reshape(6, 6)
+    msg = pose_with_covariance_msg(HEADER, MAP_FROM_CAMERA, covariance)
+    assert msg.header == HEADER and msg.pose.pose == pose_to_msg(MAP_FROM_CAMERA)
+    assert msg.pose.covariance.tolist() == list(range(36))
+    poses = pose_array_msg(HEADER, [MAP_FROM_CAMERA, np.eye(4)])
+    assert poses.header == HEADER
+    assert poses.poses == [pose_to_msg(MAP_FROM_CAMERA), pose_to_msg(np.eye(4))]

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From messages to a pose without the node around it, by classes alone."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
+from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.localizer import StageTimes, load_localizer
+from cliploc_ros.ros.tables import RELOCALIZER
+
+HEADER = Header(frame_id='camera', stamp=Time(sec=100))
+
+
+@pytest.fixture
+def values(tmp_path):
+    """Values of the relocalizer's parameters that need no network."""
+    path = tmp_path / 'room.yaml'
+    write_map(make_room(), path)
+    return {row.name: row.default for row in RELOCALIZER} | {
+        'map_file': str(path), 'matching': 'class', 'algorithm': 'bf'}
+
+
+def make_frame(encoding='mono8', detections=None, **info):
+    image = Image(header=HEADER, width=CAMERA.width, height=CAMERA.height, encoding=encoding,
+                  step=CAMERA.width, data=bytes(CAMERA.width * CAMERA.height))
+    fields = {'width': CAMERA.width, 'height': CAMERA.height, 'k': CAMERA.matrix.ravel(),
+              'p': np.c_[CAMERA.matrix, np.zeros(3)].ravel()}
+    found = see_room(make_room()) if detections is None else detections
+    return Frame(image, CameraInfo(header=HEADER, **(fields | info)),
+                 detections_to_msg(found, HEADER), 0.0)
+
+
+@pytest.fixture
+def localizer(make_node, values):
+    return load_localizer(make_node(), values)
+
+
+def test_a_perfect_view_gives_the_true_pose(localizer, values):
+    found, times = localizer.localize(make_frame(), values)
+    distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
+    assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
+    stages = [stage.split()[0] for stage in str(times).split(', ')]
+    assert stages == ['decoding', 'CLIP', 'search']
+    assert localizer.map_frame == 'map'
+    assert localizer.description == "12 landmarks in frame 'map', class_bf"
+
+
+def test_a_rectified_image_is_measured_with_p(localizer, values):
+    useless = {'k': [0.0] * 9, 'distortion_model': 'plumb_bob', 'd': [0.5] * 5}
+    with pytest.raises(CameraError, match='camera_info: K'):
+        localizer.localize(make_frame(**useless), values)
+    found, _ = localizer.localize(make_frame(**useless), values | {'rectified': True})
+    assert pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+def test_options_hold_from_the_next_frame_on(localizer, values):
+    assert localizer.localize(make_frame(), values)[0].accepted
+    assert not localizer.localize(make_frame(), values | {'min_evidence': 1e6})[0].accepted
+    found, _ = localizer.localize(make_frame(), values | {'algorithm': 'ransac'})
+    assert found.accepted and localizer.description.endswith('class_ransac')
+
+
+def test_more_detections_than_allowed_are_not_searched(localizer, values):
+    assert not localizer.localize(make_frame(), values | {'max_detections': 3})[0].accepted
+
+
+def test_nothing_seen_is_no_pose_and_no_error(localizer, values):
+    nothing = see_room(make_room()).select(np.array([], dtype=np.int64))
+    found, _ = localizer.localize(make_frame(detections=nothing), values)
+    assert not found.accepted and found.hypotheses == () and found.reason
+
+
+def test_a_bad_image_is_named(localizer, values):
+    with pytest.raises(ImageError, match="encoding 'yuv422'"):
+        localizer.localize(make_frame(encoding='yuv422'), values)
+
+
+@pytest.mark.parametrize(('changes', 'error', 'message'), [
+    ({'map_file': ''}, MapError, 'no map: set map_file'),
+    ({'map_file': '/nowhere/room.yaml'}, MapError, '/nowhere/room.yaml'),
+    ({'algorithm': 'b-prosac'}, OptionsError, 'orders candidates by similarity'),
+    ({'base_from_camera': [1.0] * 7}, OptionsError, 'base_from_camera')])
+def test_a_bad_start_is_named(make_node, values, changes, error, message):
+    with pytest.raises(error, match=message):
+        load_localizer(make_node(), values | changes)
+
+
+def test_stages_are_told_in_whole_milliseconds():
+    times = StageTimes()
+    assert str(times) == ''
+    times.mark('decoding')
+    assert str(times) == 'decoding 0 ms'

@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+import yaml
+from scene import make_room, write_map
+
+from cliploc_ros.errors import MapError
+from cliploc_ros.ros.map_parameters import load_map
+
+CUP = {'label': 'a red cup', 'class_id': 'cup', 'center': [1.0, 2.0, 3.0],
+       'semi_axes': [0.1, 0.2, 0.3], 'orientation': [0.0, 0.0, 0.0, 1.0]}
+
+
+@pytest.fixture
+def start_with(make_node):
+    """Make a node as `--params-file` makes it."""
+    def run(path):
+        return make_node(cli_args=['--ros-args', '--params-file', str(path)],
+                         automatically_declare_parameters_from_overrides=True)
+    return run
+
+
+@pytest.fixture
+def load(start_with, tmp_path):
+    """Load a map that stands in a node's parameters."""
+    def run(tree):
+        path = tmp_path / 'map.yaml'
+        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {'map': tree}}}))
+        return load_map(start_with(path), '')
+    return run
+
+
+def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
+    path = tmp_path / 'room.yaml'
+    write_map(make_room(), path)
+    of_parameters, of_file = load_map(start_with(path), ''), load_map(start_with(path), str(path))
+    # rclpy hands parameters over in an order of its own
+    rows = [of_parameters.landmark_ids.index(name) for name in of_file.landmark_ids]
+    assert of_parameters.frame_id == of_file.frame_id == 'map'
+    assert len(of_parameters) == len(of_file) == 12
+    assert [of_parameters.labels[row] for row in rows] == list(of_file.labels)
+    assert [of_parameters.class_ids[row] for row in rows] == list(of_file.class_ids)
+    for field in ('centers', 'semi_axes', 'quats_xyzw'):
+        np.testing.assert_array_equal(getattr(of_parameters, field)[rows],
+                                      getattr(of_file, field))
+
+
+def test_one_landmark_in_numbers(load):
+    loaded = load({'frame_id': 'floor_2', 'landmarks': {'cup_1': CUP}})
+    assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids) == (
+        'floor_2', ('cup_1',), ('a red cup',), ('cup',))
+    assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]
+    assert loaded.semi_axes.tolist() == [[0.1, 0.2, 0.3]]
+
+
+def test_whole_numbers_are_numbers(load):
+    loaded = load({'frame_id': 'map', 'landmarks': {'cup_1': CUP | {
+        'center': [1, 2, 3], 'semi_axes': [1, 1, 1], 'orientation': [0, 0, 0, 1]}}})
+    assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]
+
+
+def test_a_node_without_any_map_says_what_to_do(make_node):
+    with pytest.raises(MapError, match=r'set map_file, or give .* with --params-file'):
+        load_map(make_node(), '')
+
+
+def test_a_file_goes_before_the_parameters(start_with, tmp_path):
+    path, absent = tmp_path / 'room.yaml', tmp_path / 'absent.yaml'
+    write_map(make_room(), path)
+    with pytest.raises(MapError, match=r'absent\.yaml'):
+        load_map(start_with(path), str(absent))
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'center': [1.0, 2.0]}, "parameters: landmark 'cup_1': center: must be 3 numbers"),
+    ({'center': [float('nan'), 0.0, 0.0]}, 'center: .* not finite'),
+    ({'center': {'x': 1.0}}, 'center: must be 3 numbers'),
+    ({'label': 7}, "landmark 'cup_1': label: must be text"),
+    ({'label': True}, "landmark 'cup_1': label: must be text"),
+    ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'orientation: .* norm 2'),
+    ({'colour': 'red'}, "landmark 'cup_1': unknown field: colour")])
+def test_a_bad_landmark_is_named(load, change, message):
+    with pytest.raises(MapError, match=message):
+        load({'frame_id': 'map', 'landmarks': {'cup_1': CUP | change}})
+
+
+@pytest.mark.parametrize(('tree', 'message'), [
+    ({'frame_id': 'map'}, 'parameters: map: missing field: landmarks'),
+    ({'frame_id': 'map', 'landmarks': 'none'}, 'landmarks: the map is empty'),
+    ({'landmarks': {'cup_1': CUP}}, 'missing field: frame_id'),
+    ({'frame_id': 'map', 'landmarks': {'cup_1': 3}}, "landmark 'cup_1': expected the fields"),
+    ({'frame_id': 'map', 'landmarks': {'cup_1': {'label': 'a cup'}}}, 'missing field: class_id'),
+    ({'frame_id': 'map', 'landmarks': {'cup_1': CUP}, 'scale': 2.0}, 'unknown field: scale')])
+def test_a_bad_tree_is_named(load, tree, message):
+    with pytest.raises(MapError, match=message):
+        load(tree)
+
+
+def test_a_value_beside_its_own_fields_is_named(make_node):
+    node = make_node()
+    node.declare_parameter('map.frame_id', 'map')
+    node.declare_parameter('map.frame_id.name', 'map')
+    with pytest.raises(MapError, match="'frame_id' is a value and holds fields"):
+        load_map(node, '')

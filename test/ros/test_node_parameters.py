@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of real nodes: given in files, changed at run time, refused."""
+
+import pytest
+from rclpy.parameter import Parameter
+
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.parameters import NodeParameters, ParameterRow, yaml_defaults
+from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+
+TABLE = (
+    ParameterRow('low', 1, 'Not above high.', low=0, high=100),
+    ParameterRow('high', 5, 'Not below low.', low=0, high=100),
+    ParameterRow('ratio', 0.5, 'A part.', low=0.0, high=1.0),
+    ParameterRow('mode', 'calm', 'How.', choices=('calm', 'wild'), read_only=True),
+    ParameterRow('span', [0.0, 1.0], 'From, to.', unit='m'),
+)
+DEFAULTS = {row.name: row.default for row in TABLE}
+
+
+def check(values):
+    if values['low'] > values['high']:
+        raise OptionsError('low: above high')
+
+
+@pytest.fixture
+def declare(make_node, tmp_path):
+    """Make a node with parameters from the text of a file; return it and its parameters."""
+    def run(text='', table=TABLE, check=check):
+        path = tmp_path / 'parameters.yaml'
+        path.write_text(text or '/**:\n  ros__parameters:\n    use_sim_time: false\n')
+        node = make_node(cli_args=['--ros-args', '--params-file', str(path)],
+                         automatically_declare_parameters_from_overrides=True)
+        return node, NodeParameters(node, table, check)
+    return run
+
+
+def given(**values):
+    lines = ''.join(f'    {name}: {value}\n' for name, value in values.items())
+    return f'/**:\n  ros__parameters:\n{lines}'
+
+
+def set_values(node, **values):
+    return node.set_parameters_atomically(
+        [Parameter(name, value=value) for name, value in values.items()])
+
+
+@pytest.mark.parametrize(('name', 'table', 'check'), [
+    ('detector', DETECTOR, lambda values: None),
+    ('relocalizer', RELOCALIZER, relocalizer_options)])
+def test_a_node_takes_the_generated_file(declare, name, table, check, capfd):
+    _, parameters = declare(yaml_defaults(name, table), table, check)
+    assert parameters.snapshot() == {row.name: row.default for row in table}
+    assert 'unknown parameter' not in capfd.readouterr().err
+
+
+def test_without_a_file_all_is_at_its_default(declare):
+    node, parameters = declare()
+    assert parameters.snapshot() == DEFAULTS
+    assert parameters['ratio'] == 0.5
+    descriptor = node.describe_parameter('span')
+    assert (descriptor.description, descriptor.read_only) == ('From, to. [m]', False)
+    assert node.describe_parameter('mode').read_only
+    assert node.describe_parameter('mode').additional_constraints == 'calm, wild'
+
+
+def test_given_values_are_taken_whole_numbers_too(declare):
+    _, parameters = declare(given(low=2, ratio=1, mode='wild', span='[1, 2]'))
+    assert parameters.snapshot() == DEFAULTS | {
+        'low': 2, 'ratio': 1.0, 'mode': 'wild', 'span': [1.0, 2.0]}
+    assert type(parameters['ratio']) is float
+
+
+@pytest.mark.parametrize(('values', 'reason'), [
+    ({'low': 101}, 'low: 101 must be 0 to 100; mend it with: ros2 param set node_under_test low'),
+    ({'ratio': '.nan'}, 'ratio: nan must be 0 to 1'),
+    ({'ratio': 'half'}, 'ratio: must be of type float, not str'),
+    ({'mode': 'willd'}, "did you mean 'wild'?); mend it and start again"),
+    ({'span': '[1.0]'}, 'span: must be 2 numbers'),
+    ({'span': '[1.0, .nan]'}, 'span: must be 2 numbers'),
+    ({'span': "['0', '1']"}, 'span: must be 2 numbers'),
+    ({'low': 6}, 'low: above high')])
+def test_a_bad_start_is_told_until_it_is_mended(declare, values, reason):
+    _, parameters = declare(given(**values))
+    for _ in range(2):
+        with pytest.raises(OptionsError) as raised:
+            parameters.snapshot()
+        assert reason in str(raised.value)
+
+
+def test_problems_are_logged_at_once_and_mended_one_by_one(declare, capfd):
+    node, parameters = declare(given(low=101, ratio=2.0))
+    assert 'parameter low: 101' in (log := capfd.readouterr().err) and 'ratio: 2.0' in log
+    assert set_values(node, low=3).successful
+    with pytest.raises(OptionsError, match=r'^parameter ratio'):
+        parameters.snapshot()
+    assert not set_values(node, ratio=3.0).successful
+    assert set_values(node, ratio=0.25).successful
+    assert parameters.snapshot() == DEFAULTS | {'low': 3, 'ratio': 0.25}
+
+
+def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
+    declare(given(ratoi=0.5, qqq=1) + '    map:\n      frame_id: map\n')
+    log = capfd.readouterr().err
+    assert "unknown parameter 'ratoi' has no effect; did you mean 'ratio'?" in log
+    assert "unknown parameter 'qqq' has no effect\n" in log
+    assert 'map' not in log and 'use_sim_time' not in log
+
+
+def test_changes_at_run_time(declare):
+    node, parameters = declare()
+    assert set_values(node, low=50, high=60).successful
+    assert set_values(node, span=[2.0, 3.0]).successful
+    assert parameters.snapshot() == DEFAULTS | {'low': 50, 'high': 60, 'span': [2.0, 3.0]}
+
+
+@pytest.mark.parametrize(('values', 'reason'), [
+    ({'low': -1}, 'low: -1 must be 0 to 100'), ({'low': 6}, 'low: above high'),
+    ({'low': 2, 'high': 1}, 'low: above high'), ({'ratio': float('nan')}, 'ratio: nan'),
+    ({'span': [1.0]}, 'span: must be 2 numbers'), ({'span': [1.0, float('inf')]}, 'span: must'),
+    ({'ratio': 'half'}, 'Wrong parameter type'), ({'mode': 'wild'}, 'read-only'),
+    ({'use_sim_time': False, 'high': 0}, 'low: above high')])
+def test_a_refused_change_changes_nothing(declare, values, reason):
+    node, parameters = declare()
+    answer = set_values(node, **values)
+    assert not answer.successful and reason in answer.reason
+    assert parameters.snapshot() == DEFAULTS
+
+
+def test_the_map_does_not_change_at_run_time(declare):
+    node, _ = declare(given() + '    map:\n      frame_id: map\n')
+    answer = set_values(node, **{'map.frame_id': 'odom'})
+    assert not answer.successful and 'the map is read at start-up' in answer.reason
+    assert node.get_parameter('map.frame_id').value == 'map'

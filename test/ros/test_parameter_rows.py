@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import array
+import math
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.parameters import ParameterRow, markdown_table, yaml_defaults
+from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+
+TEXT = ParameterRow('text', 'a', 'Some text.')
+CHOICE = ParameterRow('choice', 'raw', 'One of two.', choices=('raw', 'compressed'))
+COUNT = ParameterRow('count', 3, 'How many.', low=1, high=10)
+SEED = ParameterRow('seed', 0, 'Any whole number.')
+LENGTH = ParameterRow('length', 0.5, 'How long.', unit='m', low=0.0, high=2.0)
+POSITIVE = ParameterRow('positive', 1.0, 'Not below 0.', low=0.0)
+SWITCH = ParameterRow('switch', False, 'On or off.')
+MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
+
+TABLES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
+RELOCALIZER_DEFAULTS = {row.name: row.default for row in RELOCALIZER}
+
+
+@pytest.mark.parametrize(('row', 'value', 'validated'), [
+    (TEXT, '', ''), (TEXT, 'b', 'b'), (CHOICE, 'compressed', 'compressed'),
+    (COUNT, 1, 1), (COUNT, 10, 10), (SEED, -10**12, -10**12),
+    (LENGTH, 0.0, 0.0), (LENGTH, 2.0, 2.0), (LENGTH, 1, 1.0), (POSITIVE, 10**6, 1e6),
+    (SWITCH, True, True), (MOUNT, [1, 2.5], [1.0, 2.5]), (MOUNT, (1, 2), [1.0, 2.0]),
+    (MOUNT, array.array('d', [3.0, 4.0]), [3.0, 4.0]),
+    (MOUNT, array.array('q', [3, 4]), [3.0, 4.0])])
+def test_good_values_come_back_in_the_parameters_type(row, value, validated):
+    result = row.validated(value)
+    assert result == validated and type(result) is type(validated)
+    if isinstance(result, list):
+        assert all(type(item) is float for item in result)
+
+
+@pytest.mark.parametrize(('row', 'value', 'message'), [
+    (TEXT, 1, 'text: must be of type str, not int'),
+    (TEXT, None, 'text: must be of type str, not NoneType'),
+    (CHOICE, 'RAW', "choice: 'RAW' is none of raw, compressed"),
+    (CHOICE, 'compresed', "did you mean 'compressed'"),
+    (CHOICE, True, 'choice: must be of type str, not bool'),
+    (COUNT, 0, 'count: 0 must be 1 to 10'), (COUNT, 11, 'count: 11 must be 1 to 10'),
+    (COUNT, 3.0, 'count: must be of type int, not float'),
+    (COUNT, True, 'count: must be of type int, not bool'),
+    (COUNT, '3', 'count: must be of type int, not str'),
+    (SEED, 0.5, 'seed: must be of type int'),
+    (LENGTH, -0.001, 'length: -0.001 must be 0 to 2'),
+    (LENGTH, 3, 'length: 3.0 must be 0 to 2'),
+    (LENGTH, math.nan, 'length: nan must be 0 to 2'),
+    (LENGTH, math.inf, 'length: inf must be 0 to 2'),
+    (LENGTH, False, 'length: must be of type float, not bool'),
+    (LENGTH, '1.0', 'length: must be of type float, not str'),
+    (POSITIVE, -1, 'positive: -1.0 must be >= 0'),
+    (POSITIVE, math.nan, 'positive: nan must be >= 0'),
+    (SWITCH, 1, 'switch: must be of type bool, not int'),
+    (SWITCH, 'true', 'switch: must be of type bool, not str'),
+    (MOUNT, [], 'mount: must be 2 numbers'), (MOUNT, [1.0], 'mount: must be 2 numbers'),
+    (MOUNT, [1.0, 2.0, 3.0], 'mount: must be 2 numbers'),
+    (MOUNT, [1.0, math.nan], 'mount: must be 2 numbers'),
+    (MOUNT, [1.0, -math.inf], 'mount: must be 2 numbers'),
+    (MOUNT, ['1', '2'], 'mount: must be 2 numbers'), (MOUNT, '12', 'mount: must be 2 numbers'),
+    (MOUNT, b'12', 'mount: must be 2 numbers'), (MOUNT, 1.0, 'mount: must be 2 numbers'),
+    (MOUNT, None, 'mount: must be 2 numbers')])
+def test_a_bad_value_is_refused_by_name_and_with_what_is_allowed(row, value, message):
+    with pytest.raises(OptionsError) as raised:
+        row.validated(value)
+    assert message in str(raised.value)
+    assert len(str(raised.value)) < 200
+
+
+@given(st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary(),
+    st.lists(st.one_of(st.integers(-2**63, 2**63 - 1), st.floats(), st.text()), max_size=4)))
+def test_whatever_comes_it_is_allowed_or_refused(value):
+    for row in (TEXT, CHOICE, COUNT, LENGTH, SWITCH, MOUNT):
+        try:
+            validated = row.validated(value)
+        except OptionsError as error:
+            assert row.name in str(error)
+        else:
+            assert type(validated) is type(row.default)
+            assert row.validated(validated) == validated
+            if row in (COUNT, LENGTH):
+                assert row.low <= validated <= row.high
+
+
+@given(st.integers(-2**62, 2**62), st.floats(allow_nan=False))
+def test_ranges_include_their_ends_and_nothing_beyond(whole, number):
+    for row, value in ((COUNT, whole), (LENGTH, number)):
+        if row.low <= value <= row.high:
+            assert row.validated(value) == value
+        else:
+            with pytest.raises(OptionsError, match=row.name):
+                row.validated(value)
+
+
+@pytest.mark.parametrize(('row', 'allowed'), [
+    (TEXT, ''), (CHOICE, 'raw, compressed'), (COUNT, '1 to 10'), (SEED, ''),
+    (LENGTH, '0 to 2'), (POSITIVE, '>= 0'), (SWITCH, ''), (MOUNT, '')],
+    ids=lambda value: getattr(value, 'name', None))
+def test_what_is_allowed_reads_well(row, allowed):
+    assert row.allowed == allowed
+
+
+def test_the_yaml_file_in_full():
+    assert yaml_defaults('probe', (LENGTH, CHOICE, SWITCH, MOUNT)) == (
+        '# Every parameter of the probe node at its default.\n'
+        '/**:\n'
+        '  ros__parameters:\n'
+        '    # How long. [m] Allowed: 0 to 2.\n'
+        '    length: 0.5\n'
+        '    # One of two. Allowed: raw, compressed.\n'
+        "    choice: 'raw'\n"
+        '    # On or off.\n'
+        '    switch: false\n'
+        '    # Two numbers. [m]\n'
+        '    mount: [0.0, 0.0]\n')
+
+
+def test_the_markdown_table_in_full():
+    fixed = ParameterRow('fixed', '', 'Set once.', read_only=True)
+    assert markdown_table((LENGTH, fixed)) == (
+        '| parameter | default | unit | allowed | at run time | what it does |\n'
+        '|---|---|---|---|---|---|\n'
+        '| `length` | `0.5` | m | 0 to 2 | yes | How long. |\n'
+        "| `fixed` | `''` |  |  |  | Set once. |\n")
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_the_yaml_file_holds_the_defaults_in_their_types(name):
+    read = yaml.safe_load(yaml_defaults(name, TABLES[name]))['/**']['ros__parameters']
+    assert list(read) == [row.name for row in TABLES[name]]
+    for row in TABLES[name]:
+        assert read[row.name] == row.default and type(read[row.name]) is type(row.default)
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_the_markdown_table_holds_the_defaults(name):
+    rows = [[cell.strip() for cell in line.strip('|').split('|')]
+            for line in markdown_table(TABLES[name]).splitlines()[2:]]
+    assert all(len(cells) == 6 for cells in rows)
+    assert {cells[0].strip('`'): yaml.safe_load(cells[1].strip('`')) for cells in rows} == {
+        row.name: row.default for row in TABLES[name]}
+    assert [cells[4] == '' for cells in rows] == [row.read_only for row in TABLES[name]]
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_tables_are_sound(name):
+    names = [row.name for row in TABLES[name]]
+    assert len(set(names)) == len(names)
+    for row in TABLES[name]:
+        assert row.validated(row.default) == row.default
+        assert row.description.endswith('.') and '|' not in row.description
+
+
+def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
+    # offline a search may take its time; a request's answer is waited for
+    assert relocalizer_options(RELOCALIZER_DEFAULTS) == RelocalizerOptions(time_budget_s=10.0)
+    rows = {row.name: row for row in RELOCALIZER}
+    for name in ('iterations', 'iou_threshold', 'time_budget_s', 'min_inliers', 'k'):
+        for end in (rows[name].low, rows[name].high):
+            value = type(rows[name].default)(end)
+            options = relocalizer_options(RELOCALIZER_DEFAULTS | {name: value})
+            assert getattr(options, name) == value
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'matching': 'class'}, "algorithm 'b-prosac' orders candidates by similarity"),
+    ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera: .* not of unit length'),
+    ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera: .* not of unit length')])
+def test_values_that_do_not_fit_together(changes, message):
+    with pytest.raises(OptionsError, match=message):
+        relocalizer_options(RELOCALIZER_DEFAULTS | changes)
+
+
+@pytest.mark.parametrize('mount', [[0.0] * 7, [1.0, 2.0, 3.0, 0.5, -0.5, 0.5, -0.5],
+                                   [0.0] * 6 + [0.995]])
+def test_mounts_that_fit(mount):
+    relocalizer_options(RELOCALIZER_DEFAULTS | {'base_from_camera': mount})

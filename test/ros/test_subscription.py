@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from std_msgs.msg import Header
+
+from cliploc_ros.ros.subscription import AdaptiveSubscription
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+DEPTH_ONE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
+                       reliability=ReliabilityPolicy.BEST_EFFORT,
+                       durability=DurabilityPolicy.VOLATILE)
+
+
+class Ear:
+    """An AdaptiveSubscription, the publishers it may hear, and what it heard."""
+
+    def __init__(self, listener, speaker, spin_until, topic='~/topic'):
+        self._listener, self._speaker, self._spin_until = listener, speaker, spin_until
+        self.topic = listener.resolve_topic_name(topic)
+        self.heard = []
+        self.subscription = AdaptiveSubscription(listener, Header, topic, self.heard.append,
+                                                 DEPTH_ONE)
+
+    def offer(self, reliability):
+        return self._speaker.create_publisher(
+            Header, self.topic, QoSProfile(depth=10, reliability=reliability))
+
+    def withdraw(self, publisher):
+        self._speaker.destroy_publisher(publisher)
+
+    def policies(self):
+        """Return the reliability of every subscription there is, as the publishers' node sees."""
+        return [info.qos_profile.reliability for info in
+                self._speaker.get_subscriptions_info_by_topic(self.topic)]
+
+    def wait_for_policies(self, *policies):
+        self.wait(lambda: self.policies() == list(policies),
+                  f'{[policy.name for policy in policies]} as the subscriptions')
+
+    def wait_for_hearing(self, publisher, name):
+        def heard():
+            return any(msg.frame_id == name for msg in self.heard)
+        self.wait(heard, f'a message of {name}',
+                  lambda: publisher.publish(Header(frame_id=name)))
+
+    def wait(self, condition, what, work=lambda: None):
+        self._spin_until([self._listener, self._speaker], condition, what, work)
+
+
+@pytest.fixture
+def nodes(make_node):
+    return make_node('listener'), make_node('speaker')
+
+
+@pytest.fixture
+def ear(nodes, spin_until):
+    ear = Ear(*nodes, spin_until)
+    yield ear
+    ear.subscription.destroy()
+
+
+def test_before_anybody_publishes_it_would_hear_everybody(ear):
+    ear.wait_for_policies(BEST_EFFORT)
+
+
+@pytest.mark.parametrize('policy', [RELIABLE, BEST_EFFORT])
+def test_it_is_as_reliable_as_the_publisher_that_comes(ear, policy):
+    publisher = ear.offer(policy)
+    ear.wait_for_policies(policy)
+    ear.wait_for_hearing(publisher, 'camera')
+
+
+def test_it_is_as_reliable_as_the_publisher_that_was_there(nodes, spin_until):
+    listener, speaker = nodes
+    publisher = speaker.create_publisher(
+        Header, 'topic', QoSProfile(depth=10, reliability=RELIABLE))
+    spin_until([listener, speaker],
+               lambda: listener.get_publishers_info_by_topic('/topic'), 'the publisher')
+    ear = Ear(listener, speaker, spin_until, 'topic')
+    ear.wait_for_policies(RELIABLE)
+    ear.wait_for_hearing(publisher, 'camera')
+    ear.subscription.destroy()
+
+
+def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
+    reliable = ear.offer(RELIABLE)
+    ear.wait_for_policies(RELIABLE)
+    best_effort = ear.offer(BEST_EFFORT)
+    ear.wait_for_policies(BEST_EFFORT)
+    ear.wait_for_hearing(best_effort, 'best effort')
+    ear.wait_for_hearing(reliable, 'reliable')
+
+
+def test_when_the_last_best_effort_publisher_leaves_it_is_reliable_again(ear):
+    reliable, best_effort = ear.offer(RELIABLE), ear.offer(BEST_EFFORT)
+    ear.wait_for_hearing(best_effort, 'best effort')
+    ear.withdraw(best_effort)
+    ear.wait_for_policies(RELIABLE)
+    ear.wait_for_hearing(reliable, 'reliable')
+
+
+def test_publishers_come_and_go_many_times(ear):
+    for turn in range(5):
+        for policy in (RELIABLE, BEST_EFFORT):
+            publisher = ear.offer(policy)
+            ear.wait_for_policies(policy)
+            ear.wait_for_hearing(publisher, f'{policy.name} {turn}')
+            ear.withdraw(publisher)
+
+
+def test_destroyed_it_hears_nobody_and_stays_away(ear):
+    publisher = ear.offer(RELIABLE)
+    ear.wait_for_hearing(publisher, 'camera')
+    ear.subscription.destroy()
+    ear.subscription.destroy()
+    ear.wait_for_policies()
+    another = ear.offer(BEST_EFFORT)
+    ear.wait(lambda: len(ear._listener.get_publishers_info_by_topic(ear.topic)) == 2,
+             'the other publisher')
+    assert ear.policies() == []
+    ear.withdraw(another)
+
+
+@pytest.mark.parametrize('overridden', [RELIABLE, BEST_EFFORT])
+def test_a_users_override_holds_against_all_publishers(make_node, spin_until, overridden):
+    listener = make_node('listener', parameter_overrides=[Parameter(
+        'qos_overrides./listener/topic.subscription.reliability',
+        value=overridden.name.lower())])
+    ear = Ear(listener, make_node('speaker'), spin_until)
+    for policy in (RELIABLE, BEST_EFFORT):
+        publisher = ear.offer(policy)
+        ear.wait(lambda: len(listener.get_publishers_info_by_topic(ear.topic)) == 1,
+                 'the publisher')
+        if overridden == BEST_EFFORT or policy == RELIABLE:
+            ear.wait_for_hearing(publisher, policy.name)
+        ear.wait_for_policies(overridden)
+        ear.withdraw(publisher)
+        ear.wait(lambda: not listener.get_publishers_info_by_topic(ear.topic), 'its end')
+    ear.subscription.destroy()

@@ -1,0 +1,335 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import gc
+import threading
+import time
+import weakref
+from concurrent.futures import CancelledError
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError
+from cliploc_ros.ros.worker import LatestOnly, Retrying, Worker
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def reports():
+    return []
+
+
+@pytest.fixture
+def worker(reports):
+    worker = Worker(reports.append)
+    yield worker
+    worker.stop()
+
+
+class Gate:
+    """A task that runs until it is let through."""
+
+    def __init__(self):
+        self.entered, self._open = threading.Event(), threading.Event()
+
+    def __call__(self, result=None):
+        self.entered.set()
+        assert self._open.wait(PATIENCE_S)
+        return result
+
+    def open(self):
+        self._open.set()
+
+    def hold(self, worker):
+        """Keep a worker busy; return the future."""
+        future = worker.submit(self)
+        assert self.entered.wait(PATIENCE_S)
+        return future
+
+
+@pytest.fixture
+def gate(worker):
+    gate = Gate()
+    yield gate
+    gate.open()
+
+
+def fail_with(error):
+    def task():
+        raise error
+    return task
+
+
+def test_results_come_back(worker):
+    assert worker.run(lambda: 6 * 7) == 42
+    assert worker.submit(lambda: None).result(PATIENCE_S) is None
+
+
+def test_tasks_run_in_their_order_in_one_other_thread(worker):
+    threads, order = [], []
+
+    def task(number):
+        threads.append(threading.get_ident())
+        order.append(number)
+    futures = [worker.submit(lambda number=number: task(number)) for number in range(50)]
+    for future in futures:
+        future.result(PATIENCE_S)
+    assert order == list(range(50))
+    assert len(set(threads)) == 1 and threads[0] != threading.get_ident()
+
+
+def test_bad_input_passes_as_it_is(worker, reports):
+    error = ModelError('weights.pt: truncated')
+    with pytest.raises(ModelError) as raised:
+        worker.run(fail_with(error))
+    assert raised.value is error
+    assert reports == []
+
+
+@pytest.mark.parametrize('error', [
+    ValueError('shapes differ'), KeyError('boxes'), MemoryError('2 GiB'), RuntimeError('CUDA'),
+    AssertionError('')], ids=repr)
+def test_a_defect_is_reported_with_its_traceback_and_survived(worker, reports, error):
+    with pytest.raises(InternalError, match='traceback is in the log') as raised:
+        worker.run(fail_with(error))
+    assert type(error).__name__ in str(raised.value) and str(error) in str(raised.value)
+    assert raised.value.__cause__ is error
+    assert len(reports) == 1
+    assert 'Traceback' in reports[0] and 'raise error' in reports[0]
+    assert worker.run(lambda: 'alive') == 'alive'
+
+
+def test_stop_of_an_idle_worker_is_immediate_and_final(worker):
+    worker.run(lambda: None)
+    worker.stop()
+    for use in (worker.submit, worker.run):
+        with pytest.raises(StoppedError, match='shutting down'):
+            use(lambda: None)
+    worker.stop()
+
+
+def test_stop_does_not_wait_for_a_long_task_but_drops_what_waits(worker, gate):
+    running = gate.hold(worker)
+    ran = []
+    waiting = [worker.submit(lambda: ran.append('never')) for _ in range(3)]
+    start = time.monotonic()
+    worker.stop()
+    assert time.monotonic() - start < 2.0
+    assert all(future.cancelled() for future in waiting)
+    with pytest.raises(CancelledError):
+        waiting[0].result(0)
+    gate.open()
+    assert running.result(PATIENCE_S) is None
+    worker.stop()
+    assert ran == []
+
+
+class Announcing(Worker):
+    """Says when a task is in the queue."""
+
+    def __init__(self, report):
+        super().__init__(report)
+        self.queued = threading.Event()
+
+    def submit(self, task):
+        future = super().submit(task)
+        self.queued.set()
+        return future
+
+
+def test_whoever_waits_in_run_learns_that_the_node_stops(gate):
+    worker = Announcing(print)
+    gate.hold(worker)
+    worker.queued.clear()
+    learned = []
+
+    def ask():
+        try:
+            worker.run(lambda: None)
+        except CliplocError as error:
+            learned.append(error)
+    asker = threading.Thread(target=ask)
+    asker.start()
+    assert worker.queued.wait(PATIENCE_S)
+    worker.stop()
+    asker.join(PATIENCE_S)
+    assert [type(error) for error in learned] == [StoppedError]
+
+
+def test_a_task_that_ends_in_time_is_waited_for(worker):
+    entered = threading.Event()
+
+    def task():
+        entered.set()
+        threading.Event().wait(0.02)
+        return 'done'
+    future = worker.submit(task)
+    assert entered.wait(PATIENCE_S)
+    worker.stop()
+    assert future.result(0) == 'done'
+
+
+def test_only_the_newest_waits_while_the_worker_is_busy(worker, gate):
+    done = []
+    latest = LatestOnly(worker, done.append)
+    gate.hold(worker)
+    for item in range(100):
+        latest.offer(item)
+    assert latest.dropped == 99
+    gate.open()
+    worker.run(lambda: None)
+    assert done == [99]
+
+
+def test_an_item_that_comes_during_the_work_is_worked_on_next(worker, gate):
+    done = []
+
+    def work(item):
+        if item == 'first':
+            gate()
+        done.append(item)
+    latest = LatestOnly(worker, work)
+    latest.offer('first')
+    assert gate.entered.wait(PATIENCE_S)
+    latest.offer('second')
+    latest.offer('third')
+    gate.open()
+    worker.run(lambda: None)
+    assert done == ['first', 'third']
+    assert latest.dropped == 1
+
+
+def test_work_that_fails_does_not_end_the_flow(worker, reports):
+    done = []
+
+    def work(item):
+        if item < 0:
+            raise ValueError(item)
+        done.append(item)
+    latest = LatestOnly(worker, work)
+    for item in (1, -2, 3):
+        latest.offer(item)
+        worker.run(lambda: None)
+    assert done == [1, 3]
+    assert len(reports) == 1 and 'ValueError: -2' in reports[0]
+
+
+@given(st.lists(st.booleans(), max_size=40))
+def test_the_last_item_is_never_lost(pauses):
+    worker, done = Worker(print), []
+    latest = LatestOnly(worker, done.append)
+    for item, pause in enumerate(pauses):
+        latest.offer(item)
+        if pause:
+            worker.run(lambda: None)
+            assert done[-1] == item
+    worker.run(lambda: None)
+    worker.stop()
+    assert done == sorted(set(done))
+    assert done[-1:] == list(range(len(pauses)))[-1:]
+    assert len(done) + latest.dropped == len(pauses)
+
+
+def test_offers_of_many_threads_are_all_accounted_for(worker):
+    done, start = [], threading.Barrier(4)
+    latest = LatestOnly(worker, done.append)
+
+    def offer(first):
+        start.wait(PATIENCE_S)
+        for item in range(first, first + 250):
+            latest.offer(item)
+    threads = [threading.Thread(target=offer, args=(250 * number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    worker.run(lambda: None)
+    assert len(done) + latest.dropped == 1000
+    assert len(set(done)) == len(done)
+    assert done[-1] % 250 == 249, 'the last item of some thread comes last'
+
+
+class Maker:
+    """Fails a number of times, then makes; remembers when it was asked [s]."""
+
+    def __init__(self, failures, error=ModelError):
+        self._failures, self._error, self.attempts = failures, error, []
+
+    def __call__(self):
+        self.attempts.append(time.monotonic())
+        if len(self.attempts) <= self._failures:
+            raise self._error(f'attempt {len(self.attempts)}')
+        return object()
+
+
+def test_what_was_made_is_kept():
+    make = Maker(failures=0)
+    kept = Retrying(make, pause_s=3600.0)
+    assert make.attempts == []
+    assert kept.get() is kept.get()
+    assert len(make.attempts) == 1
+
+
+def test_something_false_is_made_once_too():
+    made = []
+    kept = Retrying(lambda: made.append(1))
+    assert kept.get() is None and kept.get() is None
+    assert made == [1]
+
+
+def test_after_a_failure_it_is_made_anew():
+    make = Maker(failures=2)
+    retrying = Retrying(make)
+    for attempt in (1, 2):
+        with pytest.raises(ModelError, match=f'attempt {attempt}'):
+            retrying.get()
+    assert retrying.get() is retrying.get()
+    assert len(make.attempts) == 3
+
+
+def test_in_the_pause_the_same_error_comes_without_an_attempt():
+    make = Maker(failures=1)
+    retrying = Retrying(make, pause_s=3600.0)
+    for _ in range(5):
+        with pytest.raises(ModelError, match='attempt 1'):
+            retrying.get()
+    assert len(make.attempts) == 1
+
+
+def test_in_the_pause_nothing_is_kept_of_those_who_asked():
+    retrying, images = Retrying(Maker(failures=1), pause_s=3600.0), []
+
+    def ask():
+        image = threading.Event()  # anything that can be referred to weakly
+        images.append(weakref.ref(image))
+        with pytest.raises(ModelError):
+            retrying.get()
+    for _ in range(5):
+        ask()
+    gc.collect()
+    # the first one's traceback tells where the error is from
+    assert [image() for image in images[1:]] == [None] * 4
+
+
+def test_after_the_pause_it_is_tried_again(wait):
+    pause_s, make, made = 0.05, Maker(failures=2), []
+    retrying = Retrying(make, pause_s)
+
+    def attempt():
+        try:
+            made.append(retrying.get())
+        except ModelError:
+            time.sleep(0.001)
+    wait(lambda: made, 'the third attempt', attempt)
+    first, second, third = make.attempts
+    assert second - first >= pause_s and third - second >= pause_s
+
+
+def test_a_defect_of_the_maker_is_no_reason_to_pause():
+    make = Maker(failures=1, error=ValueError)
+    retrying = Retrying(make, pause_s=3600.0)
+    with pytest.raises(ValueError, match='attempt 1'):
+        retrying.get()
+    assert retrying.get() is retrying.get()
