@@ -199,7 +199,11 @@ def markdown_table(table: Iterable[ParameterRow]) -> str:
 
 def yaml_defaults(node_name: str, table: Iterable[ParameterRow]) -> str:
     """Return a parameter file with every default, each after a comment in prose."""
-    lines = [f'# Every parameter of the {node_name} node at its default.', '/**:',
+    lines = ['# SPDX-FileCopyrightText: 2026 the cliploc_ros authors',
+             '# SPDX-License-Identifier: Apache-2.0',
+             f'# Every parameter of the {node_name} node at its default.',
+             '# Written by script/document from cliploc_ros/ros/tables.py: copy it to change it.',
+             '/**:',
              '  ros__parameters:']
     for row in table:
         unit = f' [{row.unit}]' if row.unit else ''

@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The README and config/ say what the code declares."""
+
+import importlib.machinery
+import importlib.util
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+
+PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope='module')
+def document():
+    """The script that writes the documents, as a module."""
+    loader = importlib.machinery.SourceFileLoader('document', str(PROJECT / 'script/document'))
+    module = importlib.util.module_from_spec(
+        importlib.util.spec_from_loader('document', loader))
+    loader.exec_module(module)
+    return module
+
+
+def test_documents_are_what_the_tables_say(document):
+    for path, text in document.documents().items():
+        assert path.read_text() == text, f'{path} is out of date: run script/document'
+
+
+@pytest.mark.parametrize('name', ['detector', 'relocalizer'])
+def test_the_readme_has_the_tables(name):
+    readme = (PROJECT / 'README.md').read_text()
+    rows = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}[name]
+    table = readme.split(f'<!-- {name} parameters -->')[1].split('<!-- end of')[0]
+    assert [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')] == [
+        row.name for row in rows]
+
+
+def test_the_default_parameters_are_valid_together():
+    relocalizer_options({row.name: row.default for row in RELOCALIZER})
+
+
+def test_the_readme_names_every_topic_and_service(document):
+    readme = (PROJECT / 'README.md').read_text()
+    for name in ('image', 'image/compressed', 'camera_info', 'detections', '~/pose',
+                 'initialpose', '~/hypotheses', '~/relocalize',
+                 'reinitialize_global_localization'):
+        assert f'`{name}`' in readme
+
+
+@pytest.mark.parametrize('name', ['detector', 'relocalizer'])
+def test_config_files_hold_every_default(name):
+    tree = yaml.safe_load((PROJECT / f'config/{name}.yaml').read_text())
+    rows = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}[name]
+    assert tree['/**']['ros__parameters'] == {row.name: row.default for row in rows}
