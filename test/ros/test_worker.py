@@ -309,8 +309,8 @@ def test_in_the_pause_nothing_is_kept_of_those_who_asked():
     for _ in range(5):
         ask()
     gc.collect()
-    # the first one's traceback tells where the error is from
-    assert [image() for image in images[1:]] == [None] * 4
+    # one traceback tells where the error is from
+    assert sum(image() is not None for image in images) <= 1
 
 
 def test_after_the_pause_it_is_tried_again(wait):
