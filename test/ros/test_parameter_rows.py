@@ -110,9 +110,11 @@ def test_what_is_allowed_reads_well(row, allowed):
 
 
 def test_the_yaml_file_in_full():
-    assert yaml_defaults('probe', (LENGTH, CHOICE, SWITCH, MOUNT)) == (
-        '# Every parameter of the probe node at its default.\n'
-        '/**:\n'
+    heading, body = yaml_defaults('probe', (LENGTH, CHOICE, SWITCH, MOUNT)).split('/**:', 1)
+    assert all(line.startswith('#') for line in heading.splitlines())
+    assert '# Every parameter of the probe node at its default.\n' in heading
+    assert body == (
+        '\n'
         '  ros__parameters:\n'
         '    # How long. [m] Allowed: 0 to 2.\n'
         '    length: 0.5\n'
