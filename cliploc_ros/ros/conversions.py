@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages to values and back. Nothing here trusts a message."""
 
+import math
+
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -113,7 +115,7 @@ def detections_from_msg(msg: Detection2DArray) -> Detections:
     A detection without any class keeps the empty name, which no landmark has.
     """
     best = [max((result.hypothesis for result in detection.results),
-                key=lambda hypothesis: hypothesis.score, default=ObjectHypothesis())
+                key=_confidence, default=ObjectHypothesis())
             for detection in msg.detections]
     boxes = [(box.center.position.x, box.center.position.y, box.size_x, box.size_y)
              for box in (detection.bbox for detection in msg.detections)]
@@ -122,6 +124,11 @@ def detections_from_msg(msg: Detection2DArray) -> Detections:
         np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
         tuple(hypothesis.class_id for hypothesis in best),
         np.array([hypothesis.score for hypothesis in best], dtype=np.float64))
+
+
+def _confidence(hypothesis: ObjectHypothesis) -> float:
+    """Return a score to sort by; NaN comes last."""
+    return hypothesis.score if not math.isnan(hypothesis.score) else -math.inf
 
 
 def detections_to_msg(detections: Detections, header: Header) -> Detection2DArray:

@@ -75,9 +75,9 @@ class ParameterRow:
         if isinstance(self.default, float) and type(value) is int:
             value = float(value)
         if isinstance(self.default, list):
-            value = [float(item) for item in value] if _is_number_list(value) else value
-            if not isinstance(value, list) or len(value) != len(self.default):
-                raise OptionsError(f'{self.name}: must be {len(self.default)} numbers')
+            if not _is_number_list(value) or len(value) != len(self.default):
+                raise OptionsError(f'{self.name}: must be {len(self.default)} finite numbers')
+            value = [float(item) for item in value]
         if type(value) is not type(self.default):
             raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
                                f'not {type(value).__name__} ({value!r:.60})')
@@ -92,7 +92,7 @@ class ParameterRow:
 
 def _is_number_list(value: Any) -> bool:
     return (not isinstance(value, str | bytes) and isinstance(value, Iterable)
-            and all(isinstance(item, int | float) and math.isfinite(item) for item in value))
+            and all(type(item) in (int, float) and math.isfinite(item) for item in value))
 
 
 class NodeParameters:

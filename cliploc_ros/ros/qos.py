@@ -23,8 +23,11 @@ SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                      reliability=ReliabilityPolicy.RELIABLE)
 
 
-def overridable() -> QoSOverridingOptions:
-    """Return the options that let a user override history, depth, reliability, durability."""
-    return QoSOverridingOptions(policy_kinds=(
-        QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
-        QoSPolicyKind.DURABILITY))
+_OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
+                QoSPolicyKind.DURABILITY)
+
+
+def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
+    """Return the options that let a user override all policies but some."""
+    return QoSOverridingOptions(
+        policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])

@@ -9,6 +9,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSPolicyKind
 from rclpy.subscription import Subscription
 
 from cliploc_ros.ros.qos import overridable
@@ -24,6 +25,7 @@ class AdaptiveSubscription:
     Parameters
     ----------
     node : Node
+        Made with automatically_declare_parameters_from_overrides=True.
     message_type : type
     topic : str
     callback : callable
@@ -43,6 +45,9 @@ class AdaptiveSubscription:
         self._callback = callback
         self._profile = profile
         self._group = group
+        # What a user sets stays; else the parameter must not be declared, or it would stay too.
+        self._overridden = node.has_parameter(
+            f'qos_overrides.{self._topic}.subscription.reliability')
         self._reliability = self._offered()
         self._subscription: Subscription | None = self._create()
 
@@ -64,14 +69,15 @@ class AdaptiveSubscription:
                              durability=self._profile.durability, reliability=self._reliability)
         return self._node.create_subscription(
             self._message_type, self._topic, self._callback, profile, callback_group=self._group,
-            qos_overriding_options=overridable(),
+            qos_overriding_options=overridable(
+                *(() if self._overridden else (QoSPolicyKind.RELIABILITY,))),
             event_callbacks=SubscriptionEventCallbacks(
                 matched=self._adapt, incompatible_qos=self._adapt))
 
     def _adapt(self, _: Any) -> None:
         """Listen anew if the publishers that are there now offer something else."""
         offered = self._offered()
-        if self._subscription is None or offered == self._reliability:
+        if self._overridden or self._subscription is None or offered == self._reliability:
             return
         former, self._reliability = self._subscription, offered
         self._subscription = self._create()

@@ -129,7 +129,8 @@ class Retrying[T]:
         if self._made:
             return self._made[0]
         if self._error is not None and time.monotonic() - self._failed_at < self._pause_s:
-            raise self._error
+            # a traceback grows with every raise, and would keep what its callers hold
+            raise self._error.with_traceback(None)
         try:
             self._made.append(self._make())
         except CliplocError as error:

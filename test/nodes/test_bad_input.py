@@ -104,7 +104,7 @@ def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
     ('timeout_s', -1.0, 'must be'),
     ('matching', 'clip', 'read-only'),
     ('base_from_camera', [1.0] * 7, 'not of unit length'),
-    ('base_from_camera', [NAN] * 7, 'must be 7 numbers'),
+    ('base_from_camera', [NAN] * 7, 'must be 7 finite numbers'),
     ('map.frame_id', 'other', ''),
 ])
 def test_bad_parameters_at_run_time(relocalizer, tester, name, value, reason):

@@ -77,9 +77,9 @@ def test_given_values_are_taken_whole_numbers_too(declare):
     ({'ratio': '.nan'}, 'ratio: nan must be 0 to 1'),
     ({'ratio': 'half'}, 'ratio: must be of type float, not str'),
     ({'mode': 'willd'}, "did you mean 'wild'?); mend it and start again"),
-    ({'span': '[1.0]'}, 'span: must be 2 numbers'),
-    ({'span': '[1.0, .nan]'}, 'span: must be 2 numbers'),
-    ({'span': "['0', '1']"}, 'span: must be 2 numbers'),
+    ({'span': '[1.0]'}, 'span: must be 2 finite numbers'),
+    ({'span': '[1.0, .nan]'}, 'span: must be 2 finite numbers'),
+    ({'span': "['0', '1']"}, 'span: must be 2 finite numbers'),
     ({'low': 6}, 'low: above high')])
 def test_a_bad_start_is_told_until_it_is_mended(declare, values, reason):
     _, parameters = declare(given(**values))
@@ -118,7 +118,7 @@ def test_changes_at_run_time(declare):
 @pytest.mark.parametrize(('values', 'reason'), [
     ({'low': -1}, 'low: -1 must be 0 to 100'), ({'low': 6}, 'low: above high'),
     ({'low': 2, 'high': 1}, 'low: above high'), ({'ratio': float('nan')}, 'ratio: nan'),
-    ({'span': [1.0]}, 'span: must be 2 numbers'), ({'span': [1.0, float('inf')]}, 'span: must'),
+    ({'span': [1.0]}, 'span: must be 2 finite numbers'), ({'span': [1.0, float('inf')]}, 'span: must'),
     ({'ratio': 'half'}, 'Wrong parameter type'), ({'mode': 'wild'}, 'read-only'),
     ({'use_sim_time': False, 'high': 0}, 'low: above high')])
 def test_a_refused_change_changes_nothing(declare, values, reason):

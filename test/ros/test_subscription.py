@@ -130,9 +130,10 @@ def test_destroyed_it_hears_nobody_and_stays_away(ear):
 
 @pytest.mark.parametrize('overridden', [RELIABLE, BEST_EFFORT])
 def test_a_users_override_holds_against_all_publishers(make_node, spin_until, overridden):
-    listener = make_node('listener', parameter_overrides=[Parameter(
-        'qos_overrides./listener/topic.subscription.reliability',
-        value=overridden.name.lower())])
+    listener = make_node(
+        'listener', automatically_declare_parameters_from_overrides=True, parameter_overrides=[
+            Parameter('qos_overrides./listener/topic.subscription.reliability',
+                      value=overridden.name.lower())])
     ear = Ear(listener, make_node('speaker'), spin_until)
     for policy in (RELIABLE, BEST_EFFORT):
         publisher = ear.offer(policy)
