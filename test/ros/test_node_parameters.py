@@ -118,7 +118,8 @@ def test_changes_at_run_time(declare):
 @pytest.mark.parametrize(('values', 'reason'), [
     ({'low': -1}, 'low: -1 must be 0 to 100'), ({'low': 6}, 'low: above high'),
     ({'low': 2, 'high': 1}, 'low: above high'), ({'ratio': float('nan')}, 'ratio: nan'),
-    ({'span': [1.0]}, 'span: must be 2 finite numbers'), ({'span': [1.0, float('inf')]}, 'span: must'),
+    ({'span': [1.0]}, 'span: must be 2 finite numbers'),
+    ({'span': [1.0, float('inf')]}, 'span: must'),
     ({'ratio': 'half'}, 'Wrong parameter type'), ({'mode': 'wild'}, 'read-only'),
     ({'use_sim_time': False, 'high': 0}, 'low: above high')])
 def test_a_refused_change_changes_nothing(declare, values, reason):

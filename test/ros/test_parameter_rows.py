@@ -61,12 +61,15 @@ def test_good_values_come_back_in_the_parameters_type(row, value, validated):
     (POSITIVE, math.nan, 'positive: nan must be >= 0'),
     (SWITCH, 1, 'switch: must be of type bool, not int'),
     (SWITCH, 'true', 'switch: must be of type bool, not str'),
-    (MOUNT, [], 'mount: must be 2 finite numbers'), (MOUNT, [1.0], 'mount: must be 2 finite numbers'),
+    (MOUNT, [], 'mount: must be 2 finite numbers'),
+    (MOUNT, [1.0], 'mount: must be 2 finite numbers'),
     (MOUNT, [1.0, 2.0, 3.0], 'mount: must be 2 finite numbers'),
     (MOUNT, [1.0, math.nan], 'mount: must be 2 finite numbers'),
     (MOUNT, [1.0, -math.inf], 'mount: must be 2 finite numbers'),
-    (MOUNT, ['1', '2'], 'mount: must be 2 finite numbers'), (MOUNT, '12', 'mount: must be 2 finite numbers'),
-    (MOUNT, b'12', 'mount: must be 2 finite numbers'), (MOUNT, 1.0, 'mount: must be 2 finite numbers'),
+    (MOUNT, ['1', '2'], 'mount: must be 2 finite numbers'),
+    (MOUNT, '12', 'mount: must be 2 finite numbers'),
+    (MOUNT, b'12', 'mount: must be 2 finite numbers'),
+    (MOUNT, 1.0, 'mount: must be 2 finite numbers'),
     (MOUNT, None, 'mount: must be 2 finite numbers')])
 def test_a_bad_value_is_refused_by_name_and_with_what_is_allowed(row, value, message):
     with pytest.raises(OptionsError) as raised:
