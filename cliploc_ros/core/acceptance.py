@@ -2,9 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether to believe the best pose. A wrong pose is worse than none."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cliploc_ros.core.options import RelocalizerOptions
+
+# Boxes that overlap more than this show one object, detected twice.
+_SAME_BOX_IOU = 0.8
+# Fewer samples have not looked for rivals: the margin over them would mean nothing.
+_MIN_ITERATIONS = 500
+
+
+@dataclass(frozen=True)
+class Match:
+    """A detection explained by a landmark: row of the detection, row in the map, IoU."""
+
+    detection: int
+    landmark: int
+    iou: float
+
+
+@dataclass(frozen=True)
+class Support:
+    """How many objects speak for a pose, and the sum of their IoUs."""
+
+    inliers: int
+    score: float
 
 
 @dataclass(frozen=True)
@@ -13,44 +39,72 @@ class Evidence:
 
     Parameters
     ----------
-    ious : tuple of float
-        IoU of each inlier.
-    landmarks : tuple of int
-        The landmark that each inlier shows.
+    inliers : int
+        Objects that the best explains.
+    score : float
+        Sum of their IoUs.
     rival_score : float
-        Score of the best hypothesis elsewhere; 0 when there is none.
+        The same of the best hypothesis elsewhere; 0 when there is none.
+    coverage : float
+        The share of its samples that the search tried, 0 to 1.
     """
 
-    ious: tuple[float, ...]
-    landmarks: tuple[int, ...]
+    inliers: int
+    score: float
     rival_score: float
+    coverage: float = 1.0
+
+    @property
+    def strength(self) -> float:
+        """Return the score plus twice its margin over the best hypothesis elsewhere."""
+        return self.score + 2.0 * (self.score - self.rival_score)
 
 
-def one_to_one(evidence: Evidence) -> tuple[int, float]:
-    """Return the number of landmarks seen and the sum of each one's best IoU.
+def support(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> Support:
+    """Return what speaks for a pose, each object once.
 
-    Several boxes on one landmark say no more than the best of them.
+    Several boxes on one landmark, and several landmarks behind one box, say no more than the
+    best of them.
+
+    Parameters
+    ----------
+    matches : sequence of Match
+    bboxes_xyxy : ndarray (n, 4)
+        The boxes that the matches count [px].
     """
-    best: dict[int, float] = {}
-    for landmark, iou in zip(evidence.landmarks, evidence.ious, strict=True):
-        best[landmark] = max(iou, best.get(landmark, 0.0))
-    return len(best), sum(best.values())
+    taken: list[Match] = []
+    for match in sorted(matches, key=lambda match: -match.iou):
+        boxes = bboxes_xyxy[[other.detection for other in taken]]
+        if match.landmark in [other.landmark for other in taken]:
+            continue
+        if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
+            continue
+        taken.append(match)
+    return Support(len(taken), sum(match.iou for match in taken))
 
 
-def strength(evidence: Evidence) -> float:
-    """Return the one-to-one score plus twice its margin over the best hypothesis elsewhere."""
-    _, score = one_to_one(evidence)
-    return score + 2.0 * (sum(evidence.ious) - evidence.rival_score)
+def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the IoU of a box (4,) with others (m, 4)."""
+    others = others.reshape(-1, 4)
+    overlap = np.prod(np.maximum(0.0, np.minimum(box[2:], others[:, 2:])
+                                 - np.maximum(box[:2], others[:, :2])), axis=1)
+    areas = np.prod(others[:, 2:] - others[:, :2], axis=1)
+    return overlap / (np.prod(box[2:] - box[:2]) + areas - overlap)
 
 
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     """Return why the best hypothesis is not to be believed; empty if it is."""
-    inliers, _ = one_to_one(evidence)
-    if inliers < options.min_inliers:
-        return (f'only {inliers} landmarks explain detections, {options.min_inliers} are needed: '
-                'turn to where more objects are in view')
-    found = strength(evidence)
-    if found < options.min_evidence:
-        return (f'ambiguous: evidence {found:.2f} is below {options.min_evidence:.2f} '
-                f'(score {sum(evidence.ious):.2f}, best elsewhere {evidence.rival_score:.2f})')
+    if evidence.coverage < 1.0:
+        return (f'the search was cut short after {100 * evidence.coverage:.3g} %, so a better '
+                'pose may be elsewhere: raise time_budget_s, or sample (ransac, b-prosac)')
+    if options.algorithm != 'bf' and options.iterations < _MIN_ITERATIONS:
+        return (f'iterations = {options.iterations} are too few to know the rivals of a pose: '
+                f'set at least {_MIN_ITERATIONS}')
+    if evidence.inliers < options.min_inliers:
+        return (f'only {evidence.inliers} objects are where the map has them, '
+                f'{options.min_inliers} are needed: turn to where more are in view')
+    if evidence.strength < options.min_evidence:
+        return (f'ambiguous: evidence {evidence.strength:.2f} is below '
+                f'{options.min_evidence:.2f} (score {evidence.score:.2f}, best elsewhere '
+                f'{evidence.rival_score:.2f})')
     return ''

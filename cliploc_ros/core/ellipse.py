@@ -71,10 +71,12 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     cuts1, cuts2 = abs(e1) < 1.0, abs(e2) < 1.0
     if not (cuts1 or cuts2):
         return _nested_or_apart(h, k, a, b, ellipse_area)
-    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n.
+    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. Of
+    # two lines that fall together (both outlines touch twice) one looks to either side.
     along = r * r - s * s
-    sign1 = 1.0 if not cuts2 or e1 - e2 * along <= 0.0 else -1.0
-    sign2 = 1.0 if not cuts1 or e2 - e1 * along <= 0.0 else -1.0
+    side1, side2 = e1 - e2 * along, e2 - e1 * along
+    sign1 = 1.0 if not cuts2 or side1 <= 0.0 else -1.0
+    sign2 = 1.0 if not cuts1 or side2 < 0.0 or (side2 == 0.0 and along < 0.0) else -1.0
     # caps of the disc less those of the ellipse, one inside the other on every line
     surplus = 0.0
     width = sqrt(s * s * p * p + r * r * q * q)
@@ -84,7 +86,9 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     if cuts2:
         surplus += _cap_area(-sign2 * e2)
         surplus -= p * q * _cap_area(-sign2 * (r * k + s * h + e2) / width)
-    return ellipse_area + surplus if surplus < 0.0 else pi - surplus
+    # Where one lies in the other and touches it, the caps tell nothing: it is the smaller one.
+    shared = ellipse_area + surplus if surplus < 0.0 else pi - surplus
+    return max(0.0, min(pi, ellipse_area, shared))
 
 
 @compiled
@@ -124,7 +128,8 @@ def ellipse_iou(u: float, v: float, half_width: float, half_height: float,
     Returns
     -------
     float
-        0 to 1, exact to about 1e-9.
+        0 to 1, exact to about 1e-9; less where the outlines touch in one point and cross in two
+        others, all to the last digit.
     """
     half_x, half_y = sqrt(exx), sqrt(eyy)
     if abs(cx - u) >= half_width + half_x or abs(cy - v) >= half_height + half_y:

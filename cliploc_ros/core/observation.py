@@ -40,9 +40,9 @@ class Detections:
     def usable(self, width: int, height: int, limit: int) -> 'Detections':
         """Return the detections that can be localized with.
 
-        Boxes that are not finite, have no area or lie wholly outside the image are left out; of
-        the others the most confident ones stay, in their order. Boxes that reach over the
-        border stay as they are.
+        Boxes that are not finite, are thinner than a pixel, exceed all measure or lie wholly
+        outside the image are left out; of the others the most confident ones stay, in their
+        order. Boxes that reach over the border stay as they are.
 
         Parameters
         ----------
@@ -56,8 +56,9 @@ class Detections:
             sound = (np.isfinite(self.bboxes_xyxy).all(axis=1) & np.isfinite(self.scores)
                      & (right > left) & (bottom > top)
                      & (right > 0) & (bottom > 0) & (left < width) & (top < height))
-            # A box far larger than its image is a mistake of units.
+            # A box far larger than its image, or thinner than a pixel, is a mistake of units.
             sound &= (right - left < 3 * width) & (bottom - top < 3 * height)
+            sound &= (right - left >= 1.0) & (bottom - top >= 1.0)
         rows = np.nonzero(sound)[0]
         best = rows[np.argsort(-self.scores[rows], kind='stable')[:limit]]
         return self.select(np.sort(best))

@@ -4,13 +4,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core import association
-from cliploc_ros.core.acceptance import Evidence, refusal
+from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
 from cliploc_ros.core.association import Candidates
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.ellipsoid import project_ellipsoids
@@ -19,19 +19,10 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
 from cliploc_ros.core.scoring import Scene, Workspace, make_scene, verify
-from cliploc_ros.core.search import Leaders, search_exhaustively, search_samples
+from cliploc_ros.core.search import Leaders, Progress, search_exhaustively, search_samples
 from cliploc_ros.core.transforms import invert_transform, make_transform
 from cliploc_ros.core.uncertainty import box_scatter, pose_covariance
 from cliploc_ros.errors import OptionsError
-
-
-@dataclass(frozen=True)
-class Match:
-    """A detection explained by a landmark: row of the detection, row in the map, IoU."""
-
-    detection: int
-    landmark: int
-    iou: float
 
 
 @dataclass(frozen=True)
@@ -97,15 +88,6 @@ class Relocalization:
         return self.hypotheses[0].score if self.hypotheses else 0.0
 
 
-@dataclass
-class _Search:
-    """What one search left behind."""
-
-    leaders: Leaders = field(default_factory=Leaders.none_yet)
-    tried: int = 0
-    coverage: float = 1.0
-
-
 class Relocalizer:
     """Finds camera poses in one map.
 
@@ -138,8 +120,8 @@ class Relocalizer:
         shapes = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (3, 1))
         scene = make_scene(Camera(640, 480, 500.0, 500.0, 320.0, 240.0).normalize_bboxes(bboxes),
                            centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
-        search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet())
-        sum(search_exhaustively(scene, Leaders.none_yet()))
+        list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
+        list(search_exhaustively(scene, Leaders.none_yet()))
         project_ellipsoids(np.eye(4), centers, shapes)
 
     def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
@@ -177,7 +159,9 @@ class Relocalizer:
                 'correspondence candidates', stamp_ns=observation.stamp_ns)
         scene = make_scene(np.nan_to_num(bboxes, nan=1.0), self._map.centers, self._shapes,
                            potential, pairs, self._options.iou_threshold)
-        return self._conclude(observation, scene, self._search(scene, start), start)
+        leaders = Leaders.none_yet()
+        progress = self._search(scene, leaders, start)
+        return self._conclude(observation, scene, leaders, progress, start)
 
     def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
         """Return the candidates in the sampler's order, and the verification mask (n, L)."""
@@ -201,47 +185,48 @@ class Relocalizer:
             candidates = association.balanced_order(candidates)
         return candidates, potential
 
-    def _search(self, scene: Scene, start: float) -> _Search:
-        """Run the algorithm that the options name."""
+    def _search(self, scene: Scene, leaders: Leaders, start: float) -> Progress:
+        """Run the algorithm that the options name, as far as time allows."""
         options = self._options
-        search = _Search()
         if options.algorithm == 'bf':
-            slices = max(1, len(scene.pairs) - SAMPLE_SIZE + 1)
-            for done, tried in enumerate(search_exhaustively(scene, search.leaders), start=1):
-                search.tried += tried
-                search.coverage = done / slices
-                if time.perf_counter() - start > options.time_budget_s:
-                    break
-            return search
-        draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
-        seed = options.random_seed if options.random_seed >= 0 else None
-        samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-        search.tried = search_samples(scene, samples, search.leaders)
-        return search
+            search = search_exhaustively(scene, leaders)
+        else:
+            draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+            seed = options.random_seed if options.random_seed >= 0 else None
+            search = search_samples(
+                scene, draw(scene.pairs, options.iterations, np.random.default_rng(seed)), leaders)
+        progress = Progress(0, 1.0)
+        for step in search:
+            progress = step
+            if time.perf_counter() - start > options.time_budget_s:
+                break
+        return progress
 
-    def _conclude(self, observation: Observation, scene: Scene, search: _Search, start: float
-                  ) -> Relocalization:
+    def _conclude(self, observation: Observation, scene: Scene, leaders: Leaders,
+                  progress: Progress, start: float) -> Relocalization:
         """Turn the leaders into a result, and decide whether to believe the first."""
-        leaders, ranked = search.leaders, search.leaders.ranked()
+        ranked = leaders.ranked()
         if len(ranked) == 0:
             return Relocalization(False, 'no pose explains any three detections',
-                                  tried=search.tried, coverage=search.coverage,
+                                  tried=progress.tried, coverage=progress.coverage,
                                   search_ms=_elapsed_ms(start), stamp_ns=observation.stamp_ns)
         hypotheses = tuple(
             Hypothesis(invert_transform(make_transform(leaders.rotations[row],
                                                        leaders.translations[row])),
                        float(leaders.scores[row])) for row in ranked)
-        best = ranked[0]
-        matches = _matches(scene, leaders.rotations[best], leaders.translations[best])
-        covariance = _covariance(scene, leaders.samples[best], matches,
+        explained = [_matches(scene, leaders.rotations[row], leaders.translations[row])
+                     for row in ranked]
+        covariance = _covariance(scene, leaders.samples[ranked[0]], explained[0],
                                  hypotheses[0].map_from_camera)
-        evidence = Evidence(ious=tuple(match.iou for match in matches),
-                            landmarks=tuple(match.landmark for match in matches),
-                            rival_score=hypotheses[1].score if len(hypotheses) > 1 else 0.0)
-        reason = refusal(evidence, self._options)
-        return Relocalization(not reason, reason, hypotheses, matches, covariance, search.tried,
-                              int(leaders.iterations[best]), search.coverage, _elapsed_ms(start),
-                              observation.stamp_ns)
+        bboxes = observation.detections.bboxes_xyxy
+        supports = [support(matches, bboxes) for matches in explained]
+        reason = refusal(Evidence(
+            inliers=supports[0].inliers, score=supports[0].score,
+            rival_score=max((rival.score for rival in supports[1:]), default=0.0),
+            coverage=progress.coverage), self._options)
+        return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
+                              progress.tried, int(leaders.iterations[ranked[0]]),
+                              progress.coverage, _elapsed_ms(start), observation.stamp_ns)
 
 
 def _matches(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]

@@ -3,6 +3,7 @@
 """The search: hypotheses from minimal samples, and the best of them at distinct places."""
 
 from collections.abc import Iterator
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,20 @@ DISTINCT_DISTANCE_M = 0.5
 DISTINCT_ANGLE_DEG = 20.0
 # 1 + 2 cos(angle) is the trace of a rotation.
 _DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
+
+
+# A block of either search takes a few milliseconds, so that time limits hold.
+_SAMPLES_A_BLOCK = 100
+_WORK_A_BLOCK = 100_000
+# trying a hypothesis against passing over a sample that is not valid
+_WORK_A_HYPOTHESIS = 100
+
+
+class Progress(NamedTuple):
+    """How far a search is: hypotheses tried so far, and the share of its samples, 0 to 1."""
+
+    tried: int
+    coverage: float
 
 
 class Leaders(NamedTuple):
@@ -52,8 +67,9 @@ class Leaders(NamedTuple):
         return order[self.scores[order] >= 0.0]
 
 
-def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders) -> int:
-    """Try given minimal samples; return how many hypotheses there were.
+def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders
+                   ) -> Iterator[Progress]:
+    """Try given minimal samples, a block at a time.
 
     Parameters
     ----------
@@ -62,27 +78,50 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders) -
         Candidate numbers; rows of -1 are left out.
     leaders : Leaders
         Changed in place.
-    """
-    return _search_samples(scene, samples, leaders, Workspace.allocate(len(scene.bearings)))
 
-
-def search_exhaustively(scene: Scene, leaders: Leaders) -> Iterator[int]:
-    """Try every valid sample, a slice at a time; yield how many hypotheses each slice had.
-
-    Nothing is stored and the caller may stop between slices.
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
     """
     workspace = Workspace.allocate(len(scene.bearings))
     tried = 0
-    for first in range(len(scene.pairs) - 2):
-        count = _search_with_first(scene, first, tried, leaders, workspace)
-        tried += count
-        yield count
+    for start in range(0, len(samples), _SAMPLES_A_BLOCK):
+        stop = min(start + _SAMPLES_A_BLOCK, len(samples))
+        tried += _search_samples(scene, samples, start, stop, leaders, workspace)
+        yield Progress(tried, stop / len(samples))
+
+
+def search_exhaustively(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
+    """Try every valid sample, a block at a time. Nothing is stored.
+
+    Parameters
+    ----------
+    scene : Scene
+    leaders : Leaders
+        Changed in place.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    workspace = Workspace.allocate(len(scene.bearings))
+    count = len(scene.pairs)
+    cursor = np.array([0, 1, 2], dtype=np.int64)
+    tried = 0
+    while cursor[0] < count - 2:
+        tried += _search_from(scene, cursor, tried, leaders, workspace)
+        first, second, third = (int(row) for row in cursor)
+        left = (comb(max(0, count - first - 1), 3) + comb(max(0, count - second - 1), 2)
+                + max(0, count - third)) if first < count - 2 else 0
+        yield Progress(tried, 1.0 - left / comb(count, 3))
 
 
 @compiled
-def _search_samples(scene, samples, leaders, workspace):
+def _search_samples(scene, samples, start, stop, leaders, workspace):
     tried = 0
-    for t in range(samples.shape[0]):
+    for t in range(start, stop):
         if samples[t, 0] >= 0:
             tried += 1
             _try_sample(scene, samples[t], t + 1, leaders, workspace)
@@ -90,25 +129,37 @@ def _search_samples(scene, samples, leaders, workspace):
 
 
 @compiled
-def _search_with_first(scene, first, tried_before, leaders, workspace):
-    """Try every valid sample whose lowest candidate number is first."""
+def _search_from(scene, cursor, tried_before, leaders, workspace):
+    """Try the valid samples from a cursor on, for a bounded time; move the cursor behind them."""
     pairs = scene.pairs
+    count = pairs.shape[0]
     sample = np.empty(3, dtype=np.int64)
-    sample[0] = first
-    tried = 0
-    for second in range(first + 1, pairs.shape[0] - 1):
-        if pairs[second, 0] == pairs[first, 0] or pairs[second, 1] == pairs[first, 1]:
+    first, second, third = cursor[0], cursor[1], cursor[2]
+    tried, work = 0, 0
+    while first < count - 2 and work < _WORK_A_BLOCK:
+        if second >= count - 1:
+            first += 1
+            second, third = first + 1, first + 2
             continue
-        sample[1] = second
-        for third in range(second + 1, pairs.shape[0]):
-            if (pairs[third, 0] == pairs[first, 0] or pairs[third, 0] == pairs[second, 0]
-                    or pairs[third, 1] == pairs[first, 1]
-                    or pairs[third, 1] == pairs[second, 1]):
-                continue
-            sample[2] = third
+        work += 1
+        if third >= count or _clash(pairs, first, second):
+            second += 1
+            third = second + 1
+            continue
+        if not (_clash(pairs, first, third) or _clash(pairs, second, third)):
+            sample[0], sample[1], sample[2] = first, second, third
             tried += 1
+            work += _WORK_A_HYPOTHESIS + scene.potential_landmarks.shape[0]
             _try_sample(scene, sample, tried_before + tried, leaders, workspace)
+        third += 1
+    cursor[0], cursor[1], cursor[2] = first, second, third
     return tried
+
+
+@compiled
+def _clash(pairs, a, b):
+    """Tell whether two candidates share a detection or a landmark."""
+    return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
 
 
 @compiled

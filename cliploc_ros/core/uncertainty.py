@@ -15,6 +15,8 @@ _PRIOR_WEIGHT = 6.0
 # Errors of box and map are shared by neighbouring edges, so fewer are independent than counted.
 # Doubling the variance brings accepted poses of real TUM frames near their 95 % ellipsoids.
 _VARIANCE_INFLATION = 2.0
+# No box centre is known better than this on the plane z = 1: a twentieth of a pixel or so.
+_MIN_DEVIATION = 1e-4
 # Finite-difference steps of position [m] and rotation [rad].
 _STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
 # A direction the boxes do not fix is uncertain by this much, not infinitely: m^2 and rad^2.
@@ -73,7 +75,7 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
 
     jacobian = np.stack([(projections(step) - projections(-step)) / (2 * step.max())
                          for step in np.diag(_STEPS)], axis=1)
-    variances = _VARIANCE_INFLATION * (box_sizes.ravel() * scatter)**2
+    variances = _VARIANCE_INFLATION * np.maximum(box_sizes.ravel() * scatter, _MIN_DEVIATION)**2
     information = (jacobian.T @ (jacobian / variances[:, None])
                    + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
     covariance = np.linalg.inv(information)

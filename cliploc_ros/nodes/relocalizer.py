@@ -3,6 +3,7 @@
 """The relocalizer node: from image and detections to the robot's pose, when asked."""
 
 import time
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -71,6 +72,8 @@ class RelocalizerNode(WorkingNode):
         """Load map and network before the first request needs them."""
         start = time.monotonic()
         try:
+            if self._settings['base_frame'] and not any(self._settings['base_from_camera']):
+                self._base.listen()
             localizer = self._localizer.get()
             self.get_logger().info(f'ready after {time.monotonic() - start:.1f} s: '
                                    f'{localizer.description}')
@@ -97,6 +100,9 @@ class RelocalizerNode(WorkingNode):
             answer = self.worker.run(lambda: self._localize(frame))
         except CliplocError as error:
             answer = Answer(None, str(error))
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
         if answer.pose is not None:
             self._initial_pose.publish(answer.pose)
         self.get_logger().info(answer.message)
@@ -139,7 +145,7 @@ class RelocalizerNode(WorkingNode):
 
 def _summary(found: Relocalization) -> str:
     return (f'score {found.score:.2f}, {len(found.matches)} inliers, '
-            f'{found.tried} hypotheses')
+            f'{found.tried} hypotheses, {100 * found.coverage:.3g} % of the search')
 
 
 def main() -> NoReturn:

@@ -69,7 +69,9 @@ def _unpacked(msg: Image) -> NDArray[np.uint8]:
 def _decoded(msg: CompressedImage) -> NDArray[np.uint8]:
     data = np.frombuffer(msg.data, dtype=np.uint8)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        # EXIF may ask to turn the picture, but the intrinsics are those of the sensor.
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) \
+            if len(data) else None
     except cv2.error as error:
         raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
                          ) from error
@@ -117,9 +119,12 @@ def detections_from_msg(msg: Detection2DArray) -> Detections:
     best = [max((result.hypothesis for result in detection.results),
                 key=_confidence, default=ObjectHypothesis())
             for detection in msg.detections]
-    boxes = [(box.center.position.x, box.center.position.y, box.size_x, box.size_y)
-             for box in (detection.bbox for detection in msg.detections)]
-    x, y, width, height = np.array(boxes, dtype=np.float64).reshape(-1, 4).T
+    boxes = [(box.center.position.x, box.center.position.y, box.center.theta, box.size_x,
+              box.size_y) for box in (detection.bbox for detection in msg.detections)]
+    x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
+    # a turned box stands as the upright one around it; with theta 0 the sizes stay to the bit
+    cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
     return Detections(
         np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
         tuple(hypothesis.class_id for hypothesis in best),

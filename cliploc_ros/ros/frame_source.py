@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames from the wire: image, camera_info and detections of the same stamp."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,8 +21,8 @@ from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.pairing import ExactPairing
 from cliploc_ros.ros.subscription import AdaptiveSubscription
 
-# What may wait for its counterparts: a second of 1080p images, or slow detections of them.
-_MAX_WAITING = 60
+# What may wait for its counterparts: ten seconds of 30 Hz VGA images for a slow detector.
+_MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
 # A guess at what one detection holds in Python's memory.
@@ -64,6 +65,7 @@ class FrameSource:
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
         self._changed = threading.Condition()
+        self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
         self._listeners = 0
         self._newest: Frame | None = None
@@ -72,9 +74,9 @@ class FrameSource:
     def open(self) -> None:
         """Listen until closed as often as opened."""
         with self._changed:
-            self._listeners += 1
-            if self._listeners == 1:
+            if self._listeners == 0:
                 self._subscribe()
+            self._listeners += 1
 
     def close(self) -> None:
         """End what one open began; with the last one the subscriptions end."""
@@ -115,7 +117,8 @@ class FrameSource:
                 raise StoppedError('the node is shutting down')
             frame = self._newest_since(now)
             if frame is None:
-                raise NoFrameError(f'no fresh frame within {timeout_s:g} s: {self._why_none()}')
+                raise NoFrameError(f'no fresh frame within {timeout_s:g} s: '
+                                   f'{self._why_none(now)}')
             return frame
 
     def stop(self) -> None:
@@ -129,8 +132,7 @@ class FrameSource:
         return newest if newest is not None and newest.received_at >= moment else None
 
     def _subscribe(self) -> None:
-        self._pairing.clear()
-        self._newest = None
+        self._unsubscribe()  # what a failed attempt left behind
         for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
                                             ('detections', Detection2DArray, qos.DETECTIONS_IN)):
@@ -157,6 +159,7 @@ class FrameSource:
         with self._changed:
             if not self._listeners:
                 return
+            self._heard_at[name] = time.monotonic()
             complete = self._pairing.add(name, stamp_ns(msg.header.stamp),
                                          (msg, time.monotonic()), size)
             if complete is None:
@@ -168,16 +171,17 @@ class FrameSource:
             self._changed.notify_all()
         self._on_frame(frame)
 
-    def _why_none(self) -> str:
-        """Say what was missing."""
-        received = self._pairing.received
-        missing = [self._silence(name) for name in received if not received[name]]
+    def _why_none(self, since: float) -> str:
+        """Say what was missing since a moment of the monotonic clock."""
+        missing = [self._silence(name) for name in self._topics
+                   if self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
         stamps = ', '.join(f'{self._resolved(name)} {stamp / 1e9:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
         return (f'stamps never match (last seen: {stamps}): camera_info and detections must '
-                "carry their image's header")
+                "carry their image's header; if detections are merely late, the detector is too "
+                'slow for timeout_s')
 
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)

@@ -56,7 +56,7 @@ class BaseFrame:
         if any(mount):
             return invert_transform(transform_from_pose(np.array(mount[:3]),
                                                         np.array(mount[3:])))
-        self._listen()
+        self.listen()
         try:
             found = self._buffer.lookup_transform(camera_frame, base_frame, stamp,
                                                   Duration(seconds=timeout_s)).transform
@@ -66,7 +66,14 @@ class BaseFrame:
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
-    def _listen(self) -> None:
+    def listen(self) -> None:
+        """Begin to hear of transforms, so that those of the first image are known.
+
+        Raises
+        ------
+        FrameError
+            tf2 is not installed.
+        """
         if self._buffer is not None:
             return
         try:

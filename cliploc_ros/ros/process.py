@@ -9,6 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NoReturn
 
 import rclpy
@@ -63,7 +64,8 @@ def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
     """Execute callbacks until the process is told to end; no failure of one ends the node."""
     while node.context.ok():
         try:
-            executor.spin_once()
+            # rclpy loses the wake-up of a shutdown now and then: look up twice a second.
+            executor.spin_once(timeout_sec=0.5)
         except InvalidHandle:
             # A subscription was destroyed while rclpy gathered what to wait for: it gathers
             # again.
@@ -74,7 +76,10 @@ def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
 
 def run_node(make_node: Callable[[], WorkingNode]) -> NoReturn:
     """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
-    rclpy.init(args=sys.argv)
+    try:
+        rclpy.init(args=sys.argv)
+    except Exception as error:  # rcl raises its own types for arguments and for missing folders
+        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
     executor = MultiThreadedExecutor(num_threads=_THREADS)
     node = None
     try:
@@ -84,6 +89,10 @@ def run_node(make_node: Callable[[], WorkingNode]) -> NoReturn:
         _spin(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():
+            raise
+        # a signal came while the node was made
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
         if node is not None:
@@ -102,6 +111,7 @@ def _leave() -> NoReturn:
     seconds to take torch apart.
     """
     atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()
     os._exit(0)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A subscription that is as reliable as what it listens to."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -48,14 +49,19 @@ class AdaptiveSubscription:
         # What a user sets stays; else the parameter must not be declared, or it would stay too.
         self._overridden = node.has_parameter(
             f'qos_overrides.{self._topic}.subscription.reliability')
-        self._reliability = self._offered()
-        self._subscription: Subscription | None = self._create()
+        # Publishers come while others destroy, in another thread.
+        self._lock = threading.RLock()
+        self._subscription: Subscription | None = None
+        with self._lock:
+            self._reliability = self._offered()
+            self._subscription = self._create()
 
     def destroy(self) -> None:
         """Stop listening."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
+        with self._lock:
+            if self._subscription is not None:
+                self._node.destroy_subscription(self._subscription)
+                self._subscription = None
 
     def _offered(self) -> ReliabilityPolicy:
         """Return the most reliable policy that matches all publishers known now."""
@@ -76,9 +82,10 @@ class AdaptiveSubscription:
 
     def _adapt(self, _: Any) -> None:
         """Listen anew if the publishers that are there now offer something else."""
-        offered = self._offered()
-        if self._overridden or self._subscription is None or offered == self._reliability:
-            return
-        former, self._reliability = self._subscription, offered
-        self._subscription = self._create()
-        self._node.destroy_subscription(former)
+        with self._lock:
+            offered = self._offered()
+            if self._overridden or self._subscription is None or offered == self._reliability:
+                return
+            former, self._reliability = self._subscription, offered
+            self._subscription = self._create()
+            self._node.destroy_subscription(former)

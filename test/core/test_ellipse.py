@@ -57,6 +57,10 @@ def test_nearly_equal_ellipses_overlap_almost_wholly(a, b, nudge):
     ((5.0, 0.0), (1.0, 0.5), 0.0),               # apart
     ((1.0, 0.0), (1.0, 1.0), 2 * np.pi / 3 - np.sqrt(3) / 2),  # two circles at distance one
     ((0.0, 0.0), (2.0, 0.5), None),              # a cross: four common points
+    ((0.0, 0.0), (1.0, 0.2), 0.2 * np.pi),       # inside, touching at both ends
+    ((0.0, 0.0), (3.0, 1.0), np.pi),             # around, touching at both sides
+    ((0.4, 0.0), (0.6, 0.3), 0.18 * np.pi),      # inside, touching once
+    ((2.0, 0.0), (1.0, 0.5), 0.0),               # apart, touching once
 ])
 def test_shared_area_of_simple_cases(center, axes, shared):
     if shared is None:

@@ -29,7 +29,8 @@ def test_success_rates(method, office_map, queries, observe, thresholds):
     seeds = (0,) if algorithm == 'bf' else range(5)
     rates = np.mean([success_rates(
         office_map, queries.main_frames(), observe,
-        RelocalizerOptions(matching=matching, algorithm=algorithm, random_seed=seed))
+        RelocalizerOptions(matching=matching, algorithm=algorithm, random_seed=seed,
+                           iterations=500))
         for seed in seeds], axis=0)
     print(f'\n{method}: success {" / ".join(f"{rate:.2f}" for rate in rates)} at '
           '0.25 / 0.5 / 1 m')

@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether accepted poses are right, and whether their covariances are true."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance import Evidence, one_to_one, refusal, strength
+from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.transforms import pose_error
@@ -24,9 +28,9 @@ def pose_difference(estimate, truth):
 
 def test_accepted_poses_are_right_and_their_covariances_true(office_map, queries, observe,
                                                              thresholds):
-    relocalizer = Relocalizer(office_map, RelocalizerOptions())
     right, accepted, within = [], [], []
-    for frame in queries:
+    for frame, seed in product(queries, range(3)):
+        relocalizer = Relocalizer(office_map, RelocalizerOptions(random_seed=seed))
         result = relocalizer.relocalize([observe(frame)])
         near = result.solved and pose_error(result.map_from_camera, frame.map_from_camera)[0] < 1
         right.append(near)
@@ -46,23 +50,92 @@ def test_accepted_poses_are_right_and_their_covariances_true(office_map, queries
     assert low <= np.mean(within) <= high
 
 
+APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=np.float64)
+
+
 def test_several_boxes_on_one_landmark_count_once():
-    evidence = Evidence(ious=(0.5, 0.7, 0.6), landmarks=(3, 3, 4), rival_score=0.0)
-    assert one_to_one(evidence) == (2, pytest.approx(1.3))
+    found = support([Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)], APART)
+    assert (found.inliers, found.score) == (2, pytest.approx(1.3))
+
+
+def test_several_landmarks_behind_one_box_count_once():
+    boxes = np.array([[0, 0, 100, 100], [2, 0, 100, 100], [0, 0, 50, 50]], dtype=np.float64)
+    found = support([Match(0, 1, 0.5), Match(1, 2, 0.7), Match(2, 3, 0.6)], boxes)
+    assert (found.inliers, found.score) == (2, pytest.approx(1.3))
+
+
+def test_nothing_supports_nothing():
+    assert support([], APART).inliers == 0
 
 
 def test_evidence_is_score_and_twice_the_margin():
-    evidence = Evidence(ious=(0.8, 0.7), landmarks=(1, 2), rival_score=1.0)
-    assert strength(evidence) == pytest.approx(1.5 + 2 * 0.5)
+    assert Evidence(2, score=1.5, rival_score=1.0).strength == pytest.approx(1.5 + 2 * 0.5)
 
 
-@pytest.mark.parametrize(('inliers', 'rival', 'reason'), [
-    (3, 0.0, 'only 3 landmarks'), (5, 3.5, 'ambiguous'), (5, 1.0, '')])
-def test_refusal_names_its_reason(inliers, rival, reason):
-    evidence = Evidence((0.7,) * inliers, tuple(range(inliers)), rival)
-    answer = refusal(evidence, RelocalizerOptions())
+@pytest.mark.parametrize(('evidence', 'options', 'reason'), [
+    (Evidence(3, 2.5, 0.0), {}, 'only 3 objects'),
+    (Evidence(5, 3.5, 3.5), {}, 'ambiguous'),
+    (Evidence(5, 3.5, 1.0, coverage=0.5), {}, 'the search was cut short after 50 %'),
+    (Evidence(5, 3.5, 1.0), {'iterations': 100}, 'iterations = 100 are too few'),
+    (Evidence(5, 3.5, 1.0), {'iterations': 100, 'algorithm': 'bf'}, ''),
+    (Evidence(5, 3.5, 1.0), {}, ''),
+])
+def test_refusal_names_its_reason(evidence, options, reason):
+    answer = refusal(evidence, RelocalizerOptions(**options))
     assert answer.startswith(reason)
     assert bool(answer) == bool(reason)
+
+
+def garbage(rng, kind):
+    """Ten boxes that mean nothing: anywhere, nearly one, five of them twice, or the image."""
+    corners = rng.uniform((0, 0), (600, 440), (10, 2))
+    boxes = np.concatenate([corners, corners + rng.uniform(10, 200, (10, 2))], axis=1)
+    if kind == 'nearly one box':
+        boxes = boxes[:1] + rng.normal(0, 2, (10, 4))
+    elif kind == 'repeated boxes':
+        boxes = np.repeat(boxes[:5], 2, axis=0)
+    elif kind == 'the whole image':
+        boxes = np.array([[0.0, 0.0, 640.0, 480.0]]) + rng.normal(0, 5, (10, 4))
+    return boxes
+
+
+@pytest.mark.parametrize('kind', ['random boxes', 'nearly one box', 'repeated boxes',
+                                  'the whole image'])
+def test_garbage_is_hardly_ever_accepted(kind, office_map, rng, thresholds):
+    relocalizer = Relocalizer(office_map, RelocalizerOptions(matching='class',
+                                                             algorithm='ransac'))
+    classes = np.array(sorted(set(office_map.class_ids)))
+    accepted = 0
+    for _ in range(200):
+        detections = Detections(garbage(rng, kind), tuple(map(str, rng.choice(classes, 10))),
+                                np.full(10, 0.9)).usable(640, 480, 50)
+        accepted += relocalizer.relocalize([Observation(
+            Camera(640, 480, 535.4, 539.2, 320.1, 247.6), detections)]).accepted
+    print(f'\n{kind}: {accepted} of 200 garbage frames accepted')
+    assert accepted <= thresholds['trust']['garbage_accepted_of_200']
+
+
+def test_every_box_twice_is_no_more_evidence(office_map, queries, observe):
+    relocalizer = Relocalizer(office_map, RelocalizerOptions(iterations=2000))
+    wrong = 0
+    for frame in queries.main_frames():
+        once = observe(frame)
+        rows = np.repeat(np.arange(len(once.detections)), 2)
+        twice = Observation(once.camera, once.detections.select(rows), once.similarities[rows])
+        result = relocalizer.relocalize([twice])
+        wrong += result.accepted and pose_error(result.map_from_camera,
+                                                frame.map_from_camera)[0] > 1.0
+    assert wrong == 0
+
+
+def test_a_search_cut_short_is_refused(office_map, queries, observe):
+    relocalizer = Relocalizer(office_map, RelocalizerOptions(
+        matching='class', algorithm='bf', time_budget_s=0.0))
+    results = [relocalizer.relocalize([observe(frame)]) for frame in queries.main_frames()]
+    cut = [result for result in results if result.coverage < 1.0]
+    assert len(cut) > 10
+    assert not any(result.accepted for result in cut)
+    assert max(result.search_ms for result in results) < 500
 
 
 def test_covariance_is_that_of_simulated_boxes(rng):
