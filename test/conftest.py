@@ -3,6 +3,7 @@
 """What all tests share: the data beside the project, a ROS domain of their own, the counts."""
 
 import os
+import signal
 import socket
 from pathlib import Path
 
@@ -43,6 +44,8 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Keep the tests' nodes, which inherit the environment, away from every other node."""
+    # A shell lets what it runs in the background ignore Ctrl-C, and so would our processes.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, config.ros_domain_reservation = reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

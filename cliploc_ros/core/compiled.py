@@ -2,10 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the numerical kernels are compiled: one decorator, so that all share its settings."""
 
+import logging
+import pickle
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+logger = logging.getLogger(__name__)
+_kernels: list[Any] = []
+# What numba raises for a cache that was cut off by a power cut, or a disk that is full.
+_CACHE_ERRORS = (OSError, EOFError, pickle.UnpicklingError)
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -16,7 +25,39 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     settings = {'nogil': True, 'error_model': 'numpy'}
     try:
-        return njit(cache=True, **settings)(function)
+        kernel = njit(cache=True, **settings)(function)
     except RuntimeError:
         # Neither the package's folder nor the user's cache can be written: compile each time.
-        return njit(**settings)(function)
+        kernel = njit(**settings)(function)
+    _kernels.append(kernel)
+    return kernel
+
+
+def warm_up(run: Callable[[], object]) -> None:
+    """Run what calls the kernels, and mend their cache on disk where it is damaged.
+
+    Parameters
+    ----------
+    run : callable
+        Calls every kernel that will be needed.
+    """
+    for _ in range(len(_kernels) + 1):  # each kernel has a file of its own to be damaged
+        try:
+            run()
+            return
+        except _CACHE_ERRORS as error:
+            logger.warning('compiled kernels could not be cached or read: %r; compiling anew',
+                           error)
+            _forget_cache()
+    run()
+
+
+def _forget_cache() -> None:
+    """Delete this package's compiled kernels from disk."""
+    for kernel in _kernels:
+        folder = kernel.stats.cache_path
+        if folder:
+            module = Path(kernel.py_func.__code__.co_filename).stem
+            for file in Path(folder).glob(f'{module}.*.nb[ic]'):
+                with suppress(OSError):
+                    file.unlink()

@@ -13,6 +13,7 @@ from cliploc_ros.core import association
 from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
 from cliploc_ros.core.association import Candidates
 from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -112,6 +113,10 @@ class Relocalizer:
 
     def warm_up(self) -> None:
         """Compile the kernels, or read them from disk, before the first request needs them."""
+        warm_up(self._call_every_kernel)
+
+    @staticmethod
+    def _call_every_kernel() -> None:
         rng = np.random.default_rng(0)
         bboxes = np.array([[100, 100, 150, 160], [300, 120, 360, 150], [200, 300, 260, 390]],
                           dtype=np.float64)

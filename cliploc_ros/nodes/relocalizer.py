@@ -4,12 +4,11 @@
 
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 
@@ -23,6 +22,7 @@ from cliploc_ros.ros.frames import BaseFrame
 from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.parameters import NodeParameters
 from cliploc_ros.ros.process import WorkingNode, run_node
+from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
 from cliploc_ros.ros.worker import LatestOnly, Retrying
 
@@ -51,8 +51,8 @@ class RelocalizerNode(WorkingNode):
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames = FrameSource(self, self._settings['image_transport'], self._on_frame)
-        # Requests are answered one after another, each from frames newer than itself.
-        requests = MutuallyExclusiveCallbackGroup()
+        self._flights: Flights[Answer] = Flights(self._wake_up)
+        requests = BoundedCallbackGroup(MAX_REQUESTS)
         self.create_service(Trigger, '~/relocalize', self._on_relocalize,
                             qos_profile=qos.SERVICE, callback_group=requests)
         self.create_service(Empty, 'reinitialize_global_localization', self._on_reinitialize,
@@ -81,22 +81,27 @@ class RelocalizerNode(WorkingNode):
             self.get_logger().error(str(error))
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        answer = self._wake_up()
+        answer = self._flights.board()
         response.success = answer.pose is not None
         response.message = answer.message
         return response
 
     def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
-        self._wake_up()
+        self._flights.board()
         return response
 
-    def _wake_up(self) -> Answer:
-        """Localize from the next fresh frame, and tell a running localizer of success."""
+    def _wake_up(self, depart: Callable[[], None]) -> Answer:
+        """Localize from the next fresh frame, and tell a running localizer of success.
+
+        Called once for all requests that wait at the same time: those that come after depart
+        ask for a frame newer than this one.
+        """
         try:
             # A map or weights that were missing may have been mended since.
             self.worker.run(self._localizer.get)
             with self._frames.listening():
                 frame = self._frames.wait_for_fresh(self._settings['timeout_s'])
+            depart()
             answer = self.worker.run(lambda: self._localize(frame))
         except CliplocError as error:
             answer = Answer(None, str(error))

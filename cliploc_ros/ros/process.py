@@ -17,10 +17,12 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 
+from cliploc_ros.ros.requests import MAX_REQUESTS
 from cliploc_ros.ros.worker import Worker
 
-# One for a request that waits, one for frames, one for parameters and the rest.
-_THREADS = 3
+# For the requests that may wait, for frames, for parameters and the rest. Threads are made when
+# they are first needed.
+_THREADS = MAX_REQUESTS + 3
 
 
 class RosLogHandler(logging.Handler):

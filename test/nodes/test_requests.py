@@ -6,7 +6,9 @@ import time
 
 import numpy as np
 from conftest import make_frame, transform_of
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import MAP_FROM_CAMERA
+from sensor_msgs.msg import Image
 
 from cliploc_ros.core.transforms import pose_error
 
@@ -57,3 +59,23 @@ def test_two_requests_at_once_are_both_answered(relocalizer, tester):
     tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
     assert futures[0].result().success
     assert futures[1].result().success
+
+
+def test_requests_that_wait_together_reset_the_localizer_once(relocalizer, tester):
+    futures = [tester.ask() for _ in range(10)]
+    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
+    tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
+    assert all(future.result().success for future in futures)
+    tester.wait(lambda: tester.initial_poses, 'an initial pose')
+    # those that came after the frame was taken ask for a newer one, together
+    assert len(tester.initial_poses) <= 3
+
+
+def test_the_camera_may_change_its_qos_between_requests(relocalizer, tester):
+    """A camera driver is restarted, first reliable, then best effort."""
+    for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT,
+                        ReliabilityPolicy.RELIABLE):
+        tester.destroy_publisher(tester.images)
+        tester.images = tester.create_publisher(
+            Image, 'image', QoSProfile(depth=10, reliability=reliability))
+        assert tester.relocalize(make_frame()).success
