@@ -1,7 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+import io
+
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from builtin_interfaces.msg import Time
 from hypothesis import given
@@ -128,6 +131,27 @@ def compressed(extension, image_bgr):
 def test_png_keeps_every_pixel():
     np.testing.assert_array_equal(image_from_msg(compressed('png', PIXELS[:, :, ::-1])), PIXELS)
     np.testing.assert_array_equal(image_from_msg(compressed('png', GREY))[:, :, 2], GREY)
+
+
+def test_exif_does_not_turn_the_picture():
+    """The intrinsics are those of the sensor, whichever way up a viewer would show it."""
+    upper = np.zeros((40, 60, 3), dtype=np.uint8)
+    upper[:20] = 255
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 3  # orientation: upside down
+    file = io.BytesIO()
+    PIL.Image.fromarray(upper).save(file, 'JPEG', exif=exif)
+    image = image_from_msg(CompressedImage(format='jpeg', data=file.getvalue()))
+    assert image[:18].min() > 200
+    assert image[22:].max() < 50
+
+
+def test_a_turned_box_stands_as_the_upright_one_around_it():
+    msg = detections_to_msg(Detections(np.array([[10.0, 20.0, 50.0, 30.0]]), ('cup',),
+                                       np.array([0.5])), Header())
+    msg.detections[0].bbox.center.theta = np.pi / 2
+    assert detections_from_msg(msg).bboxes_xyxy == pytest.approx(
+        np.array([[25.0, 5.0, 35.0, 45.0]]))
 
 
 def test_jpeg_keeps_colours_in_their_order():
