@@ -154,15 +154,15 @@ class Relocalizer:
         start = time.perf_counter()
         bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
         candidates, potential = self._associate(observation)
-        # where the lens model has no inverse there is no bearing
-        invertible = np.isfinite(bboxes).all(axis=1)
-        potential &= invertible[:, None]
-        pairs = candidates.pairs[invertible[candidates.detections]]
+        # NaN where the lens model has no inverse; and a box turned inside out has no ellipse
+        sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1)
+        potential &= sound[:, None]
+        pairs = candidates.pairs[sound[candidates.detections]]
         if _too_few(pairs):
             return Relocalization(
                 False, f'{len(bboxes)} detections give fewer than three different '
                 'correspondence candidates', stamp_ns=observation.stamp_ns)
-        scene = make_scene(np.nan_to_num(bboxes, nan=1.0), self._map.centers, self._shapes,
+        scene = make_scene(np.where(sound[:, None], bboxes, 1.0), self._map.centers, self._shapes,
                            potential, pairs, self._options.iou_threshold)
         leaders = Leaders.none_yet()
         progress = self._search(scene, leaders, start)
@@ -180,6 +180,8 @@ class Relocalizer:
             found = 'none' if similarities is None else f'{similarities.shape}'
             raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                                f'{shape}, found {found}')
+        if not np.isfinite(similarities).all():
+            raise OptionsError('similarities hold values that are not finite')
         candidates = association.nearest_candidates(similarities, options.k)
         potential = association.candidate_mask(candidates, shape)
         if options.matching == 'hybrid':

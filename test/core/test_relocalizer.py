@@ -115,6 +115,24 @@ def test_missing_or_misshaped_similarities_are_named(room, observation):
             relocalizer.relocalize([Observation(CAMERA, observation.detections, similarities)])
 
 
+def test_similarities_that_are_no_numbers_are_named(room, observation):
+    broken = observation.similarities.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(OptionsError, match='not finite'):
+        Relocalizer(room, RelocalizerOptions()).relocalize(
+            [Observation(CAMERA, observation.detections, broken)])
+
+
+def test_boxes_turned_inside_out_are_left_out(room, observation):
+    boxes = observation.detections.bboxes_xyxy.copy()
+    boxes[:3] = boxes[:3][:, [2, 3, 0, 1]]
+    detections = Detections(boxes, observation.detections.class_ids, observation.detections.scores)
+    result = Relocalizer(room, RelocalizerOptions()).relocalize(
+        [Observation(CAMERA, detections, observation.similarities)])
+    assert result.accepted
+    assert sorted(match.detection for match in result.matches) == list(range(3, 12))
+
+
 def test_one_observation_at_a_time(room, observation):
     with pytest.raises(OptionsError, match='one observation'):
         Relocalizer(room, RelocalizerOptions()).relocalize([observation, observation])
