@@ -72,11 +72,11 @@ class RelocalizerNode(WorkingNode):
         """Load map and network before the first request needs them."""
         start = time.monotonic()
         try:
-            if self._settings['base_frame'] and not any(self._settings['base_from_camera']):
-                self._base.listen()
             localizer = self._localizer.get()
             self.get_logger().info(f'ready after {time.monotonic() - start:.1f} s: '
                                    f'{localizer.description}')
+            if self._settings['base_frame'] and not any(self._settings['base_from_camera']):
+                self._base.listen()
         except CliplocError as error:
             self.get_logger().error(str(error))
 

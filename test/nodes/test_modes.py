@@ -58,6 +58,14 @@ def test_the_mount_moves_the_pose(own_relocalizer, tester):
     assert pose_error(transform_of(tester.poses[0].pose.pose), base) < (0.08, 1.0)
 
 
+def test_no_mount_is_an_answer_not_an_end(own_relocalizer, tester):
+    process = own_relocalizer(base_frame='base_link', tf_timeout_s=0.1)
+    answer = tester.relocalize(make_frame())
+    assert not answer.success
+    assert 'set base_from_camera' in answer.message
+    assert process.alive
+
+
 @pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('asked', [False, True])
 def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
