@@ -58,7 +58,15 @@ def count(reporter, *outcomes: str) -> int:
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Print one line of counts, which script/test repeats at its end."""
+    """Print what tests measured, and one line of counts, which script/test repeats at its end."""
+    measured = [report for report in terminalreporter.stats.get('passed', [])
+                if report.when == 'call' and report.capstdout.strip()]
+    if measured:
+        terminalreporter.section('measured')
+    for report in measured:
+        terminalreporter.write_line(report.nodeid)
+        for line in report.capstdout.strip().splitlines():
+            terminalreporter.write_line(f'    {line}')
     passed = count(terminalreporter, 'passed', 'xpassed')
     failed = count(terminalreporter, 'failed', 'error', 'xfailed')
     terminalreporter.write_line(
