@@ -53,10 +53,14 @@ class WorkingNode(Node):
 
     def __init__(self, name: str) -> None:
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self.worker = Worker(self.get_logger().error)
+        self.worker = Worker(self._report)
         package_logger = logging.getLogger('cliploc_ros')
         package_logger.setLevel(logging.INFO)
         package_logger.addHandler(RosLogHandler(self))
+
+    def _report(self, traceback_text: str) -> None:
+        """Log a defect; one that comes with every frame must not fill the disk."""
+        self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
 
     def release(self) -> None:
         """Let go whoever waits in this node: the process ends."""
