@@ -28,7 +28,11 @@ from cliploc_ros.errors import CameraError, ImageError
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
              'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
-_MAX_SIDE_PX = 16384
+# A small file may claim any size: what is decoded is bounded to 200 MB.
+_MAX_PIXELS = 2**26
+_PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
+# the markers of JPEG that begin a frame, with its size in it
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -51,9 +55,7 @@ def _unpacked(msg: Image) -> NDArray[np.uint8]:
     if msg.encoding not in _CHANNELS:
         raise ImageError(f"image encoding '{msg.encoding}' is none of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]
-    if not (0 < msg.width <= _MAX_SIDE_PX and 0 < msg.height <= _MAX_SIDE_PX):
-        raise ImageError(f'image size {msg.width}x{msg.height} must lie within 1 and '
-                         f'{_MAX_SIDE_PX} px a side')
+    _check_size(msg.width, msg.height)
     if msg.step < msg.width * channels:
         raise ImageError(f'image step {msg.step} is shorter than a row of {msg.width} '
                          f'{msg.encoding} pixels')
@@ -67,17 +69,35 @@ def _unpacked(msg: Image) -> NDArray[np.uint8]:
 
 
 def _decoded(msg: CompressedImage) -> NDArray[np.uint8]:
+    _check_size(*_declared_size(bytes(msg.data), msg.format))
     data = np.frombuffer(msg.data, dtype=np.uint8)
     try:
         # EXIF may ask to turn the picture, but the intrinsics are those of the sensor.
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) \
-            if len(data) else None
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
                          ) from error
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
     return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def _declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
+    """Return width and height that a JPEG or PNG says it has, before it is decoded."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] in _JPEG_FRAMES:
+            return int.from_bytes(data[at + 7:at + 9]), int.from_bytes(data[at + 5:at + 7])
+        at += 2 + int.from_bytes(data[at + 2:at + 4])
+    raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
+                     'it is no JPEG or PNG, or is cut off')
+
+
+def _check_size(width: int, height: int) -> None:
+    if not (width > 0 and height > 0 and width * height <= _MAX_PIXELS):
+        raise ImageError(f'image size {width}x{height} must have 1 to {_MAX_PIXELS} pixels')
 
 
 def camera_from_msg(msg: CameraInfo, image_size: tuple[int, int], rectified: bool) -> Camera:

@@ -133,6 +133,18 @@ def test_png_keeps_every_pixel():
     np.testing.assert_array_equal(image_from_msg(compressed('png', GREY))[:, :, 2], GREY)
 
 
+@pytest.mark.parametrize('extension', ['png', 'jpg'])
+def test_a_small_file_that_claims_a_huge_size_is_not_decoded(extension):
+    data = bytearray(cv2.imencode(f'.{extension}', np.zeros((8, 16, 3), dtype=np.uint8))[1])
+    if extension == 'png':
+        data[16:24] = (60_000).to_bytes(4) * 2
+    else:
+        frame = data.index(b'\xff\xc0')
+        data[frame + 5:frame + 9] = (60_000).to_bytes(2) * 2
+    with pytest.raises(ImageError, match='image size 60000x60000'):
+        image_from_msg(CompressedImage(format=extension, data=bytes(data)))
+
+
 def test_exif_does_not_turn_the_picture():
     """The intrinsics are those of the sensor, whichever way up a viewer would show it."""
     upper = np.zeros((40, 60, 3), dtype=np.uint8)
