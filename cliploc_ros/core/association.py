@@ -75,6 +75,13 @@ def class_candidates(mask: NDArray[np.bool_]) -> Candidates:
     return Candidates(detections, landmarks, zeros.astype(np.int64), zeros)
 
 
+def check_k(k: int, landmark_count: int) -> None:
+    """Refuse with an OptionsError a k that the map cannot give."""
+    if not 1 <= k <= landmark_count:
+        raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
+                           f'set k to {landmark_count} or less')
+
+
 def nearest_candidates(similarities: NDArray[np.float32], k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
@@ -91,9 +98,7 @@ def nearest_candidates(similarities: NDArray[np.float32], k: int) -> Candidates:
         The map has fewer than k landmarks.
     """
     detection_count, landmark_count = similarities.shape
-    if not 1 <= k <= landmark_count:
-        raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
-                           f'set k to {landmark_count} or less')
+    check_k(k, landmark_count)
     nearest = np.argpartition(-similarities, k - 1, axis=1)[:, :k] if k < landmark_count \
         else np.tile(np.arange(landmark_count), (detection_count, 1))
     nearest.sort(axis=1)

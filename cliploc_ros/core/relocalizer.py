@@ -104,9 +104,8 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities and options.k > len(landmark_map):
-            raise OptionsError(f'k = {options.k}, but the map has {len(landmark_map)} landmarks: '
-                               f'set k to {len(landmark_map)} or less')
+        if options.needs_similarities:
+            association.check_k(options.k, len(landmark_map))
         self._map = landmark_map
         self._shapes = landmark_map.shapes
         self._options = options
