@@ -101,13 +101,26 @@ class Tester(Node):
         self.infos = self.create_publisher(CameraInfo, 'camera_info', RELIABLE)
         self.detections = self.create_publisher(Detection2DArray, 'detections', RELIABLE)
         self.poses, self.initial_poses, self.hypotheses = [], [], []
+        self._forgotten_ns = 0
         for message, topic, kept in (
                 (PoseWithCovarianceStamped, 'relocalizer/pose', self.poses),
                 (PoseWithCovarianceStamped, 'initialpose', self.initial_poses),
                 (PoseArray, 'relocalizer/hypotheses', self.hypotheses)):
-            self.create_subscription(message, topic, kept.append, RELIABLE)
+            self.create_subscription(message, topic, self._keeper(kept), RELIABLE)
         self._relocalize = self.create_client(Trigger, 'relocalizer/relocalize')
         self._reinitialize = self.create_client(Empty, 'reinitialize_global_localization')
+
+    def _keeper(self, kept):
+        def keep(msg, info):
+            if info['source_timestamp'] > self._forgotten_ns:
+                kept.append(msg)
+        return keep
+
+    def forget(self):
+        """Forget what was published until now, also what is still on its way here."""
+        self._forgotten_ns = time.time_ns()
+        for kept in (self.poses, self.initial_poses, self.hypotheses):
+            kept.clear()
 
     def spin(self):
         self._executor.spin_once(timeout_sec=0.02)
@@ -222,8 +235,7 @@ def tester(ros):
 
 @pytest.fixture(autouse=True)
 def forget(tester):
-    for kept in (tester.poses, tester.initial_poses, tester.hypotheses):
-        kept.clear()
+    tester.forget()
 
 
 @pytest.fixture(scope='session')
