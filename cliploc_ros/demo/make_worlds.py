@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Makes worlds to train on: ``python -m cliploc_ros.demo.make_worlds DIR --count 100``."""
+
+import argparse
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.demo.world.recording import record, write_true_map
+from cliploc_ros.demo.world.renderer import Light, Renderer
+from cliploc_ros.demo.world.room import make_room
+from cliploc_ros.demo.world.trajectories import CAMERA, draw_views
+
+
+def make_world(folder: Path, seed: int, frames: int) -> None:
+    """Make one world with views from anywhere in it, and write it as a TUM folder."""
+    rng = np.random.default_rng(seed)
+    room = make_room(seed)
+    renderer = Renderer(room, CAMERA, Light.draw(rng))
+    record(folder, room, renderer, draw_views(room, frames, rng), seed=seed)
+    write_true_map(folder / 'map.yaml', room)
+
+
+def main() -> None:
+    """Make worlds, several at once, each from its own seed."""
+    parser = argparse.ArgumentParser(prog='make_worlds', description=__doc__)
+    parser.add_argument('folder', type=Path, metavar='DIR')
+    parser.add_argument('--count', type=int, default=100, help='number of worlds (%(default)s)')
+    parser.add_argument('--frames', type=int, default=10, help='images of each (%(default)s)')
+    parser.add_argument('--seed', type=int, default=1000, help='of the first (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=multiprocessing.cpu_count(),
+                        help='worlds made at once (%(default)s)')
+    options = parser.parse_args()
+    # VTK's contexts do not survive a fork.
+    context = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(options.jobs, mp_context=context, max_tasks_per_child=20) as pool:
+        made = [pool.submit(make_world, options.folder / f'world_{number:03d}',
+                            options.seed + number, options.frames)
+                for number in range(options.count)]
+        for world in tqdm(as_completed(made), total=options.count, unit='world'):
+            world.result()
+
+
+if __name__ == '__main__':
+    main()
