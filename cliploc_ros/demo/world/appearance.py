@@ -74,14 +74,20 @@ class Appearance:
         """The description in plain words, as a person who makes a map would write it."""
         size = {'large': 'tall' if self.class_id == 'bottle' else 'large'}.get(
             self.size, self.size)
-        adjectives = ([] if size == 'medium' else [size]) + [self.color]
-        article = 'an' if adjectives[0][0] in 'aeiou' else 'a'
-        words = [article, *adjectives, self.class_id]
+        adjectives = ([] if size == 'medium' else [size])
+        words = [*adjectives, self.color, self.class_id]
+        if self.class_id == 'plant':
+            words = [*adjectives, 'plant in', _article(self.color), self.color, 'pot']
+        words.insert(0, _article(words[0]))
         if self.pattern != 'plain':
             words.append(PATTERNS[self.pattern].format(color=self.second_color))
         if self.word:
             words.append(f'that says {self.word}')
         return ' '.join(words)
+
+
+def _article(word: str) -> str:
+    return 'an' if word[0] in 'aeiou' else 'a'
 
 
 def draw_appearance(class_id: str, rng: np.random.Generator) -> Appearance:

@@ -6,6 +6,7 @@ import colorsys
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +16,8 @@ from cliploc_ros.demo.world.meshes import Mesh, make_object
 from cliploc_ros.demo.world.room import HEIGHT_M, LENGTH_M, WIDTH_M, Room
 from cliploc_ros.demo.world.textures import paint, paint_wall, paint_wood
 from cliploc_ros.errors import ModelError
+
+_SUPERSAMPLING = 2
 
 
 @dataclass(frozen=True)
@@ -60,25 +63,29 @@ class Renderer:
         self._vtk: Any = vtk
         vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_ERROR)
         self._camera = camera
-        self._image = self._window()
-        self._index = self._window(samples=0)
+        # Edges are smoothed by rendering larger: with multisampling and mipmaps together Mesa's
+        # software rasterizer needs minutes for some views (measured with Mesa 22.3).
+        self._image = self._window(_SUPERSAMPLING)
+        self._index = self._window()
         self._light(light)
         self._fill(room)
 
     def render(self, map_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
         """Render the image, (height, width, 3) RGB."""
-        return self._read(self._image, map_from_camera)
+        large = self._read(self._image, map_from_camera)
+        size = self._camera.width, self._camera.height
+        return np.asarray(cv2.resize(large, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def render_index(self, map_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
         """Render which object each pixel shows: its index in the room, -1 for none."""
         rgb = self._read(self._index, map_from_camera).astype(np.int64)
         return (rgb[..., 0] * 65536 + rgb[..., 1] * 256 + rgb[..., 2]) - 1
 
-    def _window(self, samples: int = 4) -> Any:
+    def _window(self, scale: int = 1) -> Any:
         window, renderer = self._vtk.vtkRenderWindow(), self._vtk.vtkRenderer()
         window.SetOffScreenRendering(1)
-        window.SetMultiSamples(samples)
-        window.SetSize(self._camera.width, self._camera.height)
+        window.SetMultiSamples(0)
+        window.SetSize(scale * self._camera.width, scale * self._camera.height)
         window.AddRenderer(renderer)
         renderer.SetBackground(0.0, 0.0, 0.0)
         renderer.AutomaticLightCreationOff()
@@ -202,7 +209,8 @@ class Renderer:
         grab.ShouldRerenderOff()
         grab.Update()
         scalars = vtk_to_numpy(grab.GetOutput().GetPointData().GetScalars())
-        image = scalars.reshape(self._camera.height, self._camera.width, 3)
+        width, height = window.GetSize()
+        image = scalars.reshape(height, width, 3)
         return np.ascontiguousarray(image[::-1])
 
 
