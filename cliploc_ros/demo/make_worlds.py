@@ -17,7 +17,12 @@ from cliploc_ros.demo.world.trajectories import CAMERA, draw_views
 
 
 def make_world(folder: Path, seed: int, frames: int) -> None:
-    """Make one world with views from anywhere in it, and write it as a TUM folder."""
+    """Make one world with views from anywhere in it, and write it as a TUM folder.
+
+    A world that is already whole there is left as it is.
+    """
+    if (folder / 'map.yaml').exists():  # written last
+        return
     rng = np.random.default_rng(seed)
     room = make_room(seed)
     renderer = Renderer(room, CAMERA, Light.draw(rng))
@@ -37,7 +42,7 @@ def main() -> None:
     options = parser.parse_args()
     # VTK's contexts do not survive a fork.
     context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(options.jobs, mp_context=context, max_tasks_per_child=20) as pool:
+    with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
         made = [pool.submit(make_world, options.folder / f'world_{number:03d}',
                             options.seed + number, options.frames)
                 for number in range(options.count)]
