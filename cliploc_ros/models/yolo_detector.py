@@ -159,7 +159,7 @@ def fetch_yolo_weights(name: str, folder: str) -> str:
 
     Runs in the child process of `cliploc_ros.models.download`.
     """
-    _import_ultralytics()
+    import_ultralytics()
     from ultralytics.utils.downloads import attempt_download_asset
 
     announce_start()
@@ -170,7 +170,7 @@ def fetch_yolo_weights(name: str, folder: str) -> str:
 
 
 @cache
-def _import_ultralytics() -> Any:
+def import_ultralytics() -> Any:
     """Import ultralytics so that it neither asks the network, installs, nor writes to the home."""
     import torch  # first: it reads OMP_NUM_THREADS, which ultralytics sets to 1
 
@@ -213,7 +213,7 @@ def _resolve_file(options: YoloOptions) -> Path:
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
-    _import_ultralytics()
+    import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
 
     if name not in GITHUB_ASSETS_NAMES:
@@ -245,7 +245,7 @@ def _reason(error: Exception) -> str:
 
 def _load(file: Path) -> Any:
     """Return ultralytics' model of a file of weights."""
-    ultralytics = _import_ultralytics()
+    ultralytics = import_ultralytics()
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
         # Ultralytics rewrites some paths (quotes, yolov5) and insists on the suffix.
         neutral = Path(desk) / 'weights.pt'
