@@ -3,6 +3,7 @@
 """Which CLIP is meant: its architecture, its file of weights and how they were trained."""
 
 import difflib
+import json
 import os
 import zipfile
 from collections.abc import Iterable
@@ -15,6 +16,7 @@ from cliploc_ros.models.devices import check_precision
 from cliploc_ros.models.download import announce_start, download
 from cliploc_ros.models.files import check_weights_file, fingerprint_file, resolve_cache_dir
 
+_CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 
 
@@ -25,7 +27,8 @@ class ClipOptions:
     Parameters
     ----------
     model : str
-        Architecture, a name of ``open_clip.list_models()``.
+        Architecture, a name of ``open_clip.list_models()``, or the path of a model config of
+        open_clip (.json), which is then known by its file's name.
     pretrained : str
         A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also says
         how the weights were trained (activation, colour normalization); a path leaves the
@@ -108,7 +111,9 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """
     import open_clip
 
-    model = options.model.replace('/', '-')  # OpenAI wrote ViT-L/14
+    own = options.model.endswith('.json')
+    # OpenAI wrote ViT-L/14
+    model = _add_config(options.model) if own else options.model.replace('/', '-')
     config = open_clip.get_model_config(model) if model in open_clip.list_models() else None
     if config is None:
         raise ModelError(f"unknown CLIP model '{options.model}'"
@@ -133,6 +138,27 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
                     ('mean', 'std', 'interpolation', 'resize_mode') if name in tag},
         embed_dim=config['embed_dim'],
         key=f'{model}:{"quick_gelu" if quick_gelu else "gelu"}:{fingerprint_file(file)}')
+
+
+def _add_config(name: str) -> str:
+    """Make a model config of the user's own known to open_clip; return the model's name."""
+    import open_clip
+
+    file = Path(name).expanduser().absolute()
+    if not file.exists():
+        raise ModelError(f'{file} does not exist: check the path of the model config')
+    try:
+        config = json.loads(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise ModelError(f'{file} is no model config, it cannot be read as JSON: {error}') from None
+    missing = ([part for part in _CONFIG_PARTS if part not in config]
+               if isinstance(config, dict) else _CONFIG_PARTS)
+    if missing:
+        raise ModelError(f'{file} is no model config of open_clip: it lacks {", ".join(missing)}')
+    if file.stem in open_clip.list_models() and config != open_clip.get_model_config(file.stem):
+        raise ModelError(f"open_clip has another model of the name '{file.stem}': rename {file}")
+    open_clip.add_model_config(file)
+    return file.stem
 
 
 def is_torchscript(file: Path) -> bool:

@@ -30,6 +30,8 @@ from cliploc_ros.demo.world.trajectories import CAMERA
 #: Objects of which fewer pixels are seen are not labelled.
 _FEWEST_PX = 40
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 88]
+#: Centre [m] and logarithms of the axes of an object differ so much from those of its kind.
+_USUAL_SPREAD = np.array([0.03, 0.03, 0.03, 0.2, 0.2, 0.2])
 Box = dict[str, Any]
 
 
@@ -156,7 +158,9 @@ def _fit(entry: dict[str, Any], views: Iterable[tuple[npt.NDArray[np.float64], .
     start = np.concatenate([entry['center'], np.log(entry['semi_axes'])])
 
     def residuals(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.asarray(_outline_boxes(x[:3], np.exp(x[3:]), quats, poses) - bboxes).ravel()
+        outlines = _outline_boxes(x[:3], np.exp(x[3:]), quats, poses)
+        # Views from one side alone leave the depth open: then the usual form decides.
+        return np.concatenate([(outlines - bboxes).ravel(), (x - start) / _USUAL_SPREAD])
 
     found = least_squares(residuals, start, loss='soft_l1', f_scale=3.0).x
     return {**entry, 'center': found[:3].tolist(), 'semi_axes': np.exp(found[3:]).tolist()}
