@@ -6,7 +6,6 @@ A small YOLO of ultralytics from scratch, on images of rendered worlds.
 """
 
 import argparse
-import os
 import sys
 import tempfile
 from pathlib import Path
@@ -100,7 +99,7 @@ def save(model: Any, path: Path) -> None:
     checkpoint['model'].yaml.pop('yaml_file', None)
     partial = path.with_name(path.name + '.partial')
     torch.save(checkpoint, partial)
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def run(arguments: list[str]) -> int:

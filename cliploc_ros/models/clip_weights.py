@@ -150,7 +150,7 @@ def _add_config(name: str) -> str:
     try:
         config = json.loads(file.read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
-        raise ModelError(f'{file} is no model config, it cannot be read as JSON: {error}') from None
+        raise ModelError(f'{file} cannot be read as JSON, as a model config is: {error}') from None
     missing = ([part for part in _CONFIG_PARTS if part not in config]
                if isinstance(config, dict) else _CONFIG_PARTS)
     if missing:

@@ -49,7 +49,8 @@ def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0
 
     With `uv_m` a texture covers so many metres; without, each face shows it once.
     """
-    vertices, uv, triangles = [], [], []
+    vertices: list[npt.NDArray[np.float64]] = []
+    uv, triangles = [], []
     half = np.array(size) / 2
     for axis in range(3):
         # The two other axes, so that the texture stands upright on the sides.
@@ -91,7 +92,8 @@ def _ring(radius: float, thickness: float, at: tuple[float, float]) -> Mesh:
     vertices = np.stack([at[0] + reach * np.cos(u), thickness * np.sin(w),
                          at[1] + reach * np.sin(u)], axis=-1).reshape(-1, 3)
     cell = (np.arange(16)[:, None] * 9 + np.arange(8)).ravel()
-    triangles = np.concatenate([np.c_[cell, cell + 9, cell + 10], np.c_[cell, cell + 10, cell + 1]])
+    triangles = np.concatenate([np.c_[cell, cell + 9, cell + 10],
+                                np.c_[cell, cell + 10, cell + 1]])
     return Mesh(vertices, np.full((len(vertices), 2), 0.02), triangles)
 
 

@@ -163,7 +163,7 @@ class Renderer:
         points, cells, data = vtk.vtkPoints(), vtk.vtkCellArray(), vtk.vtkPolyData()
         points.SetData(numpy_to_vtk(mesh.vertices, deep=True))
         faces = np.c_[np.full(len(mesh.triangles), 3), mesh.triangles].ravel()
-        cells.SetCells(len(mesh.triangles), numpy_to_vtkIdTypeArray(faces, deep=True))
+        cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(faces, deep=True))
         data.SetPoints(points)
         data.SetPolys(cells)
         uv = numpy_to_vtk(mesh.uv, deep=True)

@@ -10,7 +10,7 @@ from cliploc_ros.core.camera import Camera
 from cliploc_ros.demo.world.room import LENGTH_M, WIDTH_M, Room
 
 #: Pixel centres have whole coordinates, as everywhere in the package.
-CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob', (0.0, 0.0, 0.0, 0.0, 0.0))
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 
 def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],
@@ -29,7 +29,7 @@ def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],
 
 def draw_views(room: Room, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
     """Draw poses that look at objects from anywhere in the room; (count, 4, 4)."""
-    views = []
+    views: list[npt.NDArray[np.float64]] = []
     while len(views) < count:
         target = np.array(room.objects[int(rng.integers(len(room.objects)))].slot.position)
         eye = np.array([rng.uniform(0.7, LENGTH_M - 0.7), rng.uniform(0.7, WIDTH_M - 0.7),

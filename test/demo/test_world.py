@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The synthetic world: what it says of itself is what its images show."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.core.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+    shape_matrices,
+)
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.transforms import invert_transform
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo.world.appearance import CLASSES, COLORS, Appearance, draw_appearance
+from cliploc_ros.demo.world.reading import find_worlds, hold_out, read_frames
+from cliploc_ros.demo.world.recording import find_boxes, record, write_fitted_map, write_true_map
+from cliploc_ros.demo.world.renderer import Light, Renderer
+from cliploc_ros.demo.world.room import make_room, move_objects
+from cliploc_ros.demo.world.trajectories import CAMERA, draw_views, mapping_walk, query_walk
+from cliploc_ros.errors import DatasetError
+
+
+@pytest.fixture(scope='module')
+def room():
+    return make_room(3, dict.fromkeys(CLASSES, 8))
+
+
+@pytest.fixture(scope='module')
+def renderer(room):
+    return Renderer(room, CAMERA, Light())
+
+
+def test_labels_read_as_a_person_writes_them():
+    assert Appearance('mug', 'red', 'dots', 'white').label == 'a red mug with white dots'
+    assert Appearance('bottle', 'blue', 'label', 'yellow', size='large').label \
+        == 'a tall blue bottle with a yellow label'
+    assert Appearance('can', 'orange', 'label', 'white', 'SOUP').label \
+        == 'an orange can with a white label that says SOUP'
+    assert Appearance('plant', 'pink', size='small').label == 'a small plant in a pink pot'
+
+
+def test_an_object_never_bears_its_own_colour_twice():
+    rng = np.random.default_rng(0)
+    looks = [draw_appearance(class_id, rng) for class_id in CLASSES * 50]
+    assert all(look.color != look.second_color for look in looks)
+    assert {look.color for look in looks} == set(COLORS)
+
+
+def test_a_room_is_repeatable_and_its_labels_tell_all_objects_apart(room):
+    again = make_room(3, dict.fromkeys(CLASSES, 8))
+    assert again.objects == room.objects
+    assert make_room(4).objects != room.objects
+    labels = [item.look.label for item in room.objects]
+    assert len(set(labels)) == len(labels) == 64
+    assert sum(not item.in_map for item in room.objects) == 4
+    places = np.array([item.slot.position for item in room.objects])
+    distances = np.linalg.norm(places[:, None] - places, axis=-1) + 9 * np.eye(64)
+    assert distances.min() > 0.2
+
+
+def test_too_many_objects_are_refused():
+    with pytest.raises(ValueError, match='do not fit'):
+        make_room(0, {'mug': 500})
+
+
+def test_moved_objects_change_places_and_stay_in_the_map(room):
+    later = move_objects(room, 4, seed=1)
+    moved = [new.name for new in later.objects if new.moved]
+    assert len(moved) == 4
+    for old, new in zip(room.objects, later.objects, strict=True):
+        assert (old.slot != new.slot) == (new.name in moved)
+        assert new.in_map or not new.moved
+
+
+def test_boxes_are_where_the_ellipsoids_project(room, renderer):
+    """The renderer's camera and the core's are one: wholly seen objects fill their outlines."""
+    overlaps = []
+    for pose in draw_views(room, 8, np.random.default_rng(0)):
+        for seen in find_boxes(room, renderer, pose):
+            if seen['visibility'] < 0.9:
+                continue
+            entry = next(o for o in room.objects if o.name == seen['object']).landmark()
+            shape = shape_matrices(np.array([entry['semi_axes']]),
+                                   np.array([entry['orientation']]))
+            outline = project_ellipsoids(invert_transform(pose), np.array([entry['center']]), shape)
+            box = ellipse_bboxes(ellipses_in_pixels(outline, CAMERA))[0]
+            overlaps.append(_iou(box, np.array(seen['bbox_xyxy'])))
+    print(f'{len(overlaps)} whole objects: box IoU median {np.median(overlaps):.2f}, '
+          f'least {min(overlaps):.2f}')
+    assert len(overlaps) > 40
+    assert np.median(overlaps) > 0.75
+    assert np.percentile(overlaps, 5) > 0.5
+
+
+def test_images_are_lit_and_show_colours(renderer, room):
+    image = renderer.render(query_walk(12)[1])
+    assert image.shape == (480, 640, 3)
+    assert 60 < image.mean() < 200
+    assert cv2.cvtColor(image, cv2.COLOR_RGB2HSV)[..., 1].max() > 200
+
+
+def test_what_is_recorded_is_a_tum_folder_and_repeatable(room, renderer, tmp_path):
+    poses = query_walk(12)[:2]
+    for name in ('a', 'b'):
+        record(tmp_path / name, room, renderer, poses, seed=5, rate_hz=2.0)
+    write_true_map(tmp_path / 'a' / 'map.yaml', room)
+    sequence = read_tum(tmp_path / 'a')
+    assert np.diff(sequence.stamps_ns).tolist() == [500_000_000]
+    for stamp, pose in zip(sequence.stamps_ns, poses, strict=True):
+        np.testing.assert_allclose(sequence.pose_at(stamp), pose, atol=1e-5)
+    assert find_camera(None, tmp_path / 'a')[0] == CAMERA
+    first, second = ((tmp_path / name / 'truth.json').read_text() for name in ('a', 'b'))
+    assert first == second
+    for file in (tmp_path / 'a' / 'rgb').iterdir():
+        assert file.read_bytes() == (tmp_path / 'b' / 'rgb' / file.name).read_bytes()
+    landmark_map = LandmarkMap.from_file(tmp_path / 'a' / 'map.yaml')
+    assert len(landmark_map) == 60
+    known = {item['id']: item for item in json.loads(first)['objects']}
+    for name, center, label in zip(landmark_map.landmark_ids, landmark_map.centers,
+                                   landmark_map.labels, strict=True):
+        np.testing.assert_allclose(center, known[name]['center'], atol=1e-4)
+        assert label == known[name]['label']
+    frames = list(read_frames(tmp_path / 'a'))
+    assert len(frames) == 2
+    assert all(box.visibility >= 0.3 for frame in frames for box in frame.boxes)
+
+
+def test_a_map_fitted_to_boxes_is_near_the_truth(room, renderer, tmp_path):
+    write_fitted_map(tmp_path / 'map.yaml', room, renderer, mapping_walk(90), seed=0)
+    fitted = LandmarkMap.from_file(tmp_path / 'map.yaml')
+    truth = {item.name: item.landmark()['center'] for item in room.objects}
+    off = [np.linalg.norm(center - truth[name])
+           for name, center in zip(fitted.landmark_ids, fitted.centers, strict=True)]
+    print(f'centres of {len(off)} fitted landmarks: median {np.median(off):.3f} m off, '
+          f'at most {max(off):.3f} m')
+    assert 0 < np.median(off) < 0.03
+    assert max(off) < 0.15
+
+
+def test_worlds_held_out_are_not_trained_on(tmp_path):
+    for number in range(20):
+        (tmp_path / f'world_{number:03d}').mkdir()
+        (tmp_path / f'world_{number:03d}' / 'truth.json').write_text('{}')
+    training, held_out = hold_out(find_worlds(tmp_path))
+    assert (len(training), len(held_out)) == (18, 2)
+    assert not set(training) & set(held_out)
+
+
+def test_no_worlds_is_said(tmp_path):
+    with pytest.raises(DatasetError, match='make_worlds'):
+        find_worlds(tmp_path)
+
+
+def _iou(a, b):
+    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
+    shared = np.prod(np.clip(high - low, 0, None))
+    return shared / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - shared)
