@@ -89,7 +89,8 @@ def test_boxes_are_where_the_ellipsoids_project(room, renderer):
             entry = next(o for o in room.objects if o.name == seen['object']).landmark()
             shape = shape_matrices(np.array([entry['semi_axes']]),
                                    np.array([entry['orientation']]))
-            outline = project_ellipsoids(invert_transform(pose), np.array([entry['center']]), shape)
+            centers = np.array([entry['center']])
+            outline = project_ellipsoids(invert_transform(pose), centers, shape)
             box = ellipse_bboxes(ellipses_in_pixels(outline, CAMERA))[0]
             overlaps.append(_iou(box, np.array(seen['bbox_xyxy'])))
     print(f'{len(overlaps)} whole objects: box IoU median {np.median(overlaps):.2f}, '

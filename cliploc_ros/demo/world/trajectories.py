@@ -10,7 +10,7 @@ from cliploc_ros.core.camera import Camera
 from cliploc_ros.demo.world.room import LENGTH_M, WIDTH_M, Room
 
 #: Pixel centres have whole coordinates, as everywhere in the package.
-CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob')
 
 
 def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],

@@ -1,0 +1,25 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A few rendered worlds for the tests of training."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# Before anything renders: PyTorch's Triton and Mesa's software renderer each bring an LLVM, and
+# loading them the other way round ends the process. Programs render and train in different ones.
+import torchvision  # noqa: F401
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope='package')
+def worlds(tmp_path_factory):
+    """Two worlds of three images: one to train on, one held out."""
+    folder = tmp_path_factory.mktemp('worlds')
+    subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.demo.make_worlds', str(folder), '--count', '2',
+         '--frames', '3', '--seed', '40'], cwd=PROJECT, check=True, timeout=120)
+    return folder

@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training the demo's CLIP: it learns, and what it writes loads as any CLIP does."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from cliploc_ros.demo import train_clip
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
+
+
+def test_equal_labels_are_all_right_answers():
+    """Two crops of one label: their texts are equal, so the best loss is that of a tie."""
+    axes = torch.eye(3)
+    images = texts = axes[[0, 0, 1]]
+    loss = train_clip.contrastive_loss(images, texts, torch.tensor(100.0), ['a', 'a', 'b'])
+    assert float(loss) == pytest.approx(2 / 3 * np.log(2), abs=1e-4)
+    wrong = train_clip.contrastive_loss(images, axes[[0, 1, 0]], torch.tensor(100.0),
+                                        ['a', 'a', 'b'])
+    assert float(wrong) > 10 * float(loss)
+
+
+def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
+    model, tokenizer, preprocess = train_clip.make_model(train_clip.CONFIG, seed=0)
+    objects = list(train_clip.read_crops(worlds / 'world_000').values())
+    assert len(objects) > 10
+    losses = train_clip.train(objects, model, tokenizer, preprocess, steps=12, batch=16, seed=0)
+    assert np.mean(losses[-3:]) < np.mean(losses[:3]) - 0.1
+    file = tmp_path / 'clip.safetensors'
+    train_clip.save(model, file)
+    labels = ('a red mug', 'a blue box with white dots')
+    encoder, embeddings = load_encoder(
+        ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file),
+                    cache_dir=str(tmp_path)), labels)
+    model.eval()
+    with torch.no_grad():
+        wanted = model.encode_text(tokenizer(list(labels)), normalize=True).numpy()
+    np.testing.assert_allclose(embeddings, wanted, atol=5e-3)  # half precision on disk
+    crop = objects[0][0]
+    image = np.asarray(crop.image)
+    box = np.array([[0, 0, image.shape[1] - 1, image.shape[0] - 1]], dtype=float)
+    assert encoder.encode_crops(image, box).shape == (1, 128)
+
+
+def test_the_command_scores_worlds_held_out(worlds, tmp_path, capsys):
+    file = tmp_path / 'clip.safetensors'
+    assert train_clip.run([str(worlds), '--out', str(file), '--steps', '2', '--batch', '8']) == 0
+    assert re.search(r'1 worlds held out: top-1 0\.\d+, top-3 0\.\d+', capsys.readouterr().out)
+    assert 5e6 < file.stat().st_size < 10e6
