@@ -18,11 +18,14 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     packages=find_packages(exclude=['test', 'test.*']),
-    package_data={f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg']},
+    package_data={
+        f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
+        f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        (f'share/{PACKAGE}/config', files('config', '*.yaml')),
+        (f'share/{PACKAGE}/config', files('config', '*.yaml') + files('config', '*.rviz')),
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',
@@ -43,6 +46,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
+            f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``demo``: a robot wakes up in a synthetic room, offline, with shipped models."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.errors import OptionsError
+
+ASSETS = Path(__file__).resolve().parents[1] / 'demo' / 'assets'
+
+EPILOG = """\
+The recording is played to the real detector and relocalizer, each in its own process. Where the
+robot wakes up it stands still, asks ~/relocalize, and goes on with the answer. In the end a page
+of pictures lies in the folder of --out.
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; return the exit code."""
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
+    interrupt_on_sigterm()
+    return run_command(lambda: demonstrate(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='demo', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Let a robot wake up in a synthetic room, and draw what it saw.')
+    parser.add_argument(
+        '--out', type=Path, default=Path('demo_out'), metavar='DIR',
+        help='where the pictures go (default: ./%(default)s)')
+    parser.add_argument(
+        '--wake-ups', type=_at_least_one, default=10, metavar='N',
+        help='how often the robot wakes up on its way (default: %(default)s)')
+    parser.add_argument(
+        '--rate', type=_positive, default=4.0, metavar='X',
+        help='speed between wake-ups: 2 is twice as fast as recorded (default: %(default)g)')
+    parser.add_argument(
+        '--method', default='hybrid_b-prosac', metavar='MATCHING_ALGORITHM',
+        help='as the paper names them, such as class_bf, clip_prosac (default: %(default)s)')
+    parser.add_argument(
+        '--assets', type=Path, default=ASSETS, metavar='DIR',
+        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt '
+        'and, unless only classes are matched, clip.json and clip.safetensors')
+    parser.add_argument(
+        '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
+    return parser
+
+
+def demonstrate(options: argparse.Namespace) -> int:
+    """Run the demo as the command line asks; return the exit code."""
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise OptionsError(
+            f'ROS 2 is not there to run the nodes in ({error}): source it, or run script/setup'
+        ) from error
+    from cliploc_ros.demo.run import DemoOptions, run_demo
+
+    run_demo(DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
+                         rate=options.rate, method=options.method, rviz=options.rviz))
+    return 0
+
+
+def _at_least_one(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not a number of 1 or more')
+    return value
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

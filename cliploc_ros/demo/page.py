@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's wake-ups as a table, on the terminal and on a page with the pictures."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from cliploc_ros.demo.review import WRONG_M, Judged, Review
+from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
+
+TOP_VIEW = 'top_view.png'
+
+# Heading and width on the terminal.
+_COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('inliers', 7),
+            ('x y z [m]', 18), ('error', 15), ('answered in', 11), ('of which', 0))
+
+_STYLE = f"""\
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1280px;
+  padding: 0 1rem }}
+img {{ max-width: 100%; border: 1px solid #ddd }}
+table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums }}
+th, td {{ text-align: left; padding: .25rem .8rem; border-bottom: 1px solid #ddd }}
+.accepted {{ color: {ACCEPTED} }} .refused {{ color: {REFUSED} }}
+.note {{ background: #fff6e5; border-left: 4px solid #E69F00; padding: .6rem 1rem }}
+figure {{ margin: 2rem 0 }} figcaption {{ font-size: 14px; color: #555 }}
+"""
+
+_SYNTHETIC = """\
+<p class="note"><b>This world is synthetic.</b> Room, objects and images are computer graphics,
+made from a seed, and detector and CLIP are small networks trained on renders of other such rooms.
+What is real is the program: the nodes, the messages between them, the inference and the search
+are those that run on a robot. So this page shows that the whole system works. It does
+<em>not</em> show how well it recognizes real objects, copes with real light, lenses, dirt and
+motion, with labels that people wrote, or with a map that was made from real images; nor how
+large networks such as YOLOv8x and ViT-L/14 perform. For that, run it on your own
+recordings.</p>"""
+
+_HOW = """\
+<p>Boxes, hypotheses and figures in the table came over ROS from the two nodes; the errors are
+against the recording's ground truth, which the nodes never see. Which box belongs to which
+landmark is on no topic: for the pictures the search was repeated on the same detections with the
+same code, networks, options and seed, and its pose compared with the one that came over ROS
+({repeated}). CLIP is the cosine similarity of crop and label, rank its place among all labels of
+the map, IoU the overlap of box and projected landmark; ✓ and ✗, where there is one, compare with
+what the renderer drew there. A cross may also mean that the object has been moved since the
+map was made or is not in it.</p>"""
+
+
+def picture_name(judged: Judged) -> str:
+    """Return the file name of a wake-up's picture."""
+    return f'wake_up_{judged.number:02d}.png'
+
+
+def console_header() -> str:
+    """Return the headings of the table."""
+    return _line([heading for heading, _ in _COLUMNS])
+
+
+def console_row(judged: Judged) -> str:
+    """Return a wake-up as a line of the table."""
+    return _line(_cells(judged))
+
+
+def summary(judged: Sequence[Judged]) -> str:
+    """Return what came of all wake-ups, in a line."""
+    accepted = [one for one in judged if one.wake_up.accepted]
+    wrong = sum(one.is_wrong for one in accepted)
+    errors = [one.error[0] for one in accepted if one.error is not None]
+    text = (f'{len(judged)} wake-ups: {len(accepted)} accepted, {len(judged) - len(accepted)} '
+            f'refused, {wrong or "none"} wrong by more than {WRONG_M:g} m')
+    if errors:
+        text += f'; error {np.median(errors):.3f} m (median), {max(errors):.3f} m at most'
+    return text + f'; answered in {np.median([one.wake_up.answer_s for one in judged]):.2f} s ' \
+        '(median)'
+
+
+def write_page(folder: Path, reviews: Sequence[Review], method: str) -> Path:
+    """Write the page that shows all pictures; return its file."""
+    judged = [review.judged for review in reviews]
+    repeated = sum(review.repeated for review in reviews)
+    how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
+    page = folder / 'index.html'
+    page.write_text('\n'.join([
+        '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
+        '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
+        '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
+        f'{escape(method)}.</p>', _SYNTHETIC, _table(judged),
+        f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
+        '<figcaption>The map from above. Each estimate is joined to the truth; a pose that was '
+        'refused was told to nobody.</figcaption></figure>', how,
+        *map(_figure, judged), '</html>', '']), encoding='utf-8')
+    return page
+
+
+def _table(judged: Sequence[Judged]) -> str:
+    rows = [''.join(f'<th>{escape(heading)}</th>' for heading, _ in _COLUMNS)]
+    for one in judged:
+        kind = 'accepted' if one.wake_up.accepted else 'refused'
+        rows.append(''.join(f'<td class="{kind}">{escape(cell)}</td>' if cell == kind
+                            else f'<td>{escape(cell)}</td>' for cell in _cells(one)))
+    return '<table>' + ''.join(f'<tr>{row}</tr>' for row in rows) + '</table>'
+
+
+def _figure(judged: Judged) -> str:
+    said = escape(judged.wake_up.message)
+    return (f'<figure><img src="{picture_name(judged)}" loading="lazy" '
+            f'alt="wake-up {judged.number}: {escape(verdict(judged))}">'
+            f'<figcaption>“{said}”</figcaption></figure>')
+
+
+def _cells(judged: Judged) -> list[str]:
+    wake_up = judged.wake_up
+    position = '–'
+    if wake_up.accepted and judged.pose is not None:
+        position = ' '.join(f'{value:.2f}' for value in judged.pose[:3, 3])
+    stages = ', '.join(f'{stage} {ms} ms' for stage, ms in wake_up.stage_ms.items())
+    return [str(judged.number), f'{judged.time_s:.1f} s',
+            'accepted' if wake_up.accepted else 'refused', f'{wake_up.score:.2f}',
+            str(wake_up.inliers), position, _error(judged), f'{wake_up.answer_s:.2f} s', stages]
+
+
+def _error(judged: Judged) -> str:
+    """Return the error; in brackets if the pose was not published."""
+    if judged.error is None:
+        return '–'
+    text = f'{judged.error[0]:.3f} m {judged.error[1]:.1f}°'
+    return text if judged.wake_up.accepted else f'({text})'
+
+
+def _line(cells: Sequence[str]) -> str:
+    return '  '.join(cell.ljust(width) for cell, (_, width) in zip(cells, _COLUMNS, strict=True)
+                     ).rstrip()

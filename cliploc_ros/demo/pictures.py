@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's pictures of a wake-up: the camera image, and which box is which landmark."""
+
+import textwrap
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from cliploc_ros.core.ellipsoid import project_ellipsoids
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.transforms import invert_transform
+from cliploc_ros.demo.review import Review
+from cliploc_ros.demo.style import ACCEPTED, REFUSED, outline_points, verdict
+
+_DPI = 110
+_BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'
+_EDGED = (withStroke(linewidth=2.6, foreground='black', alpha=0.6),)
+# Of the panel beside the image: where each column begins, 0 to 1.
+_COLUMNS = {'box': 0.0, 'landmark': 0.065, 'CLIP': 0.73, 'rank': 0.815, 'IoU': 0.89, '': 0.965}
+_LABEL_CHARS = 54
+_LINE_CHARS = 88
+_MOST_ROWS = 34
+
+
+def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
+    """Draw the camera image with boxes and projected landmarks, and list the matches beside it.
+
+    Parameters
+    ----------
+    review : Review
+    landmark_map : LandmarkMap
+    path : Path
+        The PNG to write.
+    """
+    figure = Figure(figsize=(14.0, 6.9), dpi=_DPI)
+    _draw_title(figure, review)
+    image_axes = figure.add_axes((0.008, 0.075, 0.552, 0.84))
+    _draw_image(image_axes, review, landmark_map)
+    _draw_legend(figure)
+    panel = figure.add_axes((0.572, 0.03, 0.42, 0.885))
+    panel.set_axis_off()
+    panel.set(xlim=(0, 1), ylim=(_MOST_ROWS, -1))
+    _list_matches(panel, review, landmark_map)
+    figure.savefig(path)
+
+
+def _draw_title(figure: Figure, review: Review) -> None:
+    judged = review.judged
+    color = ACCEPTED if judged.wake_up.accepted else REFUSED
+    figure.text(0.008, 0.945, f'Wake-up {judged.number}: {verdict(judged)}', color=color,
+                fontsize=15, fontweight='bold')
+    wake_up = judged.wake_up
+    figure.text(0.992, 0.945, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
+                fontsize=11, ha='right')
+
+
+def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap) -> None:
+    height, width = review.image_rgb.shape[:2]
+    axes.imshow(review.image_rgb, interpolation='bilinear')
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    if review.judged.pose is not None and review.repeated:
+        _draw_landmarks(axes, review, landmark_map, review.judged.pose)
+    matched = {match.detection for match in review.matches}
+    for row, number in _reading_order(review).items():
+        left, top, right, bottom = review.detections.bboxes_xyxy[row]
+        color = _BOX if row in matched else _UNMATCHED
+        axes.add_patch(Rectangle(
+            (left, top), right - left, bottom - top, fill=False, edgecolor=color, linewidth=1.3,
+            linestyle='-' if row in matched else (0, (3, 2)), path_effects=_EDGED))
+        axes.text(max(left, 2) + 1, max(top, 2) + 1, str(number), fontsize=7.5, color='black',
+                  ha='left', va='top', clip_on=True,
+                  bbox={'boxstyle': 'square,pad=0.12', 'facecolor': color, 'edgecolor': 'none'})
+
+
+def _draw_landmarks(axes: Axes, review: Review, landmark_map: LandmarkMap,
+                    map_from_camera: NDArray[np.float64]) -> None:
+    """Draw the outlines of landmarks as the pose would show them: matched ones, and all others."""
+    matched = {match.landmark for match in review.matches}
+    outlines = project_ellipsoids(invert_transform(map_from_camera), landmark_map.centers,
+                                  landmark_map.shapes)
+    for landmark, outline in enumerate(outlines):
+        if not np.isfinite(outline).all():
+            continue
+        points = review.camera.project_normalized(outline_points(outline))
+        own = landmark in matched
+        axes.add_patch(Polygon(
+            points, closed=True, fill=False, edgecolor=_ELLIPSE if own else _EXPECTED,
+            linewidth=1.8 if own else 0.9, linestyle='-' if own else ':',
+            path_effects=_EDGED if own else None))
+
+
+def _draw_legend(figure: Figure) -> None:
+    lines = [
+        Line2D([], [], color=_BOX, linewidth=2, label='box with its landmark'),
+        Line2D([], [], color='#888888', linewidth=2, linestyle='--', label='box without one'),
+        Line2D([], [], color=_ELLIPSE, linewidth=2, label='matched landmark, projected'),
+        Line2D([], [], color='#B8A800', linewidth=1.5, linestyle=':',
+               label='any other landmark of the map')]
+    figure.legend(handles=lines, loc='lower left', bbox_to_anchor=(0.0, 0.0), ncol=4,
+                  frameon=False, fontsize=9)
+
+
+def _reading_order(review: Review) -> dict[int, int]:
+    """Return a number for the row of each detection, from left to right."""
+    order = np.argsort(review.detections.bboxes_xyxy[:, [0, 2]].sum(axis=1), kind='stable')
+    return {int(row): number for number, row in enumerate(order, start=1)}
+
+
+def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap) -> None:
+    line = _list_reason(panel, review, -0.5)
+    if not review.repeated:
+        panel.text(0, line, 'The search, repeated for this picture, ended elsewhere: '
+                            'no matches are shown.', fontsize=9, va='top')
+        return
+    for name, x in _COLUMNS.items():
+        if review.similarities is not None or name not in ('CLIP', 'rank'):
+            panel.text(x, line, name, fontsize=8.5, fontweight='bold', va='top')
+    line += 1.1
+    numbers = _reading_order(review)
+    for match in sorted(review.matches, key=lambda match: numbers[match.detection]):
+        cells = _match_cells(review, landmark_map, match.detection, match.landmark)
+        _write_row(panel, line, [str(numbers[match.detection]), *cells[:3], f'{match.iou:.2f}'],
+                   cells[3])
+        line += 1
+    _list_rest(panel, review, numbers, line + 0.4)
+
+
+def _list_reason(panel: Axes, review: Review, line: float) -> float:
+    """Write why there is no pose; return the next free line."""
+    if review.judged.wake_up.accepted:
+        return line
+    lines = textwrap.wrap('Refused: ' + review.judged.wake_up.reason, _LINE_CHARS)
+    if review.judged.pose is not None:
+        lines.append('Not published, what speaks for the best hypothesis:')
+    for text in lines:
+        panel.text(0, line, text, fontsize=9, va='top', color=REFUSED)
+        line += 1
+    return line + 0.3
+
+
+def _match_cells(review: Review, landmark_map: LandmarkMap, detection: int, landmark: int
+                 ) -> tuple[str, str, str, bool | None]:
+    """Return label, similarity and its rank as text, and whether the match is true."""
+    similarity = rank = ''
+    if review.similarities is not None:
+        row = review.similarities[detection]
+        similarity, rank = f'{row[landmark]:.2f}', str(1 + int((row > row[landmark]).sum()))
+    is_true = None if review.true_ids is None else (
+        review.true_ids[detection] == landmark_map.landmark_ids[landmark])
+    return landmark_map.labels[landmark], similarity, rank, is_true
+
+
+def _write_row(panel: Axes, line: float, cells: list[str], is_true: bool | None) -> None:
+    cells[1] = textwrap.shorten(cells[1], _LABEL_CHARS, placeholder='…')
+    for x, cell in zip(_COLUMNS.values(), cells, strict=False):
+        panel.text(x, line, cell, fontsize=8.5, va='top')
+    if is_true is not None:
+        panel.text(_COLUMNS[''], line, '✓' if is_true else '✗', fontsize=9, va='top',
+                   color=ACCEPTED if is_true else REFUSED, fontweight='bold')
+
+
+def _list_rest(panel: Axes, review: Review, numbers: dict[int, int], line: float) -> None:
+    """List the boxes without a landmark in as few lines as they need."""
+    matched = {match.detection for match in review.matches}
+    rest = [f'{number} {review.detections.class_ids[row]}' for row, number in numbers.items()
+            if row not in matched]
+    if rest:
+        text = 'No landmark there: ' + ', '.join(rest)
+        panel.text(0, line, textwrap.fill(text, _LINE_CHARS), fontsize=8.5, va='top',
+                   color='#555555')

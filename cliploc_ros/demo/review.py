@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's wake-ups beside the truth, and what no topic carries: which box is which landmark."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance import Match
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.relocalizer import Relocalization
+from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
+from cliploc_ros.demo.robot import WakeUp
+from cliploc_ros.demo.world.reading import TrueBox, read_frames
+
+#: Poses farther from the truth than this are wrong [m].
+WRONG_M = 1.0
+# A repeated search that ends up farther away than this is another one [m, deg].
+_SAME_POSE = (1e-6, 1e-4)
+_SAME_OBJECT_IOU = 0.5
+
+#: Makes an observation of image, camera, detections and stamp [ns].
+Observe = Callable[[NDArray[np.uint8], Camera, Detections, int], Observation]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A wake-up beside the truth.
+
+    Parameters
+    ----------
+    number : int
+        From 1.
+    wake_up : WakeUp
+    time_s : float
+        Of the image, from the start of the recording [s].
+    truth : ndarray (4, 4) or None
+        map_from_camera; None where the recording has none.
+    """
+
+    number: int
+    wake_up: WakeUp
+    time_s: float
+    truth: NDArray[np.float64] | None
+
+    @property
+    def pose(self) -> NDArray[np.float64] | None:
+        """Return the best hypothesis (4, 4), published or not; None if there is none."""
+        return self.wake_up.hypotheses[0] if self.wake_up.hypotheses else None
+
+    @property
+    def error(self) -> tuple[float, float] | None:
+        """Return the error of the best hypothesis [m, deg]; None where it cannot be known."""
+        if self.pose is None or self.truth is None:
+            return None
+        return pose_error(self.pose, self.truth)
+
+    @property
+    def is_wrong(self) -> bool:
+        """Return whether a pose was accepted that lies far from the truth."""
+        return self.wake_up.accepted and self.error is not None and self.error[0] > WRONG_M
+
+
+@dataclass(frozen=True)
+class Review:
+    """What a picture of a wake-up shows.
+
+    Parameters
+    ----------
+    judged : Judged
+    image_rgb : ndarray (h, w, 3) uint8
+    camera : Camera
+    detections : Detections
+        Those that the relocalizer used, n of them.
+    matches : tuple of Match
+        Inliers of the best hypothesis.
+    similarities : ndarray (n, L) or None
+        Of each crop with each label; None where only classes are matched.
+    true_ids : tuple of str, or None
+        Which object each detection really shows, '' if none; None where nobody knows.
+    repeated : bool
+        Whether the search, repeated for the picture, found the pose that came over the wire. If
+        not there are no matches.
+    """
+
+    judged: Judged
+    image_rgb: NDArray[np.uint8]
+    camera: Camera
+    detections: Detections
+    matches: tuple[Match, ...]
+    similarities: NDArray[np.float32] | None
+    true_ids: tuple[str, ...] | None
+    repeated: bool
+
+
+def judge(wake_up: WakeUp, number: int, sequence: TumSequence) -> Judged:
+    """Put a wake-up beside the truth."""
+    return Judged(number, wake_up, (wake_up.stamp_ns - sequence.stamps_ns[0]) / NS_PER_S,
+                  sequence.pose_at(wake_up.stamp_ns))
+
+
+def observe_classes(image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
+                    stamp_ns: int) -> Observation:
+    """Return an observation where only classes are matched."""
+    return Observation(camera, detections, stamp_ns=stamp_ns)
+
+
+class Reviewer:
+    """Repeats what the relocalizer did with a frame, with the same code, options and seed.
+
+    Parameters
+    ----------
+    sequence : TumSequence
+    camera : Camera
+    observe : Observe
+    relocalize : callable
+        Searches the pose of observations.
+    max_detections : int
+        The relocalizer's parameter of this name.
+    """
+
+    def __init__(self, sequence: TumSequence, camera: Camera, observe: Observe,
+                 relocalize: Callable[[Sequence[Observation]], Relocalization],
+                 max_detections: int) -> None:
+        self._sequence, self._camera = sequence, camera
+        self._observe, self._relocalize = observe, relocalize
+        self._max_detections = max_detections
+        self._true_boxes = _read_true_boxes(sequence.folder)
+
+    def review(self, judged: Judged) -> Review:
+        """Repeat the search of a wake-up."""
+        stamp = judged.wake_up.stamp_ns
+        image_rgb = _read_image(self._sequence.image_paths[self._sequence.stamps_ns.index(stamp)])
+        detections = judged.wake_up.detections.usable(
+            self._camera.width, self._camera.height, self._max_detections)
+        observation = self._observe(image_rgb, self._camera, detections, stamp)
+        found = self._relocalize([observation])
+        repeated = _same_pose(found.map_from_camera, judged.pose)
+        true_boxes = self._true_boxes.get(stamp)
+        return Review(judged, image_rgb, self._camera, detections,
+                      found.matches if repeated else (), observation.similarities,
+                      None if true_boxes is None else _true_ids(detections, true_boxes), repeated)
+
+
+def _same_pose(first: NDArray[np.float64] | None, second: NDArray[np.float64] | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    error_m, error_deg = pose_error(first, second)
+    return error_m < _SAME_POSE[0] and error_deg < _SAME_POSE[1]
+
+
+def _read_image(path: Path) -> NDArray[np.uint8]:
+    pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    assert pixels_bgr is not None  # it has been converted already
+    return np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
+
+
+def _read_true_boxes(folder: Path) -> dict[int, tuple[TrueBox, ...]]:
+    """Return what the generator of the world knows of each image, by stamp [ns]."""
+    if not (folder / 'truth.json').is_file():
+        return {}
+    return {parse_stamp_ns(frame.timestamp, 'truth.json'): frame.boxes
+            for frame in read_frames(folder, least_visibility=0.0)}
+
+
+def _true_ids(detections: Detections, true_boxes: tuple[TrueBox, ...]) -> tuple[str, ...]:
+    """Return the object whose visible part fills each box, or ''."""
+    ids = []
+    for bbox in detections.bboxes_xyxy:
+        ious = [_box_iou(bbox, true.bbox_xyxy) for true in true_boxes]
+        best = int(np.argmax(ious)) if ious else -1
+        ids.append(true_boxes[best].object_id if ious and ious[best] > _SAME_OBJECT_IOU else '')
+    return tuple(ids)
+
+
+def _box_iou(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
+    shared = float(np.prod(np.maximum(sides, 0.0)))
+    return shared / float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2])
+                          - shared)

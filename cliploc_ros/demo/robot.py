@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's robot: plays a recording, and where it wakes up asks where it is."""
+
+import re
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+from geometry_msgs.msg import Pose, PoseArray
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.demo.processes import DemoError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.bag_publisher import create_publisher
+from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns
+
+_PATIENCE_S = 60.0
+# How often a camera that stands still shows the same again.
+_FRAME_PERIOD_S = 0.2
+_SPIN_S = 0.02
+_NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class WakeUp:
+    """A request and its answer, as they came over the wire.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Of the image that was answered [ns].
+    accepted : bool
+        Whether the relocalizer published a pose.
+    message : str
+        What it said.
+    hypotheses : tuple of ndarray (4, 4)
+        map_from_camera of the distinct best, best first; the first is the pose published.
+    detections : Detections
+        Of the detector.
+    answer_s : float
+        From the request to the answer, the detector's work included [s].
+    """
+
+    stamp_ns: int
+    accepted: bool
+    message: str
+    hypotheses: tuple[NDArray[np.float64], ...]
+    detections: Detections
+    answer_s: float
+
+    @property
+    def score(self) -> float:
+        """Return the score that the relocalizer stated."""
+        return float(self._stated(r'score ([0-9.]+)'))
+
+    @property
+    def inliers(self) -> int:
+        """Return the number of inliers that the relocalizer stated."""
+        return int(self._stated(r'(\d+) inliers'))
+
+    @property
+    def stage_ms(self) -> dict[str, int]:
+        """Return the time that the relocalizer stated for each of its stages [ms]."""
+        return {stage: int(ms) for stage, ms in re.findall(r'(\w+) (\d+) ms', self.message)}
+
+    @property
+    def reason(self) -> str:
+        """Return why there is no pose, without the figures; empty if accepted."""
+        return '' if self.accepted else self.message.removeprefix('refused: ').split(' [')[0]
+
+    def _stated(self, pattern: str) -> str:
+        # the reason before the bracket may speak of scores too
+        found = re.search(pattern, self.message.rpartition(' [')[2])
+        return found[1] if found else '0'
+
+
+class Robot(Node):
+    """Publishes a recording, as the player does, but stops to ask.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The open recording.
+    check : callable
+        Called while waiting; raises when waiting has no sense any more.
+    """
+
+    def __init__(self, reader: BagReader, check: Callable[[], None]) -> None:
+        super().__init__('robot')
+        self._reader, self._check = reader, check
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._topics = {topic.name: create_publisher(self, topic, topic.name)
+                        for topic in reader.topics.values()}
+        self._client = self.create_client(Trigger, 'relocalizer/relocalize')
+        self._detections: dict[int, Detections] = {}
+        self._hypotheses: dict[int, tuple[NDArray[np.float64], ...]] = {}
+        self.create_subscription(Detection2DArray, 'detections', self._on_detections,
+                                 qos.DETECTIONS_OUT)
+        self.create_subscription(PoseArray, 'relocalizer/hypotheses', self._on_hypotheses,
+                                 qos.POSE)
+
+    def connect(self) -> None:
+        """Wait until detector and relocalizer are there to talk to."""
+        self._wait(lambda: self._client.service_is_ready()
+                   and self.count_publishers('detections') > 0
+                   and self.count_publishers('relocalizer/hypotheses') > 0)
+
+    def walk(self, wake_up_at: Collection[int], rate: float) -> Iterator[WakeUp]:
+        """Play the recording; at each of some stamps [ns] stop, ask, and yield the answer.
+
+        Parameters
+        ----------
+        wake_up_at : collection of int
+            Stamps of images [ns].
+        rate : float
+            Speed between them; 1 is as recorded.
+        """
+        last_ns = self._reader.start_ns
+        for stamp, group in groupby(self._reader.messages(), key=lambda message: message.stamp_ns):
+            self._rest((stamp - last_ns) / _NS_PER_S / rate)
+            last_ns, frame = stamp, list(group)
+            if stamp in wake_up_at:
+                yield self._wake_up(stamp, frame)
+            else:
+                self._publish(frame)
+
+    def _wake_up(self, stamp: int, frame: list[BagMessage]) -> WakeUp:
+        """Ask where this frame was taken, and show it until the answer comes."""
+        start = time.monotonic()
+        future = self._client.call_async(Trigger.Request())
+        shown_at = -np.inf
+
+        def answered() -> bool:
+            nonlocal shown_at
+            # The relocalizer alone listens to camera_info, and only until it has its frame.
+            if (self._topics['/camera_info'].get_subscription_count() > 0
+                    and time.monotonic() - shown_at >= _FRAME_PERIOD_S):
+                self._publish(frame)
+                shown_at = time.monotonic()
+            return bool(future.done())
+
+        self._wait(answered)
+        answer_s, answer = time.monotonic() - start, future.result()
+        if not answer.message.startswith(('accepted', 'refused')):
+            raise DemoError(f'the relocalizer found no answer: {answer.message}')
+        self._wait(lambda: stamp in self._hypotheses and stamp in self._detections)
+        return WakeUp(stamp, answer.success, answer.message, self._hypotheses[stamp],
+                      self._detections[stamp], answer_s)
+
+    def _publish(self, frame: list[BagMessage]) -> None:
+        for message in frame:
+            self._topics[message.topic].publish(message.data)
+
+    def _rest(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._check()
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+
+    def _wait(self, condition: Callable[[], bool]) -> None:
+        """Handle what arrives until a condition holds."""
+        deadline = time.monotonic() + _PATIENCE_S
+        while not condition():
+            self._check()
+            if time.monotonic() > deadline:
+                raise DemoError(f'nothing came over ROS for {_PATIENCE_S:g} s: does a firewall '
+                                'forbid UDP on this machine?')
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+
+    def _on_detections(self, msg: Detection2DArray) -> None:
+        self._detections[stamp_ns(msg.header.stamp)] = detections_from_msg(msg)
+
+    def _on_hypotheses(self, msg: PoseArray) -> None:
+        self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(map(_transform, msg.poses))
+
+
+def _transform(pose: Pose) -> NDArray[np.float64]:
+    p, q = pose.position, pose.orientation
+    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))

@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo from its start to its page of pictures."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.signals import SignalHandlerOptions
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import TumSequence, read_tum
+from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.demo import page
+from cliploc_ros.demo.pictures import draw_wake_up
+from cliploc_ros.demo.processes import (
+    DemoError,
+    Process,
+    installed_share,
+    node_command,
+    own_ros_domain,
+    running,
+)
+from cliploc_ros.demo.review import Judged, Observe, Review, Reviewer, judge, observe_classes
+from cliploc_ros.demo.robot import Robot
+from cliploc_ros.demo.top_view import draw_top_view
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
+
+# The first start compiles the kernels of the search.
+_PATIENCE_S = 180.0
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """How to run the demo.
+
+    Parameters
+    ----------
+    assets : Path
+        Holds sequence/ (a TUM folder), map.yaml, yolo.pt and, unless only classes are matched,
+        clip.json and clip.safetensors.
+    out : Path
+        Where the pictures go.
+    wake_ups : int
+        How often the robot wakes up.
+    rate : float
+        Speed of the recording between the wake-ups; 1 is as recorded.
+    method : str
+        Matching and algorithm as the paper joins them, ``hybrid_b-prosac``.
+    rviz : bool
+        Whether to open RViz where it is installed.
+    """
+
+    assets: Path
+    out: Path
+    wake_ups: int = 10
+    rate: float = 4.0
+    method: str = 'hybrid_b-prosac'
+    rviz: bool = False
+
+    @property
+    def parameters(self) -> dict[str, object]:
+        """Return the relocalizer's parameters that are not its defaults."""
+        matching, _, algorithm = self.method.partition('_')
+        parameters: dict[str, object] = {'map_file': self.assets / 'map.yaml',
+                                         'matching': matching, 'algorithm': algorithm}
+        if matching != 'class':
+            parameters |= {'clip_model': self.assets / 'clip.json',
+                           'clip_pretrained': self.assets / 'clip.safetensors'}
+        return parameters
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Return the values of all of the relocalizer's parameters."""
+        return {row.name: row.default for row in RELOCALIZER} | self.parameters
+
+
+def run_demo(options: DemoOptions) -> list[Judged]:
+    """Let the robot walk and wake up, and draw what it saw.
+
+    Returns
+    -------
+    list of Judged
+        The wake-ups.
+
+    Raises
+    ------
+    CliplocError
+        For assets that are missing or cannot be used, and where the nodes do not run.
+    """
+    start = time.monotonic()
+    relocalizer_options(options.values)  # refuses an unknown method before anything starts
+    _check_assets(options)
+    landmark_map = LandmarkMap.from_file(options.assets / 'map.yaml')
+    sequence = read_tum(options.assets / 'sequence')
+    _make_folder(options.out)
+    with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
+        bag = _convert(sequence, Path(folder) / 'walk', landmark_map.frame_id)
+        domain = stack.enter_context(own_ros_domain())
+        rviz = stack.enter_context(_rviz(options, landmark_map.frame_id))
+        judged = _walk(options, bag, sequence, domain)
+        print(page.summary(judged), flush=True)
+        index = _draw(options, landmark_map, sequence, judged)
+        print(f'pictures: {index.resolve()} ({time.monotonic() - start:.0f} s in all)', flush=True)
+        if rviz is not None:
+            print('close RViz to end')
+            rviz.wait()
+    return judged
+
+
+def _check_assets(options: DemoOptions) -> None:
+    needed = [options.assets / 'sequence', options.assets / 'yolo.pt',
+              *(value for value in options.parameters.values() if isinstance(value, Path))]
+    for path in needed:
+        if not path.exists():
+            raise DemoError(f'{path} is missing: run script/setup again, or give another folder '
+                            'with --assets')
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionsError(f'--out {folder}: cannot be made: {error.strerror}') from error
+
+
+def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:
+    camera, _ = find_camera(None, sequence.folder)
+    convert_tum(sequence, camera, bag, ConversionOptions(world_frame=frame_id))
+    print(f'a walk of {len(sequence)} images is now a recording', flush=True)
+    return bag
+
+
+@contextmanager
+def _rviz(options: DemoOptions, frame_id: str) -> Iterator[Process | None]:
+    """Open RViz if it is asked for and there."""
+    if options.rviz and shutil.which('rviz2'):
+        config = installed_share() / 'config' / 'demo.rviz'
+        with running(['rviz2', '-d', config, '-f', frame_id],
+                     options.out / 'rviz2.log') as process:
+            yield process
+        return
+    if options.rviz:
+        print('RViz (rviz2) is not installed or not sourced here: going on without it')
+    yield None
+
+
+def _walk(options: DemoOptions, bag: Path, sequence: TumSequence, domain: int) -> list[Judged]:
+    """Let the robot wake up along the recording; print each answer as it comes."""
+    chosen = np.linspace(0, len(sequence) - 1, min(options.wake_ups, len(sequence)))
+    wake_up_at = {sequence.stamps_ns[round(index)] for index in chosen}
+    judged: list[Judged] = []
+    with (_nodes(options, domain) as check, BagReader(bag) as reader,
+          _robot(reader, check) as robot):
+        robot.connect()
+        print('\n' + page.console_header(), flush=True)
+        for wake_up in robot.walk(wake_up_at, options.rate):
+            judged.append(judge(wake_up, len(judged) + 1, sequence))
+            print(page.console_row(judged[-1]), flush=True)
+    return judged
+
+
+@contextmanager
+def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
+    """Run detector and relocalizer; yield a function that raises when one has died."""
+    start = time.monotonic()
+    print(f'starting detector and relocalizer ({options.method}); to listen in: export '
+          f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
+    with (running(node_command('detector', {'model': options.assets / 'yolo.pt'}),
+                  options.out / 'detector.log') as detector,
+          running(node_command('relocalizer', options.parameters),
+                  options.out / 'relocalizer.log') as relocalizer):
+        detector.wait_for_output('detector ready', _PATIENCE_S)
+        relocalizer.wait_for_output('ready after', _PATIENCE_S)
+        print(f'both are ready after {time.monotonic() - start:.1f} s', flush=True)
+
+        def check() -> None:
+            detector.check()
+            relocalizer.check()
+
+        yield check
+
+
+@contextmanager
+def _robot(reader: BagReader, check: Callable[[], None]) -> Iterator[Robot]:
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        robot = Robot(reader, check)
+        yield robot
+        robot.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence,
+          judged: list[Judged]) -> Path:
+    """Draw all pictures and the page that shows them; return the page."""
+    reviewer = _reviewer(options, landmark_map, sequence)
+    reviews: list[Review] = []
+    for one in judged:
+        reviews.append(reviewer.review(one))
+        draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(one))
+    draw_top_view(judged, landmark_map, _walked(sequence), options.out / page.TOP_VIEW)
+    return page.write_page(options.out, reviews, options.method)
+
+
+def _walked(sequence: TumSequence) -> NDArray[np.float64]:
+    """Return where the camera was while it took images (t, 3) [m]."""
+    truth = sequence.trajectory
+    first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
+    return truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]
+
+
+def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence) -> Reviewer:
+    values = options.values
+    method = relocalizer_options(values)
+    camera, _ = find_camera(None, sequence.folder)
+
+    observe: Observe = observe_classes
+    if method.needs_similarities:
+        from cliploc_ros.models.clip_encoder import load_encoder
+        from cliploc_ros.models.observer import Observer
+        observe = Observer(*load_encoder(
+            ClipOptions(model=str(values['clip_model']),
+                        pretrained=str(values['clip_pretrained'])),
+            landmark_map.labels)).observe
+    return Reviewer(sequence, camera, observe, Relocalizer(landmark_map, method).relocalize,
+                    values['max_detections'])
