@@ -63,8 +63,8 @@ RELOCALIZER = (
     ParameterRow('min_evidence', 4.0, 'A pose with less evidence (score plus twice its margin '
                  'over the best elsewhere) is refused.', low=0.0, high=1e6),
     ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),
-    ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config (.json).',
-                 read_only=True),
+    ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config '
+                 '(.json).', read_only=True),
     ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
                  read_only=True),
     ParameterRow('clip_checkpoint_path', '', 'Local file with the weights of that tag; empty: '
