@@ -103,10 +103,10 @@ def run_demo(options: DemoOptions) -> list[Judged]:
     """
     start = time.monotonic()
     relocalizer_options(options.values)  # refuses an unknown method before anything starts
+    _make_folder(options.out)
     _check_assets(options)
     landmark_map = LandmarkMap.from_file(options.assets / 'map.yaml')
     sequence = read_tum(options.assets / 'sequence')
-    _make_folder(options.out)
     with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
         bag = _convert(sequence, Path(folder) / 'walk', landmark_map.frame_id)
         domain = stack.enter_context(own_ros_domain())

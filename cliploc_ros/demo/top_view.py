@@ -19,7 +19,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.demo.review import Judged
 from cliploc_ros.demo.style import ACCEPTED, REFUSED, outline_points
 
-_DPI = 130
+_DPI = 140
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
@@ -79,7 +79,7 @@ def _draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, .
         axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=colors[class_id],
                                edgecolor='#333333', linewidth=0.5, alpha=0.55, zorder=3))
     for place, names in _places(landmark_map):
-        axes.text(place[0], place[1], '\n'.join(names), fontsize=4.6, ha='center', va='center',
+        axes.text(place[0], place[1], '\n'.join(names), fontsize=5.4, ha='center', va='center',
                   zorder=4, linespacing=0.95, path_effects=_EDGED)
     return colors
 
@@ -117,7 +117,8 @@ def _draw_wake_up(axes: Axes, judged: Judged) -> None:
     if judged.truth is not None:
         ends = np.stack([judged.truth[:2, 3], judged.pose[:2, 3]])
         axes.plot(ends[:, 0], ends[:, 1], color=color, zorder=6,
-                  linewidth=1.6 if judged.wake_up.accepted else 0.9,
+                  linewidth=1.6 if judged.wake_up.accepted else 0.8,
+                  alpha=1.0 if judged.wake_up.accepted else 0.6,
                   linestyle='-' if judged.wake_up.accepted else (0, (4, 3)))
 
 
@@ -131,8 +132,8 @@ def _draw_camera(axes: Axes, map_from_camera: NDArray[np.float64], color: str, m
 
 
 def _number(axes: Axes, map_from_camera: NDArray[np.float64], number: int, color: str) -> None:
-    """Write the wake-up's number behind the camera."""
-    x, y = map_from_camera[:2, 3] - 0.16 * map_from_camera[:2, 2]
+    """Write the wake-up's number behind the camera, to its left."""
+    x, y = map_from_camera[:2, 3] - 0.11 * (map_from_camera[:2, 2] + map_from_camera[:2, 0])
     axes.text(x, y, str(number), fontsize=10, fontweight='bold', color=color, ha='center',
               va='center', zorder=8, path_effects=_EDGED)
 

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo as a user runs it: the installed executable, to its end or to Ctrl-C."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[2]
+ASSETS = PROJECT / 'cliploc_ros' / 'demo' / 'assets'
+MISSING = [name for name in ('sequence', 'map.yaml', 'yolo.pt', 'clip.json', 'clip.safetensors')
+           if not (ASSETS / name).exists()]
+needs_assets = pytest.mark.skipif(
+    bool(MISSING), reason=f'the shipped assets are not all there yet: {", ".join(MISSING)}')
+
+WAKE_UPS = 10
+PATIENCE_S = 300.0
+ROW = re.compile(r'^(\d+) .*?(accepted|refused) .*?\(?([0-9.]+) m [0-9.]+°', re.MULTILINE)
+
+
+def start(executables, *arguments):
+    return subprocess.Popen([executables / 'demo', *map(str, arguments)], text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def run(executables, *arguments):
+    process = start(executables, *arguments)
+    output, errors = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, output, errors
+
+
+@pytest.fixture(scope='module')
+def finished(executables, tmp_path_factory):
+    """One run to its end: the folder of its pictures, and its output."""
+    out = tmp_path_factory.mktemp('demo') / 'pictures'
+    code, output, errors = run(executables, '--out', out, '--rviz', '--wake-ups', WAKE_UPS)
+    assert code == 0, errors
+    return out, output
+
+
+@needs_assets
+def test_poses_are_right_or_refused(finished):
+    _, output = finished
+    print(output)
+    rows = ROW.findall(output)
+    errors_m = [float(error) for _, answer, error in rows if answer == 'accepted']
+    assert f'{WAKE_UPS} wake-ups: {len(errors_m)} accepted' in output
+    assert errors_m
+    assert max(errors_m) < 1.0
+
+
+@needs_assets
+def test_pictures_show_something(finished):
+    out, _ = finished
+    pictures = sorted(out.glob('*.png'))
+    assert [picture.name for picture in pictures] == [
+        'top_view.png', *(f'wake_up_{number:02d}.png' for number in range(1, WAKE_UPS + 1))]
+    pixels = [cv2.imread(str(picture)) for picture in pictures]
+    for image in pixels:
+        assert min(image.shape[:2]) > 600
+        assert image.std() > 20
+    assert all(np.any(first != second) for first, second in pairwise(pixels[1:]))
+
+
+@needs_assets
+def test_the_page_shows_all_and_says_what_it_does_not(finished):
+    out, output = finished
+    page = (out / 'index.html').read_text()
+    for picture in out.glob('*.png'):
+        assert f'src="{picture.name}"' in page
+    assert 'This world is synthetic' in page
+    assert f'equal in {WAKE_UPS} of {WAKE_UPS} cases' in page
+    assert str(out / 'index.html') in output
+
+
+@needs_assets
+@pytest.mark.skipif(shutil.which('rviz2') is not None, reason='RViz is there, and would open')
+def test_without_rviz_it_says_so_and_goes_on(finished):
+    assert 'RViz (rviz2) is not installed' in finished[1]
+
+
+def children(pid):
+    """Return the processes that a process has started."""
+    return [int(child) for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+@needs_assets
+@pytest.mark.parametrize(('number', 'expected'), [
+    (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
+def test_no_process_outlives_it(executables, tmp_path, number, expected):
+    process = start(executables, '--out', tmp_path, '--rate', '0.5')
+    for line in process.stdout:
+        if line.startswith('both are ready'):
+            break
+    nodes = children(process.pid)
+    assert len(nodes) == 2
+    os.kill(process.pid, number)
+    process.communicate(timeout=20)
+    assert process.returncode == expected
+    deadline = time.monotonic() + 10
+    while any(Path(f'/proc/{node}').exists() for node in nodes):
+        assert time.monotonic() < deadline, 'a node lives on'
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (['--assets', '/nowhere'], '/nowhere/sequence is missing'),
+    (['--method', 'class_prosac'], "algorithm 'prosac'"),
+    (['--method', 'telepathy'], "'telepathy' is none of"),
+    (['--out', '/proc/demo'], '--out /proc/demo'),
+])
+def test_bad_input_is_named_in_one_line(executables, tmp_path, arguments, named):
+    code, output, errors = run(executables, '--out', tmp_path, *arguments)
+    assert code == 1, output
+    assert errors.startswith('error: ')
+    assert named in errors
+    assert len(errors.splitlines()) == 1
