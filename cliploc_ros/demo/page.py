@@ -12,6 +12,8 @@ from cliploc_ros.demo.review import WRONG_M, Judged, Review
 from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
 
 TOP_VIEW = 'top_view.png'
+#: Pattern of the wake-ups' pictures.
+PICTURES = 'wake_up_??.png'
 
 # Heading and width on the terminal.
 _COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('inliers', 7),
@@ -51,7 +53,7 @@ map was made or is not in it.</p>"""
 
 def picture_name(judged: Judged) -> str:
     """Return the file name of a wake-up's picture."""
-    return f'wake_up_{judged.number:02d}.png'
+    return PICTURES.replace('??', f'{judged.number:02d}')
 
 
 def console_header() -> str:

@@ -131,10 +131,13 @@ def _check_assets(options: DemoOptions) -> None:
 
 
 def _make_folder(folder: Path) -> None:
+    """Make the folder for the pictures, and remove those of an earlier demo."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        for picture in folder.glob(page.PICTURES):
+            picture.unlink()
     except OSError as error:
-        raise OptionsError(f'--out {folder}: cannot be made: {error.strerror}') from error
+        raise OptionsError(f'--out {folder}: cannot be written to: {error.strerror}') from error
 
 
 def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:

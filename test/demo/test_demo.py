@@ -124,3 +124,15 @@ def test_bad_input_is_named_in_one_line(executables, tmp_path, arguments, named)
     assert errors.startswith('error: ')
     assert named in errors
     assert len(errors.splitlines()) == 1
+
+
+def test_weights_that_do_not_load_are_named(executables, tmp_path):
+    for name in ('sequence', 'map.yaml'):
+        (tmp_path / name).symlink_to(ASSETS / name)
+    (tmp_path / 'yolo.pt').write_text('no weights')
+    code, _, errors = run(executables, '--assets', tmp_path, '--method', 'class_ransac',
+                          '--out', tmp_path / 'out')
+    assert code == 1
+    assert errors.startswith('error: the detector does not become ready')
+    assert str(tmp_path / 'yolo.pt') in errors
+    assert 'Traceback' not in errors
