@@ -87,6 +87,12 @@ def train(data: Path, desk: Path, *, architecture: Path, epochs: int, imgsz: int
     return ultralytics.YOLO(desk / 'run' / 'weights' / 'last.pt')
 
 
+def score(model: Any, data: Path, desk: Path) -> Any:
+    """Score a model of ultralytics on the part 'val' of a data set; return its metrics."""
+    return model.val(data=str(data), imgsz=CAMERA.width, batch=8, device='cpu', workers=0,
+                     plots=False, verbose=False, project=str(desk), name='val')
+
+
 def save(model: Any, path: Path) -> None:
     """Write the weights in half precision, whole or not at all, without paths of this machine."""
     import torch
@@ -122,8 +128,7 @@ def run(arguments: list[str]) -> int:
         model = train(data, desk, architecture=options.architecture, epochs=options.epochs,
                       imgsz=options.imgsz, batch=options.batch, seed=options.seed,
                       threads=options.threads)
-        scores = model.val(data=str(data), imgsz=CAMERA.width, batch=8, device='cpu', workers=0,
-                           plots=False, verbose=False, project=name, name='val')
+        scores = score(model, data, desk)
         save(model, options.out)
     print(f'{len(held_out)} worlds held out: mAP50 {scores.box.map50:.3f}, '
           f'mAP50-95 {scores.box.map:.3f}')
