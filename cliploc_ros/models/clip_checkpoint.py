@@ -42,10 +42,10 @@ def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
         raise ModelError(f'{file} cannot be read: {error.strerror}') from error
     except Exception as error:  # each format and version has exceptions of its own
         raise damaged(file, _first_line(error)) from error
-    state = _unwrap(state)
-    if not state:
-        raise ModelError(f'{file} is no checkpoint of CLIP: it holds no tensors by name')
-    return convert_to_custom_text_state_dict(state)
+    tensors = _unwrap(state)
+    if not tensors:
+        raise ModelError(f'{file} is no checkpoint of CLIP: {_content(state)}')
+    return convert_to_custom_text_state_dict(tensors)
 
 
 def copy_tensors(
@@ -111,6 +111,17 @@ def _unwrap(state: object) -> 'dict[str, torch.Tensor]':
         return {}
     return {str(name).removeprefix('module.'): tensor for name, tensor in state.items()
             if isinstance(tensor, torch.Tensor)}
+
+
+def _content(state: object) -> str:
+    """Say what was read instead of tensors.
+
+    Once ultralytics has loaded a detector, its classes pass PyTorch's check of pickles for as long
+    as the process lives, and a detector is read whole.
+    """
+    values = state.values() if isinstance(state, dict) else [state]
+    types = sorted({f'{type(value).__module__}.{type(value).__qualname__}' for value in values})
+    return f'it holds no tensors by name, but {", ".join(types[:8]) or "nothing"}'
 
 
 def _groups(
