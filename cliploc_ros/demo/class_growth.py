@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's claim, with real networks: ``python -m cliploc_ros.demo.class_growth --out DIR``.
 
-Rooms in which all objects are of one class, more and more of them. Matching by class must then
-try ever more correspondences, and finds the right ones ever more rarely; labels tell them apart.
+Rooms of 48 objects each: of eight classes, then of four, of two, of one. What is seen stays as
+much, but more and more of it is of the same class. Matching by class must then try ever more
+correspondences, and finds the right ones ever more rarely; labels tell them apart.
 """
 
 import argparse
@@ -19,10 +20,13 @@ from tqdm import tqdm
 from cliploc_ros.cli.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.demo.compare import as_input, record
+from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.table import Row, as_markdown, measure
 
+#: Objects of each class; the fewer the classes, the more.
 COUNTS = (6, 12, 24, 48)
-CLASS_ID = 'book'
+_TOTAL = 48
+_CLASSES = ('book', 'box', 'bottle', 'plant', 'mug', 'can', 'bowl', 'clock')
 METHODS = ('class_ransac', 'class_bf', 'hybrid_ransac', 'hybrid_b-prosac')
 _SUCCESS_M = 0.5
 _TRIALS = 5
@@ -31,20 +35,21 @@ _BF_BUDGET_S = 2.0
 
 
 def render(folder: Path, count: int, images: int, seed: int) -> None:
-    """Render a room with so many objects of one class, all of them in the map."""
+    """Render a room with so many objects of each class, all of them in the map."""
     from cliploc_ros.demo.world.recording import record as record_walk
     from cliploc_ros.demo.world.recording import write_true_map
     from cliploc_ros.demo.world.renderer import Light, Renderer
     from cliploc_ros.demo.world.room import make_room
     from cliploc_ros.demo.world.trajectories import CAMERA, query_walk
 
-    room = make_room(seed, {CLASS_ID: count}, unknown=0)
+    counts = dict.fromkeys(_CLASSES[:_TOTAL // count], count)
+    room = make_room(seed, counts, unknown=0)
     record_walk(folder, room, Renderer(room, CAMERA, Light()), query_walk(images), seed=seed)
     write_true_map(folder / 'map.yaml', room)
 
 
 def plot(rows: Mapping[int, Sequence[Row]], path: Path) -> None:
-    """Draw success and time over the number of objects, the key of the rows."""
+    """Draw success and time over the number of objects of a class, the key of the rows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -62,7 +67,7 @@ def plot(rows: Mapping[int, Sequence[Row]], path: Path) -> None:
     for axes in (left, right):
         axes.set_xscale('log', base=2)
         axes.set_xticks([*rows], [str(count) for count in rows])
-        axes.set_xlabel(f'objects in the map, all of class {CLASS_ID}')
+        axes.set_xlabel(f'objects of the same class, of {_TOTAL} in the map')
         axes.grid(alpha=0.3)
     left.set_ylim(-0.02, 1.02)
     left.set_ylabel(f'success (within {_SUCCESS_M:g} m)')
@@ -80,7 +85,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--images', type=int, default=24, help='of each room (%(default)s)')
     parser.add_argument('--seed', type=int, default=70)
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     rows: dict[int, list[Row]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
         rooms = {count: Path(name) / str(count) for count in COUNTS}
@@ -95,7 +100,7 @@ def run(arguments: list[str]) -> int:
             queries = as_input(record(folder, landmark_map, folder))
             rows[count] = [measure(method, landmark_map, queries, trials=_TRIALS, iterations=500,
                                    bf_budget_s=_BF_BUDGET_S) for method in METHODS]
-            print(f'\n{count} objects\n{as_markdown(rows[count])}', flush=True)
+            print(f'\n{count} objects of each class\n{as_markdown(rows[count])}', flush=True)
     plot(rows, options.out / 'class_growth.png')
     print(f'wrote {options.out / "class_growth.png"}')
     return 0

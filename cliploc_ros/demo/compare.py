@@ -25,6 +25,7 @@ from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import train_detector
 from cliploc_ros.demo.world.reading import TrueFrame, read_frames
+from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.recording import observation_of, record_queries
 from cliploc_ros.evaluation.table import METHODS, Query, as_markdown, measure
 from cliploc_ros.models.clip_encoder import load_encoder
@@ -76,8 +77,8 @@ def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
                 similarities = frame.similarities[int(np.argmax(overlaps))]
                 own = similarities[landmark_ids.index(box.object_id)]
                 ranks.append(int((similarities > own).sum()))
-    counted = np.array(ranks)
-    return float((counted < 1).mean()), float((counted < 3).mean()), len(ranks)
+    counted, number = np.array(ranks), max(len(ranks), 1)
+    return int((counted < 1).sum()) / number, int((counted < 3).sum()) / number, len(ranks)
 
 
 def _overlaps(bbox: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,7 +101,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--bf-budget', type=float, default=2.0, metavar='S',
                         help='bf is cut short after so long a query [s] (%(default)s)')
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_compare_') as cache:
         queries = record(ASSETS / 'sequence', landmark_map, Path(cache))

@@ -35,7 +35,7 @@ from cliploc_ros.demo.processes import (
 from cliploc_ros.demo.review import Judged, Observe, Review, Reviewer, judge, observe_classes
 from cliploc_ros.demo.robot import Robot
 from cliploc_ros.demo.top_view import draw_top_view
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
 
@@ -132,12 +132,9 @@ def _check_assets(options: DemoOptions) -> None:
 
 def _make_folder(folder: Path) -> None:
     """Make the folder for the pictures, and remove those of an earlier demo."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for picture in folder.glob(page.PICTURES):
-            picture.unlink()
-    except OSError as error:
-        raise OptionsError(f'--out {folder}: cannot be written to: {error.strerror}') from error
+    make_folder(folder)
+    for picture in folder.glob(page.PICTURES):
+        picture.unlink()
 
 
 def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:

@@ -17,10 +17,6 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros' / 'demo' / 'assets'
-MISSING = [name for name in ('sequence', 'map.yaml', 'yolo.pt', 'clip.json', 'clip.safetensors')
-           if not (ASSETS / name).exists()]
-needs_assets = pytest.mark.skipif(
-    bool(MISSING), reason=f'the shipped assets are not all there yet: {", ".join(MISSING)}')
 
 WAKE_UPS = 10
 PATIENCE_S = 300.0
@@ -47,7 +43,6 @@ def finished(executables, tmp_path_factory):
     return out, output
 
 
-@needs_assets
 def test_poses_are_right_or_refused(finished):
     _, output = finished
     print(output)
@@ -58,7 +53,6 @@ def test_poses_are_right_or_refused(finished):
     assert max(errors_m) < 1.0
 
 
-@needs_assets
 def test_pictures_show_something(finished):
     out, _ = finished
     pictures = sorted(out.glob('*.png'))
@@ -71,7 +65,6 @@ def test_pictures_show_something(finished):
     assert all(np.any(first != second) for first, second in pairwise(pixels[1:]))
 
 
-@needs_assets
 def test_the_page_shows_all_and_says_what_it_does_not(finished):
     out, output = finished
     page = (out / 'index.html').read_text()
@@ -82,7 +75,6 @@ def test_the_page_shows_all_and_says_what_it_does_not(finished):
     assert str(out / 'index.html') in output
 
 
-@needs_assets
 @pytest.mark.skipif(shutil.which('rviz2') is not None, reason='RViz is there, and would open')
 def test_without_rviz_it_says_so_and_goes_on(finished):
     assert 'RViz (rviz2) is not installed' in finished[1]
@@ -93,7 +85,6 @@ def children(pid):
     return [int(child) for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
-@needs_assets
 @pytest.mark.parametrize(('number', 'expected'), [
     (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
 def test_no_process_outlives_it(executables, tmp_path, number, expected):

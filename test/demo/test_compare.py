@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's table and the growth of a class in the demo's world, with its real networks."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.demo.class_growth import METHODS as GROWTH_METHODS
+from cliploc_ros.demo.class_growth import plot
+from cliploc_ros.demo.compare import score_clip
+from cliploc_ros.evaluation.table import METHODS, Row
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+def compare(folder, *arguments):
+    return subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.demo.compare', '--out', str(folder), *arguments],
+        cwd=PROJECT, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope='module')
+def compared(tmp_path_factory):
+    """The folder and the output of a comparison, with little time for the exhaustive methods."""
+    folder = tmp_path_factory.mktemp('compare')
+    done = compare(folder, '--bf-budget', '0.05', '--trials', '3')
+    assert done.returncode == 0, done.stderr
+    print('\n' + done.stdout)
+    return folder, done.stdout
+
+
+@pytest.fixture(scope='module')
+def limits():
+    return yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['table']
+
+
+def test_the_networks_know_a_walk_they_never_saw(compared, limits):
+    map50, first, third = map(float, re.search(
+        r'mAP50 ([.0-9]+); CLIP: top-1 ([.0-9]+), top-3 ([.0-9]+)', compared[1]).groups())
+    assert map50 >= limits['map50']
+    assert first >= limits['clip_top_1']
+    assert third >= limits['clip_top_3']
+
+
+def test_labels_lead_where_classes_do_not(compared, limits):
+    table = (compared[0] / 'table.md').read_text()
+    assert table in compared[1]
+    rows = re.findall(r'^\| (\S+) \| ([.0-9]+) / ([.0-9]+) / ([.0-9]+) .* (\d+) of \d+ \|$', table,
+                      re.MULTILINE)
+    assert [row[0] for row in rows] == list(METHODS)
+    success = {row[0]: float(row[2]) for row in rows}
+    assert success['hybrid_b-prosac'] >= limits['hybrid_b-prosac_at_half_a_metre']
+    assert success['hybrid_b-prosac'] > success['class_ransac']
+    wrong = {row[0]: int(row[4]) for row in rows}
+    assert wrong['hybrid_b-prosac'] == 0
+
+
+def test_what_was_recorded_can_be_read_again(compared):
+    queries = load_queries(compared[0] / 'queries.npz')
+    assert len(tuple(queries)) == 48
+
+
+def test_a_score_without_a_hit_is_none():
+    assert score_clip((), (), ()) == (0, 0, 0)
+
+
+def test_bad_input_is_named_in_one_line():
+    done = compare('/proc/compare')
+    assert done.returncode == 1
+    assert done.stderr.startswith('error: ')
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_figure_shows_every_method(tmp_path):
+    def row(method, count):
+        return Row(method, np.full((1, 4), count / 50), np.zeros((1, 4), bool), count, 1.0)
+
+    path = tmp_path / 'growth.png'
+    plot({count: [row(method, count) for method in GROWTH_METHODS] for count in (6, 48)}, path)
+    image = cv2.imread(str(path))
+    assert image.shape[0] > 300
+    assert image.std() > 20

@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's walk as a recording, through real nodes with the real networks trained for it."""
+
+import numpy as np
+import pytest
+import yaml
+from conftest import PROJECT
+from wake_ups import judge, wake_up_on_every_frame
+
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.datasets.tum import read_tum
+
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+FRAMES = 48
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch):
+    output = tmp_path / 'walk'
+    monkeypatch.setattr('sys.argv', ['tum_to_bag', str(ASSETS / 'sequence'), str(output)])
+    assert tum_to_bag() == 0
+    return output
+
+
+def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
+    print()
+    start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
+        'detector ready')
+    start('nodes.relocalizer', parameters={
+        'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid', 'algorithm': 'b-prosac',
+        'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
+        'cache_dir': tmp_path}).wait_for_output('ready after')
+    tester.connect()
+    start('cli.replay', recording, '--loop', '--rate', '2')
+    answers = wake_up_on_every_frame(tester, FRAMES)
+    errors_m, wrong = judge(answers, read_tum(ASSETS / 'sequence'))
+    limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['nodes']
+    assert np.mean(errors_m < 0.5) >= limits['success_at_half_a_metre']
+    assert wrong <= limits['accepted_wrong_by_1m']
+    assert sum(not answer.success for answer, _ in answers.values()) >= limits['refused']
