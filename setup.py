@@ -37,6 +37,8 @@ setup(
             'ultralytics-opencv-headless',
         ],
         'datasets': ['rosbags'],
+        'demo': ['matplotlib'],
+        'worlds': ['vtk'],  # renders them
         'test': ['hypothesis', 'pytest'],
     },
     zip_safe=False,

@@ -34,7 +34,7 @@ def main() -> None:
     """Make worlds, several at once, each from its own seed."""
     parser = argparse.ArgumentParser(prog='make_worlds', description=__doc__)
     parser.add_argument('folder', type=Path, metavar='DIR')
-    parser.add_argument('--count', type=int, default=100, help='number of worlds (%(default)s)')
+    parser.add_argument('--count', type=int, default=90, help='number of worlds (%(default)s)')
     parser.add_argument('--frames', type=int, default=10, help='images of each (%(default)s)')
     parser.add_argument('--seed', type=int, default=1000, help='of the first (%(default)s)')
     parser.add_argument('--jobs', type=int, default=multiprocessing.cpu_count(),

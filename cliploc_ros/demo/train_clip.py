@@ -160,7 +160,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('worlds', type=Path, metavar='WORLDS', help='folder of make_worlds')
     parser.add_argument('--out', type=Path, required=True, help='.safetensors file to write')
     parser.add_argument('--config', type=Path, default=CONFIG, help='open_clip model config')
-    parser.add_argument('--steps', type=int, default=1600)
+    parser.add_argument('--steps', type=int, default=1500)
     parser.add_argument('--batch', type=int, default=192, help='crops a step')
     parser.add_argument('--threads', type=int, default=2)
     parser.add_argument('--seed', type=int, default=0)

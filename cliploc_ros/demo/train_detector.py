@@ -115,7 +115,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('worlds', type=Path, metavar='WORLDS', help='folder of make_worlds')
     parser.add_argument('--out', type=Path, required=True, help='.pt file to write')
     parser.add_argument('--architecture', type=Path, default=ARCHITECTURE)
-    parser.add_argument('--epochs', type=int, default=14)
+    parser.add_argument('--epochs', type=int, default=12)
     parser.add_argument('--imgsz', type=int, default=480, help='longer side in training [px]')
     parser.add_argument('--batch', type=int, default=8, help='images a step')
     parser.add_argument('--threads', type=int, default=2)
