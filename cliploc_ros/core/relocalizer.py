@@ -60,6 +60,8 @@ class Relocalization:
         How long association, search and verification took [ms].
     stamp_ns : int
         Stamp of the observation [ns].
+    evidence : float
+        What acceptance compares with min_evidence; 0 when nothing was found.
     """
 
     accepted: bool
@@ -72,6 +74,7 @@ class Relocalization:
     coverage: float = 1.0
     search_ms: float = 0.0
     stamp_ns: int = 0
+    evidence: float = 0.0
 
     @property
     def solved(self) -> bool:
@@ -226,13 +229,15 @@ class Relocalizer:
                                  hypotheses[0].map_from_camera)
         bboxes = observation.detections.bboxes_xyxy
         supports = [support(matches, bboxes) for matches in explained]
-        reason = refusal(Evidence(
+        evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
-            coverage=progress.coverage), self._options)
+            coverage=progress.coverage)
+        reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
                               progress.tried, int(leaders.iterations[ranked[0]]),
-                              progress.coverage, _elapsed_ms(start), observation.stamp_ns)
+                              progress.coverage, _elapsed_ms(start), observation.stamp_ns,
+                              evidence.strength)
 
 
 def _matches(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
