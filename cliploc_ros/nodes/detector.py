@@ -10,9 +10,10 @@ from sensor_msgs.msg import CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.messages import image_from_msg
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detections_to_msg, image_from_msg
+from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.parameters import NodeParameters, Value
 from cliploc_ros.ros.process import WorkingNode, run_node
 from cliploc_ros.ros.subscription import AdaptiveSubscription

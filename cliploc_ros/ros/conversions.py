@@ -4,12 +4,10 @@
 
 import math
 
-import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseArray, PoseWithCovarianceStamped
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import (
     BoundingBox2D,
@@ -19,116 +17,13 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
-from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.transforms import quaternion_from_transform
-from cliploc_ros.errors import CameraError, ImageError
-
-# Where red, green and blue stand in each pixel, and how many bytes it has.
-_CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
-             'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
-             'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
-# A small file may claim any size: what is decoded is bounded to 200 MB.
-_MAX_PIXELS = 2**26
-_PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
-# the markers of JPEG that begin a frame, with its size in it
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def stamp_ns(stamp: Time) -> int:
     """Return a message's time stamp in nanoseconds."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def image_from_msg(msg: Image | CompressedImage) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3) uint8, red first.
-
-    Raises
-    ------
-    ImageError
-        Names what in the message cannot be.
-    """
-    return _decoded(msg) if isinstance(msg, CompressedImage) else _unpacked(msg)
-
-
-def _unpacked(msg: Image) -> NDArray[np.uint8]:
-    if msg.encoding not in _CHANNELS:
-        raise ImageError(f"image encoding '{msg.encoding}' is none of {', '.join(_CHANNELS)}")
-    order, channels = _CHANNELS[msg.encoding]
-    _check_size(msg.width, msg.height)
-    if msg.step < msg.width * channels:
-        raise ImageError(f'image step {msg.step} is shorter than a row of {msg.width} '
-                         f'{msg.encoding} pixels')
-    if len(msg.data) < msg.step * msg.height:
-        raise ImageError(f'image data has {len(msg.data)} bytes, but {msg.height} rows of '
-                         f'{msg.step} bytes are {msg.step * msg.height}')
-    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
-    pixels = rows.reshape(msg.height, msg.step)[:, :msg.width * channels]
-    pixels = pixels.reshape(msg.height, msg.width, channels)
-    return np.ascontiguousarray(pixels[:, :, order])
-
-
-def _decoded(msg: CompressedImage) -> NDArray[np.uint8]:
-    _check_size(*_declared_size(bytes(msg.data), msg.format))
-    data = np.frombuffer(msg.data, dtype=np.uint8)
-    try:
-        # EXIF may ask to turn the picture, but the intrinsics are those of the sensor.
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
-                         ) from error
-    if image is None:
-        raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
-    return np.ascontiguousarray(image[:, :, ::-1])
-
-
-def _declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
-    """Return width and height that a JPEG or PNG says it has, before it is decoded."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
-    at = 2 if data.startswith(_JPEG) else len(data)
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] in _JPEG_FRAMES:
-            return int.from_bytes(data[at + 7:at + 9]), int.from_bytes(data[at + 5:at + 7])
-        at += 2 + int.from_bytes(data[at + 2:at + 4])
-    raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
-                     'it is no JPEG or PNG, or is cut off')
-
-
-def _check_size(width: int, height: int) -> None:
-    if not (width > 0 and height > 0 and width * height <= _MAX_PIXELS):
-        raise ImageError(f'image size {width}x{height} must have 1 to {_MAX_PIXELS} pixels')
-
-
-def camera_from_msg(msg: CameraInfo, image_size: tuple[int, int], rectified: bool) -> Camera:
-    """Return the camera that took an image.
-
-    Parameters
-    ----------
-    msg : CameraInfo
-    image_size : tuple of int
-        Width and height of the image [px].
-    rectified : bool
-        The image is rectified: P holds, and there is no distortion.
-
-    Raises
-    ------
-    CameraError
-        For values that no camera can have, and for the intrinsics of another image size.
-    """
-    width, height = image_size
-    if (msg.width or width, msg.height or height) != image_size:
-        raise CameraError(f'camera_info is for {msg.width}x{msg.height} px, but the image has '
-                          f'{width}x{height}: scale the intrinsics with the image')
-    name, matrix = ('P', msg.p) if rectified else ('K', msg.k)
-    fx, fy, cx, cy = (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (
-        matrix[0], matrix[4], matrix[2], matrix[5])
-    distortion = () if rectified else tuple(map(float, msg.d))
-    try:
-        return Camera(width, height, float(fx), float(fy), float(cx), float(cy),
-                      msg.distortion_model, distortion)
-    except CameraError as error:
-        raise CameraError(f'camera_info: {name}: {error}') from error
 
 
 def detections_from_msg(msg: Detection2DArray) -> Detections:

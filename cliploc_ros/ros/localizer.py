@@ -12,11 +12,10 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.ros.conversions import (
-    camera_from_msg,
     detections_from_msg,
-    image_from_msg,
     stamp_ns,
 )
 from cliploc_ros.ros.frame_source import Frame
