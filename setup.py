@@ -50,6 +50,7 @@ setup(
         'console_scripts': [
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
+            f'evaluate = {PACKAGE}.cli.evaluate:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Query files: recorded boxes and similarities, so that methods meet identical input."""
 
+import math
 import os
 import zipfile
 from collections.abc import Collection, Iterator
@@ -33,6 +34,9 @@ LAYOUT = {
 }
 #: An array beyond the format that keeps what a float64 of seconds cannot: exact stamps [ns].
 STAMPS_NS = 'stamps_ns'
+#: Arrays beyond the format that say how long detector and CLIP took; NaN where not known.
+_STAGES = ('detector_ms', 'clip_ms')
+_OPTIONAL = {STAMPS_NS: (('F',), 'integer')} | dict.fromkeys(_STAGES, (('F',), 'number'))
 
 _KINDS = {'string': 'US', 'number': 'fiu', 'integer': 'iu', 'boolean': 'b'}
 _MAX_SIMILARITY = 1.001  # cosines in half precision stray a little beyond 1
@@ -62,6 +66,8 @@ class QueryFrame:
         The query that the frame belongs to.
     is_main : bool
         Whether it is the query itself, not a neighbouring frame.
+    detector_ms, clip_ms : float
+        How long these took on the image [ms]; NaN where it was not recorded.
     """
 
     stamp_ns: int
@@ -73,6 +79,8 @@ class QueryFrame:
     map_from_camera: NDArray[np.float64]
     group: int
     is_main: bool
+    detector_ms: float = math.nan
+    clip_ms: float = math.nan
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -197,7 +205,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     with content:
         if missing := [name for name in LAYOUT if name not in content.files]:
             raise _ArrayError(f'array {missing[0]} is missing')
-        names = [name for name in (*LAYOUT, STAMPS_NS) if name in content.files]
+        names = [name for name in (*LAYOUT, *_OPTIONAL) if name in content.files]
         return {name: _load_array(content, name) for name in names}
 
 
@@ -216,7 +224,7 @@ def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
             raise _ArrayError(f'array {name} is a single value')
         sizes[letter] = len(arrays[name])
     sizes['F+1'] = sizes['F'] + 1
-    layout = LAYOUT | ({STAMPS_NS: (('F',), 'integer')} if STAMPS_NS in arrays else {})
+    layout = LAYOUT | {name: one for name, one in _OPTIONAL.items() if name in arrays}
     for name, (letters, kind) in layout.items():
         array = arrays[name]
         shape = tuple(sizes.get(str(letter), letter) for letter in letters)
@@ -333,6 +341,7 @@ def _make_frame(arrays: dict[str, NDArray[Any]], index: int, rows: slice) -> Que
         map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
         group=int(arrays['query_group'][index]),
         is_main=bool(arrays['is_main'][index]),
+        **{name: float(arrays[name][index]) for name in _STAGES if name in arrays},
     )
 
 
@@ -367,6 +376,7 @@ def _make_arrays(queries: Queries) -> dict[str, NDArray[Any]]:
         'query_group': np.array([one.group for one in frames], dtype=np.int64),
         'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
         STAMPS_NS: stamps_ns,
+        **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
     }
 
 

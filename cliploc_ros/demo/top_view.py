@@ -6,26 +6,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import color_sequences
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
-from matplotlib.patheffects import withStroke
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.demo.review import Judged
-from cliploc_ros.demo.style import ACCEPTED, REFUSED, outline_points
+from cliploc_ros.demo.style import ACCEPTED, REFUSED
+from cliploc_ros.evaluation.map_view import EDGED, draw_map
 
 _DPI = 140
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
-# Landmarks above each other share one place for their names.
-_SAME_PLACE_M = 0.14
-_EDGED = (withStroke(linewidth=2.0, foreground='white'),)
 
 
 def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
@@ -53,7 +49,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
              xlabel=f'x in {frame} [m]', ylabel=f'y in {frame} [m]')
     axes.grid(color='#EEEEEE', zorder=0)
     axes.set_axisbelow(True)
-    class_colors = _draw_map(axes, landmark_map)
+    class_colors = draw_map(axes, landmark_map)
     axes.plot(path_xyz[:, 0], path_xyz[:, 1], color='#999999', linewidth=1.0, zorder=2)
     for one in judged:
         _draw_wake_up(axes, one)
@@ -66,36 +62,6 @@ def _bounds(landmark_map: LandmarkMap, path_xyz: NDArray[np.float64]
             ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
     return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
-
-
-def _draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
-    """Draw each landmark as seen from above; return the colour of each class."""
-    classes = sorted(set(landmark_map.class_ids))
-    palette = color_sequences['tab20'][::2] + color_sequences['tab20'][1::2]
-    colors = {name: palette[i % len(palette)] for i, name in enumerate(classes)}
-    for center, shape, class_id in zip(landmark_map.centers, landmark_map.shapes,
-                                       landmark_map.class_ids, strict=True):
-        outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
-        axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=colors[class_id],
-                               edgecolor='#333333', linewidth=0.5, alpha=0.55, zorder=3))
-    for place, names in _places(landmark_map):
-        axes.text(place[0], place[1], '\n'.join(names), fontsize=5.4, ha='center', va='center',
-                  zorder=4, linespacing=0.95, path_effects=_EDGED)
-    return colors
-
-
-def _places(landmark_map: LandmarkMap) -> list[tuple[NDArray[np.float64], list[str]]]:
-    """Return where to write names: those of landmarks above each other at one place."""
-    places: list[tuple[NDArray[np.float64], list[int]]] = []
-    for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
-        center = landmark_map.centers[row, :2]
-        for place, rows in places:
-            if np.linalg.norm(place - center) < _SAME_PLACE_M:
-                rows.append(int(row))
-                break
-        else:
-            places.append((center, [int(row)]))
-    return [(place, [landmark_map.landmark_ids[row] for row in rows]) for place, rows in places]
 
 
 def _draw_wake_up(axes: Axes, judged: Judged) -> None:
@@ -135,7 +101,7 @@ def _number(axes: Axes, map_from_camera: NDArray[np.float64], number: int, color
     """Write the wake-up's number behind the camera, to its left."""
     x, y = map_from_camera[:2, 3] - 0.11 * (map_from_camera[:2, 2] + map_from_camera[:2, 0])
     axes.text(x, y, str(number), fontsize=10, fontweight='bold', color=color, ha='center',
-              va='center', zorder=8, path_effects=_EDGED)
+              va='center', zorder=8, path_effects=EDGED)
 
 
 def _legend(class_colors: dict[str, tuple[float, ...]]) -> list[Line2D | Patch]:

@@ -1,7 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where results go."""
+"""Where results go: a file is there complete, or not at all."""
 
+import os
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from cliploc_ros.errors import OptionsError
@@ -17,7 +20,48 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / '.writable').touch()
-        (folder / '.writable').unlink()
+        probe = folder / f'.{os.getpid()}.probe'
+        probe.touch()
+        probe.unlink()
     except OSError as error:
         raise OptionsError(f'--out {folder}: cannot be written to: {error.strerror}') from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file in one step.
+
+    Raises
+    ------
+    OptionsError
+        If it cannot be written; nothing is left behind then.
+    """
+    write_file(path, lambda partial: _write(partial, text))
+
+
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Let a function write a file, which takes its name only when it is complete.
+
+    Parameters
+    ----------
+    path : Path
+    write : callable
+        Takes the path to write to, which ends like the file's own.
+
+    Raises
+    ------
+    OptionsError
+        If it cannot be written; nothing is left behind then.
+    """
+    partial = path.with_name(f'.{os.getpid()}.{path.name}')
+    try:
+        write(partial)
+        partial.replace(path)
+    except OSError as error:
+        raise OptionsError(f'{path}: cannot be written: {error.strerror}') from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding='utf-8')

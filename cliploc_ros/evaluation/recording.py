@@ -2,36 +2,45 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording queries: detector and CLIP run once, every method then meets the same input."""
 
+import hashlib
+import json
+import logging
+import time
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
+from tqdm import tqdm
 
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.datasets.queries import Queries, QueryFrame
-from cliploc_ros.datasets.tum import TumSequence
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.frames import Frame, Frames
+from cliploc_ros.datasets.queries import Queries, QueryFrame, load_queries, save_queries
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.protocols import ObjectDetector
+from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+
+logger = logging.getLogger(__name__)
 
 #: The most confident detections of an image that are used, as by the relocalizer node.
 MAX_DETECTIONS = 50
+Progress = Callable[[Iterable[Frame]], Iterable[Frame]]
 
 
-def record_queries(sequence: TumSequence, camera: Camera, landmark_map: LandmarkMap,
-                   detector: ObjectDetector, observer: Observer,
-                   progress: Callable[[Iterable[Any]], Iterable[Any]] = iter) -> Queries:
-    """Run detector and CLIP on every image of a sequence that has ground truth.
+def record_queries(frames: Frames, landmark_map: LandmarkMap, detector: ObjectDetector,
+                   observer: Observer, progress: Progress = iter) -> Queries:
+    """Run detector and CLIP on every image that has ground truth.
 
     Parameters
     ----------
-    sequence : TumSequence
-    camera : Camera
-        Of the images; it must have no distortion, as query files hold undistorted boxes.
+    frames : Frames
     landmark_map : LandmarkMap
         Whose labels the observer compares with.
     detector : ObjectDetector
@@ -42,45 +51,111 @@ def record_queries(sequence: TumSequence, camera: Camera, landmark_map: Landmark
     Returns
     -------
     Queries
-        Each image is a query of its own. Which landmark a box shows is not known: -1.
+        Each image is a query of its own. Which landmark a box shows is not known: -1. Boxes are
+        undistorted.
 
     Raises
     ------
     DatasetError
-        If an image cannot be read, the camera distorts, or no image has ground truth.
+        If an image cannot be read, no image has ground truth, or the camera changes.
     """
-    if any(camera.distortion):
-        raise DatasetError('recording queries needs undistorted images: rectify them first')
-    frames: list[QueryFrame] = []
-    for stamp, path in progress(list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
-        truth = sequence.pose_at(stamp)
-        if truth is None:
+    recorded: list[QueryFrame] = []
+    camera: Camera | None = None
+    for frame in progress(frames.read()):
+        if frame.map_from_camera is None:
             continue
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise DatasetError(f'{path} cannot be read as an image')
-        image_rgb = np.ascontiguousarray(image[..., ::-1])
-        detections = detector.detect(image_rgb).usable(camera.width, camera.height, MAX_DETECTIONS)
-        observation = observer.observe(image_rgb, camera, detections, stamp)
-        frames.append(_frame(observation, truth, len(frames)))
-    if not frames:
-        raise DatasetError(f'no image of {sequence.folder} has ground truth within 20 ms')
+        if camera not in (None, frame.camera):
+            raise DatasetError(f'{frames.source}: the camera changes at '
+                               f'{frame.stamp_ns / 1e9:.6f}: a query file has one')
+        camera = frame.camera
+        recorded.append(_record(frame, detector, observer, len(recorded)))
+    if camera is None:
+        raise DatasetError(f'no image of {frames.source} has ground truth within 20 ms')
     return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),
-                   tuple(frames))
+                   tuple(recorded))
 
 
-def _frame(observation: Observation, truth: NDArray[np.float64], number: int) -> QueryFrame:
-    detections = observation.detections
-    assert observation.similarities is not None
+def _record(frame: Frame, detector: ObjectDetector, observer: Observer, number: int) -> QueryFrame:
+    camera = frame.camera
+    start = time.perf_counter()
+    detections = detector.detect(frame.image_rgb).usable(camera.width, camera.height,
+                                                         MAX_DETECTIONS)
+    detected = time.perf_counter()
+    observation = observer.observe(frame.image_rgb, camera, detections, frame.stamp_ns)
+    compared = time.perf_counter()
+    similarities = observation.similarities
+    assert similarities is not None and frame.map_from_camera is not None
+    bboxes = _undistorted(detections, camera)
+    rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
+    sound = detections.select(rows)
     return QueryFrame(
-        stamp_ns=observation.stamp_ns, bboxes_xyxy=detections.bboxes_xyxy,
-        class_ids=detections.class_ids, scores=detections.scores,
-        similarities=observation.similarities.astype(np.float64),
-        true_landmark=np.full(len(detections), -1, dtype=np.int64), map_from_camera=truth,
-        group=number, is_main=True)
+        stamp_ns=frame.stamp_ns, bboxes_xyxy=bboxes[rows], class_ids=sound.class_ids,
+        scores=sound.scores, similarities=similarities[rows].astype(np.float64),
+        true_landmark=np.full(len(rows), -1, dtype=np.int64),
+        map_from_camera=frame.map_from_camera, group=number, is_main=True,
+        detector_ms=(detected - start) * 1e3, clip_ms=(compared - detected) * 1e3)
 
 
-def observation_of(frame: QueryFrame, camera: Camera) -> Observation:
-    """Return the observation that a query frame recorded; its camera has no distortion."""
-    return Observation(camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
-                       frame.similarities.astype(np.float32), frame.stamp_ns)
+def _undistorted(detections: Detections, camera: Camera) -> np.ndarray:
+    if not any(camera.distortion):
+        return detections.bboxes_xyxy
+    bboxes = camera.normalize_bboxes(detections.bboxes_xyxy)
+    return bboxes * [camera.fx, camera.fy] * 2 + [camera.cx, camera.cy] * 2
+
+
+def recorded_once(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, clip: ClipOptions
+                  ) -> Queries:
+    """Return queries from the cache beside the images, or record them and keep them there.
+
+    Parameters
+    ----------
+    frames : Frames
+    landmark_map : LandmarkMap
+    yolo : YoloOptions
+    clip : ClipOptions
+        A cache that was made with others is not used.
+
+    Raises
+    ------
+    CliplocError
+        From loading the networks and from recording. A cache that cannot be read or written is
+        but a warning.
+    """
+    cache = cache_path(frames, landmark_map, yolo, clip)
+    if cache.exists():
+        try:
+            queries = load_queries(cache, landmark_map.landmark_ids)
+            logger.warning('boxes and similarities of an earlier run: %s', cache)
+            return queries
+        except DatasetError as error:
+            logger.warning('recording anew: %s', error)
+    queries = record_queries(
+        frames, landmark_map, YoloDetector(yolo),
+        Observer(*load_encoder(clip, landmark_map.labels)),
+        partial(tqdm, total=frames.count, desc='detector and CLIP', unit='image', disable=None))
+    try:
+        save_queries(cache, queries)
+    except DatasetError as error:
+        logger.warning('the next run must record again: %s', error)
+    return queries
+
+
+def cache_path(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, clip: ClipOptions
+               ) -> Path:
+    """Return where queries are kept: beside their source, by all that they depend on."""
+    source = frames.source.resolve()
+    parts: list[Any] = [frames.count, landmark_map.landmark_ids, landmark_map.labels,
+                        asdict(yolo), asdict(clip),
+                        [_state(Path(path)) for path in (source, yolo.model, clip.model,
+                                                         clip.pretrained, clip.checkpoint_path)]]
+    digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+    return source.with_name(f'{source.name}.cliploc-{digest}.npz')
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file does; None for the name of a published model."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)

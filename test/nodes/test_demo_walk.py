@@ -32,7 +32,8 @@ def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
         'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
         'cache_dir': tmp_path}).wait_for_output('ready after')
     tester.connect()
-    start('cli.replay', recording, '--loop', '--rate', '2')
+    # slow enough to be asked about nearly every frame in one round
+    start('cli.replay', recording, '--loop')
     answers = wake_up_on_every_frame(tester, FRAMES)
     errors_m, wrong = judge(answers, read_tum(ASSETS / 'sequence'))
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['nodes']

@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``evaluate``: the paper's table and figures, on anyone's data."""
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
+
+EPILOG = f"""\
+methods: {', '.join(PAPER_METHODS)};
+  '{ALL}': these ten; '{AUTO}': the relocalizer's defaults; FILE.yaml: named sets of options, such as
+    wide: {{base: hybrid_b-prosac, k: 5, iterations: 2000}}
+
+examples:
+  evaluate --queries office.npz --map office.yaml --methods all --trials 5
+  evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
+  evaluate --queries office.npz --map office.yaml --methods hybrid_b-prosac --tune
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Evaluate; return the exit code."""
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
+    interrupt_on_sigterm()
+    return run_command(lambda: evaluate(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Compare methods on the same input: the paper's table, results.json, "
+        'summary.csv, figures and trajectories. Needs no sourced ROS.')
+    sources = parser.add_mutually_exclusive_group(required=True)
+    sources.add_argument('--queries', type=Path, metavar='NPZ',
+                         help='boxes and similarities that were recorded')
+    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with true poses')
+    sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
+    parser.add_argument('--map', type=Path, required=True, metavar='YAML')
+    parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
+                        help=f'default: {ALL}; see below')
+    parser.add_argument('--trials', type=_positive_int, default=5,
+                        help="the paper's %(default)s by default")
+    parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
+    parser.add_argument('--frames', choices=('main', 'all'), default='main',
+                        help='of query files: also the neighbours of the queries')
+    parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
+    parser.add_argument('--workers', type=_positive_int, metavar='N',
+                        default=len(os.sched_getaffinity(0)), help='processes (%(default)s)')
+    parser.add_argument('--resume', action='store_true', help='go on with a run that was stopped')
+    parser.add_argument('--no-figures', dest='figures', action='store_false')
+    parser.add_argument('--tune', action='store_true',
+                        help='choose k, IoU threshold, iterations and min_evidence of one method '
+                        'on half of the queries, and report on the other half')
+    _add_paper_options(parser)
+    _add_recording_options(parser)
+    return parser
+
+
+def _add_paper_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("of the paper's methods")
+    group.add_argument('--iterations', type=int, default=500, help='(%(default)s)')
+    group.add_argument('--k', type=int, default=3, help='(%(default)s)')
+    group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
+    group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
+                       help='cut each search short (never; results then vary)')
+    group.add_argument('--sweep', type=_positive_int, nargs='*', metavar='N',
+                       default=[50, 100, 200, 1000],
+                       help='numbers of iterations to compare (50 100 200 1000)')
+
+
+def _add_recording_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('for --bag and --tum')
+    group.add_argument('--save-queries', type=Path, metavar='NPZ',
+                       help='write what detector and CLIP said, for --queries')
+    group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
+    group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
+    group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
+    group.add_argument('--device', default='auto', help='(%(default)s)')
+    group.add_argument('--every', type=_positive_int, default=1, metavar='N',
+                       help='take each N-th image of --tum only')
+    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
+    group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
+    group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC')
+    group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
+                       help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
+    group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
+                       help='x y z qx qy qz qw of the camera on what the ground truth is of')
+    group.add_argument('--rectified', action='store_true', help='the images of --bag are')
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Evaluate as the command line asks; return the exit code."""
+    # Late, so that --help is fast.
+    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.options import RelocalizerOptions
+    from cliploc_ros.evaluation.methods import parse_methods
+    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.session import Session
+    from cliploc_ros.evaluation.trials import make_queries
+
+    logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    landmark_map = LandmarkMap.from_file(options.map)
+    paper = RelocalizerOptions(
+        iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
+        random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3)
+    methods = parse_methods(options.methods, paper, len(landmark_map))
+    if options.tune and len(methods) != 1:
+        raise OptionsError(f'--tune is for one method, not {len(methods)}: name it by --methods')
+    make_folder(options.out)
+    recorded = _read_queries(options, landmark_map)
+    queries = make_queries(recorded, landmark_map, options.frames == 'all')
+    session = Session(landmark_map, queries, options.out, options.trials, options.workers)
+    if options.tune:
+        session.tune(methods[0], options.seed)
+    else:
+        session.compare(methods, sweep=options.sweep, resume=options.resume,
+                        figures=options.figures, frames=recorded.frames)
+    return 0
+
+
+def _read_queries(options: argparse.Namespace, landmark_map):
+    """Return the queries of a file, or record them."""
+    from cliploc_ros.datasets.queries import load_queries, save_queries
+
+    if options.queries is not None:
+        if options.save_queries is not None:
+            raise OptionsError('--save-queries is for --bag and --tum')
+        return load_queries(options.queries, landmark_map.landmark_ids)
+    queries = _record(options, landmark_map)
+    if options.save_queries is not None:
+        save_queries(options.save_queries, queries)
+        print(f'wrote {options.save_queries}', flush=True)
+    return queries
+
+
+def _record(options: argparse.Namespace, landmark_map):
+    from cliploc_ros.evaluation.recording import recorded_once
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.models.yolo_detector import YoloOptions
+
+    frames = _frames(options)
+    yolo = YoloOptions(model=options.model, device=options.device)
+    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                       device=options.device)
+    queries = recorded_once(frames, landmark_map, yolo, clip)
+    without = frames.count - len(queries)
+    if without:
+        print(f'left out, as no true pose lies within 20 ms: {without} of {frames.count} images',
+              flush=True)
+    return queries
+
+
+def _frames(options: argparse.Namespace):
+    from cliploc_ros.datasets.frames import (
+        BagTopics,
+        bag_frames,
+        mount_from_numbers,
+        tum_frames,
+    )
+    from cliploc_ros.datasets.intrinsics import find_camera
+    from cliploc_ros.datasets.tum import read_tum
+
+    if options.tum is not None:
+        sequence = read_tum(options.tum).every(options.every)
+        return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
+    mount = options.body_from_camera
+    return bag_frames(options.bag, BagTopics(options.image, options.camera_info,
+                                             options.ground_truth, options.rectified),
+                      None if mount is None else mount_from_numbers(mount))
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

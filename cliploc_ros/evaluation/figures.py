@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's figures and more, as PNG and SVG."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.evaluation.map_view import draw_map
+from cliploc_ros.evaluation.methods import PAPER_METHODS
+from cliploc_ros.evaluation.output import write_file
+from cliploc_ros.evaluation.summary import Summary, find_best
+from cliploc_ros.evaluation.trials import Query, Result
+
+# Okabe and Ito's colours, which the colour-blind tell apart: one for each kind of matching, and
+# the rest for methods of other names. The algorithm is the line's style and marker.
+_COLORS = {'class': '#D55E00', 'clip': '#009E73', 'hybrid': '#0072B2'}
+_OTHER_COLORS = ('#CC79A7', '#E69F00', '#56B4E9', '#000000', '#F0E442')
+_STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 1.5)), 's'),
+           'b-prosac': ((0, (5, 1, 1, 1)), 'D')}
+_SIZE = (6.4, 4.0)
+_MAX_ERROR_M = 2.0
+_SUCCESS_M = 1.0
+_BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
+_MARGIN_M = 0.5
+
+
+def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+             results: Sequence[Result], summaries: Sequence[Summary],
+             sweep: Mapping[str, Mapping[int, Summary]], observing_ms: Mapping[str, float]
+             ) -> list[Path]:
+    """Draw every figure there is data for.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they go.
+    landmark_map : LandmarkMap
+    queries : sequence of Query
+    results : sequence of Result
+    summaries : sequence of Summary
+        Of the results.
+    sweep : mapping of str to mapping of int to Summary
+        Of each method that draws samples, by their number.
+    observing_ms : mapping of str to float
+        Mean times of the stages before the search, where they were recorded.
+
+    Returns
+    -------
+    list of Path
+        The PNG files; beside each is an SVG.
+    """
+    sampled = [one for one in summaries if _style(one.method)[2] is not None
+               and not one.method.endswith('_bf')]
+    best = find_best(summaries)
+    figures = {
+        'success_over_threshold': _success_over_threshold(summaries),
+        'success_by_boxes': _success_by_boxes(summaries),
+        'precision_over_recall': _precision_over_recall(summaries),
+        'time_by_stage': _time_by_stage(summaries, observing_ms),
+        'top_view': _top_view(landmark_map, queries,
+                              [one for one in results if one.method == best.method], best.method),
+    }
+    if sampled:
+        figures['best_iteration'] = _best_iteration(sampled)
+    if sweep:
+        figures['success_over_iterations'] = _success_over_iterations(sweep)
+    return [_save(figure, folder / f'{name}.png') for name, figure in figures.items()]
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    # Without its date, an SVG of the same results is the same file.
+    write_file(path, lambda partial: figure.savefig(partial, dpi=150))
+    write_file(path.with_suffix('.svg'),
+               lambda partial: figure.savefig(partial, metadata={'Date': None}))
+    return path
+
+
+def _new(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=_SIZE, layout='constrained')
+    axes = figure.add_subplot()
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _style(method: str) -> tuple[str, object, str | None]:
+    """Return the colour, line style and marker of a method."""
+    if method in PAPER_METHODS:
+        matching, algorithm = method.split('_')
+        return _COLORS[matching], *_STYLES[algorithm]
+    return _OTHER_COLORS[sum(method.encode()) % len(_OTHER_COLORS)], '-', 'P'
+
+
+def _legend(figure: Figure) -> None:
+    figure.legend(loc='outside right upper', frameon=False, fontsize=8)
+
+
+def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = _new('error threshold [m]', 'success')
+    limits = np.linspace(0.0, _MAX_ERROR_M, 401)
+    for one in summaries:
+        color, line, _ = _style(one.method)
+        errors = np.sort(one.errors_m.ravel())
+        axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
+                  linestyle=line, linewidth=1.4, label=one.method)
+    axes.set(xlim=(0, _MAX_ERROR_M), ylim=(0, 1))
+    _legend(figure)
+    return figure
+
+
+def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figure:
+    figure, axes = _new('iterations', f'success (within {_SUCCESS_M:g} m)')
+    for method, by_count in sweep.items():
+        color, line, marker = _style(method)
+        rates = [one.success(_SUCCESS_M) for one in by_count.values()]
+        axes.plot([*by_count], rates, color=color, linestyle=line, marker=marker, markersize=4,
+                  linewidth=1.2, label=method)
+    counts = sorted({count for by_count in sweep.values() for count in by_count})
+    axes.set_xscale('log')
+    axes.set_xticks(counts, [f'{count:,}' for count in counts])
+    axes.set_xticks([], minor=True)
+    axes.set_ylim(0, 1)
+    _legend(figure)
+    return figure
+
+
+def _best_iteration(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = _new('iteration that found the best pose', '')
+    found = [one.best_iterations[np.isfinite(one.errors_m)] for one in summaries]
+    boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
+                         patch_artist=True, medianprops={'color': 'black'})
+    for patch, one in zip(boxes['boxes'], summaries, strict=True):
+        patch.set(facecolor=_style(one.method)[0], alpha=0.6)
+    axes.set_yticks(range(1, len(summaries) + 1), [one.method for one in summaries])
+    axes.invert_yaxis()
+    axes.set_title('median, quartiles, and 1.5 of their distance', fontsize=9)
+    return figure
+
+
+def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = _new('detections in the image', f'success (within {_SUCCESS_M:g} m)')
+    boxes = summaries[0].boxes
+    bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
+    bins = [one for one in bins if one[2].any()]
+    for one in summaries:
+        color, line, marker = _style(one.method)
+        rates = [(one.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
+        axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
+                  markersize=4, linewidth=1.2, label=one.method)
+    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} and more'
+             for low, high, _ in bins]
+    axes.set_xticks(range(len(bins)), [f'{name}\n({int(chosen.sum())} images)'
+                                       for name, (*_, chosen) in zip(names, bins, strict=True)])
+    axes.set_ylim(-0.02, 1.02)
+    _legend(figure)
+    return figure
+
+
+def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = _new('recall: right poses that are believed',
+                        f'precision: believed poses within {_SUCCESS_M:g} m')
+    for one in summaries:
+        color, line, marker = _style(one.method)
+        recall, precision = precision_recall(one)
+        if not len(recall):
+            continue
+        axes.plot(recall, precision, color=color, linestyle=line, linewidth=1.2,
+                  label=one.method)
+        if one.accepted.any():
+            axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
+                      markeredgecolor='black', linestyle='none')
+    axes.set(xlim=(-0.02, 1.02))
+    axes.set_title('lines: every threshold of the evidence; markers: the options as run',
+                   fontsize=9)
+    _legend(figure)
+    return figure
+
+
+def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
+                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return recall (m,) and precision (m,) of believing all poses above each evidence.
+
+    Parameters
+    ----------
+    one : Summary
+    limit_m : float
+        What counts as right.
+
+    Returns
+    -------
+    recall, precision : ndarray (m,)
+        From the strictest threshold on; empty if no pose is right.
+    """
+    solved = np.isfinite(one.errors_m)
+    order = np.argsort(-one.evidence[solved], kind='stable')
+    right = (one.errors_m[solved] < limit_m)[order]
+    if not right.any():
+        return np.empty(0), np.empty(0)
+    believed = np.cumsum(right)
+    # of equal evidence all or none are believed
+    last = np.append(np.diff(one.evidence[solved][order]) != 0, True)
+    return (believed / right.sum())[last], (believed / np.arange(1, right.size + 1))[last]
+
+
+def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, float]) -> Figure:
+    figure, axes = _new('mean time [ms]', '')
+    rows = np.arange(len(summaries))
+    start = np.zeros(len(summaries))
+    for (stage, duration), shade in zip(observing_ms.items(), ('#BBBBBB', '#888888'),
+                                        strict=False):
+        axes.barh(rows, duration, left=start, color=shade, label=stage)
+        start += duration
+    search = np.array([one.mean_search_ms for one in summaries])
+    axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
+    for row, total, own in zip(rows, start + search, search, strict=True):
+        axes.annotate(f'search {own:,.1f}', (total, row), xytext=(3, 0), va='center', fontsize=8,
+                      textcoords='offset points')
+    axes.set_yticks(rows, [one.method for one in summaries])
+    axes.invert_yaxis()
+    if (start + search).max() > 50 * (start + search).min() and not observing_ms:
+        axes.set_xscale('log')
+    axes.margins(x=0.2)
+    if observing_ms:
+        _legend(figure)
+    return figure
+
+
+def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequence[Result],
+              method: str) -> Figure:
+    truth = {query.number: query.map_from_camera for query in queries}
+    first = [one for one in results if one.trial == 0]
+    positions = np.array([pose[:2, 3] for pose in truth.values()])
+    points = np.concatenate([landmark_map.centers[:, :2], positions])
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    width, height = high - low
+    scale = min(8.0 / width, 8.0 / height)
+    figure = Figure(figsize=(max(3.0, width * scale) + 2.4, max(3.0, height * scale) + 1.0),
+                    layout='constrained')
+    axes = figure.add_subplot()
+    frame = landmark_map.frame_id
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal',
+             xlabel=f'x in {frame} [m]', ylabel=f'y in {frame} [m]',
+             title=f'{method}: estimates joined to their truth')
+    draw_map(axes, landmark_map)
+    axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
+              color='#222222', label='truth', zorder=6)
+    for label, color, marker, chosen in _groups(first):
+        for number, one in enumerate(chosen):
+            (x, y), pose = truth[one.query][:2, 3], one.map_from_camera
+            assert pose is not None
+            axes.plot([x, pose[0][3]], [y, pose[1][3]], color=color, linewidth=0.9, zorder=5,
+                      marker=marker, markevery=[1], markersize=4,
+                      label=f'{label} ({len(chosen)})' if number == 0 else None)
+    _legend(figure)
+    return figure
+
+
+def _groups(results: Sequence[Result]) -> Iterator[tuple[str, str, str, list[Result]]]:
+    found = [one for one in results if one.error_m is not None]
+    yield 'believed', '#0072B2', 'o', [one for one in found if one.accepted]
+    yield 'not believed', '#D55E00', 'X', [one for one in found if not one.accepted]

@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What of a run is done, so that one that was stopped can go on."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.trials import Result
+
+
+class Journal:
+    """A file of results, a line for each part of a run, after a line that says what run it is."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @property
+    def exists(self) -> bool:
+        """Return whether a run was stopped here."""
+        return self._path.exists()
+
+    def read(self, run: Mapping[str, Any]) -> list[Result]:
+        """Return what is done of a run.
+
+        Parameters
+        ----------
+        run : mapping
+            What the run is about, as JSON knows it.
+
+        Raises
+        ------
+        OptionsError
+            The file is about another run, and names what differs.
+        """
+        try:
+            lines = self._path.read_text(encoding='utf-8').splitlines()
+            header = json.loads(lines[0])
+            done = [Result(**fields) for line in _whole(lines[1:]) for fields in line]
+        except OSError as error:
+            raise OptionsError(f'{self._path}: cannot be read: {error.strerror}') from error
+        except (ValueError, TypeError, IndexError) as error:
+            raise OptionsError(f'{self._path}: is damaged: remove it to begin again') from error
+        differing = [key for key in run if header.get(key) != run[key]]
+        if differing:
+            raise OptionsError(f'{self._path}: was begun with another {" and ".join(differing)}: '
+                               'give the same, or remove it to begin again')
+        return done
+
+    @contextmanager
+    def writing(self, run: Mapping[str, Any], done: Sequence[Result]) -> Iterator['Journal']:
+        """Write what is done, and open the file for more.
+
+        Raises
+        ------
+        OptionsError
+            It cannot be written.
+        """
+        try:
+            with self._path.open('w', encoding='utf-8') as self._file:
+                self._line(run)
+                if done:
+                    self.add(done)
+                yield self
+        except OSError as error:
+            raise OptionsError(f'{self._path}: cannot be written: {error.strerror}; what is done '
+                               'is kept: go on with --resume') from error
+
+    def add(self, results: Sequence[Result]) -> None:
+        """Write the results of a part."""
+        self._line([result.as_dict() for result in results])
+
+    def remove(self) -> None:
+        """Remove the file: the run is done."""
+        self._path.unlink(missing_ok=True)
+
+    def _line(self, content: object) -> None:
+        self._file.write(json.dumps(content) + '\n')
+        self._file.flush()
+
+
+def _whole(lines: list[str]) -> Iterator[Any]:
+    """Yield the content of lines but of a last one that was cut off."""
+    for number, line in enumerate(lines, start=1):
+        try:
+            yield json.loads(line)
+        except ValueError:
+            if number < len(lines):
+                raise

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A map drawn from above."""
+
+import numpy as np
+from matplotlib import color_sequences
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+
+#: Sets writing off from what it stands on.
+EDGED = (withStroke(linewidth=2.0, foreground='white'),)
+_OUTLINE_POINTS = 64
+_MOST_NAMES = 100
+# Landmarks above each other share one place for their names.
+_SAME_PLACE_M = 0.14
+
+
+def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
+    """Draw each landmark as seen from above, with its name where names are few.
+
+    Parameters
+    ----------
+    axes : Axes
+        Of equal scales, x and y of the map [m].
+    landmark_map : LandmarkMap
+
+    Returns
+    -------
+    dict of str to tuple of float
+        The colour of each class.
+    """
+    classes = sorted(set(landmark_map.class_ids))
+    palette = color_sequences['tab20'][::2] + color_sequences['tab20'][1::2]
+    colors = {name: palette[i % len(palette)] for i, name in enumerate(classes)}
+    for center, shape, class_id in zip(landmark_map.centers, landmark_map.shapes,
+                                       landmark_map.class_ids, strict=True):
+        outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
+        axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=colors[class_id],
+                               edgecolor='#333333', linewidth=0.5, alpha=0.55, zorder=3))
+    for place, names in _places(landmark_map) if len(landmark_map) <= _MOST_NAMES else ():
+        axes.text(place[0], place[1], '\n'.join(names), fontsize=5.4, ha='center', va='center',
+                  zorder=4, linespacing=0.95, path_effects=EDGED)
+    return colors
+
+
+def _places(landmark_map: LandmarkMap) -> list[tuple[NDArray[np.float64], list[str]]]:
+    """Return where to write names: those of landmarks above each other at one place."""
+    places: list[tuple[NDArray[np.float64], list[int]]] = []
+    for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
+        center = landmark_map.centers[row, :2]
+        for place, rows in places:
+            if np.linalg.norm(place - center) < _SAME_PLACE_M:
+                rows.append(int(row))
+                break
+        else:
+            places.append((center, [int(row)]))
+    return [(place, [landmark_map.landmark_ids[row] for row in rows]) for place, rows in places]
+
+
+def outline_points(ellipse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (n, 2) on an ellipse cx, cy, exx, exy, eyy, see cliploc_ros.core.ellipsoid."""
+    cx, cy, exx, exy, eyy = ellipse
+    root = np.linalg.cholesky(np.array([[exx, exy], [exy, eyy]]))
+    angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE_POINTS, endpoint=False)
+    return np.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T + (cx, cy))

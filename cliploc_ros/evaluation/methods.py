@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is compared: the paper's ten methods, our defaults, and named sets of options."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
+
+#: The rows of the paper's Table 1. Class has no similarities to order candidates by.
+PAPER_METHODS = ('class_bf', 'class_ransac', 'clip_bf', 'clip_ransac', 'clip_prosac',
+                 'clip_b-prosac', 'hybrid_bf', 'hybrid_ransac', 'hybrid_prosac',
+                 'hybrid_b-prosac')
+#: The options of the relocalizer node as it is installed.
+AUTO = 'auto'
+ALL = 'all'
+_FIELDS = {field.name: field for field in fields(RelocalizerOptions)}
+
+
+@dataclass(frozen=True)
+class Method:
+    """A name and the options that it stands for."""
+
+    name: str
+    options: RelocalizerOptions
+
+    @property
+    def is_exhaustive(self) -> bool:
+        """Return whether it tries every sample, and so gives equal results in every trial."""
+        return self.options.algorithm == 'bf'
+
+
+def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int
+                  ) -> tuple[Method, ...]:
+    """Return the methods that words name.
+
+    Parameters
+    ----------
+    words : iterable of str
+        Names of the paper's methods, 'all' of these, 'auto', or files in YAML: a mapping of
+        names to options, each of which may build on another method by 'base'.
+    paper : RelocalizerOptions
+        What holds for the paper's methods besides matching and algorithm.
+    landmarks : int
+        Size of the map: k is at most that.
+
+    Raises
+    ------
+    OptionsError
+        Names the word, or the file, the method and the option.
+    """
+    methods: dict[str, Method] = {}
+    for word in words:
+        if word == ALL:
+            found = [_named(name, paper, landmarks) for name in PAPER_METHODS]
+        elif word.endswith(('.yaml', '.yml')):
+            found = _read(Path(word), paper, landmarks)
+        else:
+            found = [_named(word, paper, landmarks)]
+        for method in found:
+            if methods.get(method.name, method) != method:
+                raise OptionsError(f"two different methods are called '{method.name}'")
+            methods[method.name] = method
+    if not methods:
+        raise OptionsError(f'no method is named: give some of {", ".join(PAPER_METHODS)}, '
+                           f'{ALL}, {AUTO}, or a YAML file')
+    return tuple(methods.values())
+
+
+def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
+    if name == AUTO:
+        options = RelocalizerOptions(random_seed=paper.random_seed)
+    elif name in PAPER_METHODS:
+        matching, algorithm = name.split('_')
+        options = replace(paper, matching=matching, algorithm=algorithm)
+    else:
+        raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
+                           'nor a YAML file')
+    return Method(name, replace(options, k=min(options.k, landmarks)))
+
+
+def _read(path: Path, paper: RelocalizerOptions, landmarks: int) -> list[Method]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise OptionsError(f'{path}: cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise OptionsError(f'{path}: is not YAML: {error}') from error
+    if not isinstance(content, Mapping) or not content:
+        raise OptionsError(f'{path}: is not a mapping of names to options')
+    return [_made(path, str(name), options, paper, landmarks)
+            for name, options in content.items()]
+
+
+def _made(path: Path, name: str, values: Any, paper: RelocalizerOptions, landmarks: int) -> Method:
+    where = f'{path}: {name}'
+    if not isinstance(values, Mapping):
+        raise OptionsError(f'{where}: is not a mapping of options')
+    if '@' in name or '/' in name:
+        raise OptionsError(f"{where}: a name must hold neither '@' nor '/'")
+    base = _named(str(values.get('base', AUTO)), paper, landmarks).options
+    changes = {option: value for option, value in values.items() if option != 'base'}
+    for option, value in changes.items():
+        if option not in _FIELDS:
+            raise OptionsError(f"{where}: '{option}' is none of base, {', '.join(_FIELDS)}")
+        kind = type(_FIELDS[option].default)
+        fits = isinstance(value, int | float if kind is float else kind)
+        if not fits or (isinstance(value, bool) and kind is not bool):
+            raise OptionsError(f'{where}: {option}: {value!r} is no {kind.__name__}')
+    try:
+        return Method(name, replace(base, **changes))
+    except OptionsError as error:
+        raise OptionsError(f'{where}: {error}') from error

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One evaluation from its queries to its table, files and figures."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.queries import QueryFrame
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation import tuning
+from cliploc_ros.evaluation.journal import Journal
+from cliploc_ros.evaluation.methods import Method
+from cliploc_ros.evaluation.output import write_text
+from cliploc_ros.evaluation.run import count_searches, run_methods
+from cliploc_ros.evaluation.summary import Summary, summarize
+from cliploc_ros.evaluation.tables import as_csv, as_json, as_markdown, as_text, notes, table_rows
+from cliploc_ros.evaluation.trajectories import absolute_trajectory_error, write_trajectories
+from cliploc_ros.evaluation.trials import Query, Result
+
+_JOURNAL = 'unfinished.jsonl'
+_TRAJECTORIES = 'trajectories'
+# Joins a method and a number of iterations.
+_AT = '@'
+
+
+@dataclass(frozen=True)
+class Session:
+    """Queries against a map, and where the results go.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    queries : sequence of Query
+    out : Path
+        A folder that exists.
+    trials, workers : int
+        See run_methods.
+    """
+
+    landmark_map: LandmarkMap
+    queries: Sequence[Query]
+    out: Path
+    trials: int
+    workers: int
+
+    def compare(self, methods: Sequence[Method], *, sweep: Sequence[int] = (),
+                resume: bool = False, figures: bool = True, frames: Sequence[QueryFrame] = ()
+                ) -> list[Summary]:
+        """Run methods, print the table, and write everything.
+
+        Parameters
+        ----------
+        methods : sequence of Method
+        sweep : sequence of int
+            Numbers of iterations to run each sampling method with besides, for a figure.
+        resume : bool
+            Go on with a run that was stopped.
+        figures : bool
+            Whether to draw.
+        frames : sequence of QueryFrame
+            Of the query file, for the times of detector and CLIP.
+
+        Returns
+        -------
+        list of Summary
+            Of the methods.
+
+        Raises
+        ------
+        CliplocError
+            For a run that cannot be resumed, or files that cannot be written.
+        """
+        everything = [*methods, *_swept(methods, sweep if figures else ())]
+        results = self._run(everything, resume)
+        own = [one for one in results if _AT not in one.method]
+        summaries = summarize(own)
+        self._write(own, summaries)
+        if figures:
+            self._draw(own, summaries, _by_count(summarize(results), methods), frames)
+        Journal(self.out / _JOURNAL).remove()
+        print(f'results: {self.out.resolve()}', flush=True)
+        return summaries
+
+    def tune(self, method: Method, seed: int) -> tuning.Tuned:
+        """Tune a method, print what it brings, and write tuned.yaml, a parameter file."""
+        count = tuning.count_searches(method.options, len(self.landmark_map), len(self.queries),
+                                      self.trials)
+        with tqdm(total=count, desc='tuning', unit='search', disable=None) as bar:
+            tuned = tuning.tune(self.landmark_map, method.options, self.queries,
+                                trials=self.trials, workers=self.workers, seed=seed,
+                                advance=lambda results: bar.update(len(results)))
+        pair = [tuned.before, tuned.after]
+        text = tuning.as_parameter_file(tuned.options)
+        print(f'on the {len(tuned.after.queries)} queries that did not choose:\n'
+              f'{as_text(table_rows(pair))}\n' + '\n'.join(notes(pair)) + f'\n\n{text}')
+        for one in pair:
+            print(f'{one.method}: precision {one.precision():.3f} at recall {one.recall():.3f} '
+                  '(1 m)')
+        write_text(self.out / 'tuned.yaml', text)
+        print(f'wrote {self.out / "tuned.yaml"}', flush=True)
+        return tuned
+
+    def _run(self, methods: Sequence[Method], resume: bool) -> list[Result]:
+        run = self._describe(methods)
+        journal = Journal(self.out / _JOURNAL)
+        if journal.exists and not resume:
+            raise OptionsError(f'{self.out} holds an unfinished run: go on with --resume, give '
+                               f'another --out, or remove {self.out / _JOURNAL}')
+        done = journal.read(run) if journal.exists else []
+        with journal.writing(run, done), self._progress(methods, len(done)) as bar:
+            def advance(results: list[Result]) -> None:
+                journal.add(results)
+                bar.update(len(results))
+
+            return run_methods(self.landmark_map, methods, self.queries, trials=self.trials,
+                               workers=self.workers, done=done, advance=advance)
+
+    @contextmanager
+    def _progress(self, methods: Sequence[Method], done: int) -> Iterator[Any]:
+        total = count_searches(methods, len(self.queries), self.trials)
+        with tqdm(total=total, initial=done, unit='search', disable=None) as bar:
+            yield bar
+
+    def _describe(self, methods: Sequence[Method]) -> dict[str, Any]:
+        """Return what makes this run another one than others, as JSON knows it."""
+        digest = hashlib.sha256()
+        for query in self.queries:
+            detections = query.observation.detections
+            for part in (query.observation.similarities, detections.bboxes_xyxy,
+                         query.map_from_camera):
+                digest.update(np.ascontiguousarray(part).tobytes())
+            digest.update(repr((query.number, detections.class_ids)).encode())
+        world = hashlib.sha256(repr((self.landmark_map.landmark_ids, self.landmark_map.class_ids,
+                                     self.landmark_map.centers.tolist(),
+                                     self.landmark_map.shapes.tolist())).encode())
+        return {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': self.trials,
+                'methods': {one.name: {name: str(value) for name, value
+                                       in asdict(one.options).items()} for one in methods}}
+
+    def _write(self, results: Sequence[Result], summaries: Sequence[Summary]) -> None:
+        rows = table_rows(summaries)
+        write_trajectories(self.out / _TRAJECTORIES, self.queries, results)
+        remarks = notes(summaries)
+        for one in summaries:
+            error = absolute_trajectory_error(self.out / _TRAJECTORIES, one.method)
+            if error is not None:
+                remarks.append(f'{one.method}: absolute trajectory error of believed poses '
+                               f'{error:.3f} m (evo, trial 0)')
+        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
+        write_text(self.out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
+        write_text(self.out / 'results.json', as_json(results))
+        write_text(self.out / 'summary.csv', as_csv(summaries))
+
+    def _draw(self, results: Sequence[Result], summaries: Sequence[Summary],
+              sweep: dict[str, dict[int, Summary]], frames: Sequence[QueryFrame]) -> None:
+        try:
+            from cliploc_ros.evaluation.figures import draw_all
+        except ImportError as error:
+            print(f'no figures: {error}: pip install matplotlib', flush=True)
+            return
+        observing = {stage: np.array([getattr(frame, name) for frame in frames])
+                     for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
+        draw_all(self.out, self.landmark_map, self.queries, results, summaries, sweep,
+                 {stage: float(np.nanmean(times)) for stage, times in observing.items()
+                  if np.isfinite(times).any()})
+
+
+def _swept(methods: Sequence[Method], counts: Sequence[int]) -> list[Method]:
+    return [Method(f'{one.name}{_AT}{count}', replace(one.options, iterations=count))
+            for one in methods if not one.is_exhaustive
+            for count in counts if count != one.options.iterations]
+
+
+def _by_count(summaries: Sequence[Summary], methods: Sequence[Method]
+              ) -> dict[str, dict[int, Summary]]:
+    """Return the summaries of the sweep and of the methods themselves, by iterations."""
+    counts: dict[str, dict[int, Summary]] = {}
+    iterations = {one.name: one.options.iterations for one in methods if not one.is_exhaustive}
+    for one in summaries:
+        name, _, count = one.method.partition(_AT)
+        if name in iterations:
+            counts.setdefault(name, {})[int(count or iterations[name])] = one
+    return {name: dict(sorted(found.items())) for name, found in counts.items()
+            if len(found) > 1}

@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's table, for people and for programs."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+
+from cliploc_ros.evaluation.methods import PAPER_METHODS
+from cliploc_ros.evaluation.summary import LIMITS_M, Summary, compare, find_best
+from cliploc_ros.evaluation.trials import Result
+
+_HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
+           'search [ms]', 'believed', 'wrong by > 1 m')
+_WITHIN_NOISE = '~'
+
+
+def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
+    """Return the cells of the table, its header first.
+
+    What the queries are too few to tell from the best method is marked with a '~'.
+
+    Parameters
+    ----------
+    summaries : sequence of Summary
+        On the same queries.
+    """
+    best = find_best(summaries)
+    return [_HEADER, *(_row(one, best) for one in summaries)]
+
+
+def _row(one: Summary, best: Summary) -> tuple[str, ...]:
+    matching, algorithm = (one.method.split('_', 1) if one.method in PAPER_METHODS
+                           else (one.method, ''))
+    rates = ' / '.join(_rate(one.success(limit)) for limit in LIMITS_M)
+    if len(one.errors_m) > 1:
+        rates += f' ± {_rate(one.success_deviation(LIMITS_M[-1]))}'
+    if one is not best and compare(one, best).is_noise:
+        rates += f' {_WITHIN_NOISE}'
+    cut = '' if one.coverage.min() == 1.0 else f' ({one.coverage.mean():.0%} tried)'
+    return (matching, algorithm, rates, f'{one.median_error_m:.3f}, {one.mean_error_m:.2f}',
+            f'{one.mean_search_ms:.1f}{cut}', _rate(float(one.accepted.mean())),
+            f'{one.wrongly_accepted()} of {one.errors_m.size}')
+
+
+def _rate(value: float) -> str:
+    return f'{value:.2f}'.removeprefix('0')
+
+
+def notes(summaries: Sequence[Summary]) -> list[str]:
+    """Return what a reader of the table must know, in sentences."""
+    best = find_best(summaries)
+    lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
+             '(exhaustive methods one: they draw nothing); ± is the standard deviation over '
+             'trials, at 1 m.']
+    if len(summaries) > 1:
+        lines.append(f'{_WITHIN_NOISE}: not to be told from {best.method} by so many queries '
+                     '(at 1 m; paired bootstrap, 95 %).')
+    return lines
+
+
+def as_text(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table for the terminal."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ['  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+             for row in rows]
+    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+
+
+def as_markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = ['| ' + ' | '.join(row) + ' |' for row in rows]
+    return '\n'.join([lines[0], '|' + '---|' * len(rows[0]), *lines[1:]])
+
+
+def as_csv(summaries: Sequence[Summary]) -> str:
+    """Return a line of figures for each method."""
+    best = find_best(summaries)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(['method', 'queries', 'trials', *(f'success_{limit:g}m' for limit in LIMITS_M),
+                     *(f'success_{limit:g}m_std' for limit in LIMITS_M), 'median_error_m',
+                     'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
+                     'recall_1m', 'wrongly_accepted', 'less_than_best_1m',
+                     'less_than_best_low', 'less_than_best_high'])
+    for one in summaries:
+        difference = compare(one, best)
+        writer.writerow([
+            one.method, len(one.queries), len(one.errors_m),
+            *(one.success(limit) for limit in LIMITS_M),
+            *(one.success_deviation(limit) for limit in LIMITS_M), one.median_error_m,
+            one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
+            float(one.accepted.mean()), one.precision(), one.recall(), one.wrongly_accepted(),
+            difference.mean, difference.low, difference.high])
+    return text.getvalue()
+
+
+def as_json(results: Sequence[Result]) -> str:
+    """Return all results, one a line."""
+    lines = ',\n'.join(json.dumps(result.as_dict()) for result in results)
+    return f'[\n{lines}\n]\n'
