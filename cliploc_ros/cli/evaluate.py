@@ -8,14 +8,21 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
+if TYPE_CHECKING:
+    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.frames import Frames
+    from cliploc_ros.datasets.queries import Queries
+
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
-  '{ALL}': these ten; '{AUTO}': the relocalizer's defaults; FILE.yaml: named sets of options, such as
+  '{ALL}': these ten; '{AUTO}': the relocalizer's defaults;
+  FILE.yaml: named sets of options, such as
     wide: {{base: hybrid_b-prosac, k: 5, iterations: 2000}}
 
 examples:
@@ -127,7 +134,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _read_queries(options: argparse.Namespace, landmark_map):
+def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     """Return the queries of a file, or record them."""
     from cliploc_ros.datasets.queries import load_queries, save_queries
 
@@ -142,7 +149,7 @@ def _read_queries(options: argparse.Namespace, landmark_map):
     return queries
 
 
-def _record(options: argparse.Namespace, landmark_map):
+def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     from cliploc_ros.evaluation.recording import recorded_once
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.yolo_detector import YoloOptions
@@ -159,7 +166,7 @@ def _record(options: argparse.Namespace, landmark_map):
     return queries
 
 
-def _frames(options: argparse.Namespace):
+def _frames(options: argparse.Namespace) -> 'Frames':
     from cliploc_ros.datasets.frames import (
         BagTopics,
         bag_frames,

@@ -15,13 +15,19 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.cli.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.demo.compare import as_input, record
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.demo.compare import record
+from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
-from cliploc_ros.evaluation.table import Row, as_markdown, measure
+from cliploc_ros.evaluation.run import run_methods
+from cliploc_ros.evaluation.summary import Summary, summarize
+from cliploc_ros.evaluation.tables import as_text, table_rows
+from cliploc_ros.evaluation.trials import make_queries
 
 #: Objects of each class; the fewer the classes, the more.
 COUNTS = (6, 12, 24, 48)
@@ -30,8 +36,8 @@ _CLASSES = ('book', 'box', 'bottle', 'plant', 'mug', 'can', 'bowl', 'clock')
 METHODS = ('class_ransac', 'class_bf', 'hybrid_ransac', 'hybrid_b-prosac')
 _SUCCESS_M = 0.5
 _TRIALS = 5
-#: Exhaustive search is stopped after this long [s] for each image: whole, it would take hours.
-_BF_BUDGET_S = 2.0
+# A search is cut short after two seconds: whole, exhaustive ones would take hours.
+_OPTIONS = RelocalizerOptions(iterations=500, time_budget_s=2.0)
 
 
 def render(folder: Path, count: int, images: int, seed: int) -> None:
@@ -48,8 +54,13 @@ def render(folder: Path, count: int, images: int, seed: int) -> None:
     write_true_map(folder / 'map.yaml', room)
 
 
-def plot(rows: Mapping[int, Sequence[Row]], path: Path) -> None:
-    """Draw success and time over the number of objects of a class, the key of the rows."""
+def _whole_search_s(one: Summary) -> float:
+    """Return the mean time of a search [s]; of one cut short, what all of it would take."""
+    return float((one.search_ms / np.maximum(one.coverage, 1e-9)).mean()) / 1e3
+
+
+def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
+    """Draw success and time over the number of objects of a class, the key of the summaries."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -60,13 +71,13 @@ def plot(rows: Mapping[int, Sequence[Row]], path: Path) -> None:
     styles = dict(zip(METHODS, (('#D55E00', 'o-'), ('#E69F00', 's--'), ('#56B4E9', '^-.'),
                                 ('#0072B2', 'D-')), strict=True))
     for method, (color, style) in styles.items():
-        own = [row for same in rows.values() for row in same if row.method == method]
-        left.plot([*rows], [row.success(_SUCCESS_M) for row in own], style, color=color)
-        right.plot([*rows], [row.search_ms / 1e3 for row in own], style, color=color,
+        own = [one for same in summaries.values() for one in same if one.method == method]
+        left.plot([*summaries], [one.success(_SUCCESS_M) for one in own], style, color=color)
+        right.plot([*summaries], [_whole_search_s(one) for one in own], style, color=color,
                    label=method)
     for axes in (left, right):
         axes.set_xscale('log', base=2)
-        axes.set_xticks([*rows], [str(count) for count in rows])
+        axes.set_xticks([*summaries], [str(count) for count in summaries])
         axes.set_xlabel(f'objects of the same class, of {_TOTAL} in the map')
         axes.grid(alpha=0.3)
     left.set_ylim(-0.02, 1.02)
@@ -86,7 +97,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--seed', type=int, default=70)
     options = parser.parse_args(arguments)
     make_folder(options.out)
-    rows: dict[int, list[Row]] = {}
+    summaries: dict[int, list[Summary]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
         rooms = {count: Path(name) / str(count) for count in COUNTS}
         # In processes of its own: the LLVMs of Mesa and of PyTorch do not bear each other.
@@ -97,11 +108,13 @@ def run(arguments: list[str]) -> int:
                 room.result()
         for count, folder in rooms.items():
             landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
-            queries = as_input(record(folder, landmark_map, folder))
-            rows[count] = [measure(method, landmark_map, queries, trials=_TRIALS, iterations=500,
-                                   bf_budget_s=_BF_BUDGET_S) for method in METHODS]
-            print(f'\n{count} objects of each class\n{as_markdown(rows[count])}', flush=True)
-    plot(rows, options.out / 'class_growth.png')
+            queries = make_queries(record(folder, landmark_map, folder), landmark_map)
+            summaries[count] = summarize(run_methods(
+                landmark_map, parse_methods(METHODS, _OPTIONS, len(landmark_map)), queries,
+                trials=_TRIALS, workers=2))
+            print(f'\n{count} objects of each class\n{as_text(table_rows(summaries[count]))}',
+                  flush=True)
+    plot(summaries, options.out / 'class_growth.png')
     print(f'wrote {options.out / "class_growth.png"}')
     return 0
 

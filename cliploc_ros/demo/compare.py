@@ -7,6 +7,7 @@ once, and runs the paper's ten methods on that.
 """
 
 import argparse
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -18,16 +19,19 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.cli.command import run_command
-from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.frames import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import train_detector
 from cliploc_ros.demo.world.reading import TrueFrame, read_frames
+from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
-from cliploc_ros.evaluation.recording import observation_of, record_queries
-from cliploc_ros.evaluation.table import METHODS, Query, as_markdown, measure
+from cliploc_ros.evaluation.recording import record_queries
+from cliploc_ros.evaluation.session import Session
+from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
@@ -42,15 +46,10 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
     observer = Observer(*load_encoder(clip, landmark_map.labels))
-    camera, _ = find_camera(None, sequence)
-    return record_queries(read_tum(sequence), camera, landmark_map, detector, observer,
-                          partial(tqdm, desc='recording', unit='image', disable=None))
-
-
-def as_input(queries: Queries) -> list[Query]:
-    """Return what methods are measured on: observations with their true poses."""
-    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
-    return [(observation_of(frame, camera), frame.map_from_camera) for frame in queries]
+    frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
+    return record_queries(frames, landmark_map, detector, observer,
+                          partial(tqdm, total=frames.count, desc='recording', unit='image',
+                                  disable=None))
 
 
 def score_detector(sequence: Path) -> float:
@@ -98,8 +97,10 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')
     parser.add_argument('--trials', type=int, default=5, help='with other seeds (%(default)s)')
     parser.add_argument('--iterations', type=int, default=500, help="the paper's %(default)s")
-    parser.add_argument('--bf-budget', type=float, default=2.0, metavar='S',
-                        help='bf is cut short after so long a query [s] (%(default)s)')
+    parser.add_argument('--budget', type=float, default=2.0, metavar='S',
+                        help='a search is cut short after so long [s] (%(default)s); some '
+                        'exhaustive ones are')
+    parser.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args(arguments)
     make_folder(options.out)
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
@@ -110,13 +111,10 @@ def run(arguments: list[str]) -> int:
                                      landmark_map.landmark_ids)
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
-    rows = []
-    for method in tqdm(METHODS, unit='method', disable=None):
-        rows.append(measure(method, landmark_map, as_input(queries), trials=options.trials,
-                            iterations=options.iterations, bf_budget_s=options.bf_budget))
-    table = as_markdown(rows)
-    (options.out / 'table.md').write_text(table + '\n')
-    print(table)
+    paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
+    Session(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
+            workers=options.workers).compare(
+        parse_methods(['all'], paper, len(landmark_map)), resume=True, frames=queries.frames)
     return 0
 
 

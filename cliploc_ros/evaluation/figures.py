@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -241,8 +242,8 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     width, height = high - low
     scale = min(8.0 / width, 8.0 / height)
-    figure = Figure(figsize=(max(3.0, width * scale) + 2.4, max(3.0, height * scale) + 1.0),
-                    layout='constrained')
+    figure = Figure(figsize=(max(3.0, width * scale) + 2.6, max(3.0, height * scale) + 1.0),
+                    layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     axes = figure.add_subplot()
     frame = landmark_map.frame_id
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal',

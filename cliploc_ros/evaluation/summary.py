@@ -5,6 +5,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,15 +102,14 @@ def summarize(results: Iterable[Result]) -> list[Summary]:
 def _summary(method: str, results: Sequence[Result]) -> Summary:
     queries = tuple(dict.fromkeys(result.query for result in results))
 
-    def column(name: str) -> NDArray[np.generic]:
+    def column(name: str) -> NDArray[Any]:
         return np.array([getattr(result, name) for result in results]).reshape(-1, len(queries))
 
     errors = [np.inf if result.error_m is None else result.error_m for result in results]
     return Summary(
-        method, queries, np.array(errors).reshape(-1, len(queries)),
-        **{name: column(name) for name in ('accepted', 'evidence', 'search_ms', 'coverage',
-                                           'hypotheses')},
-        best_iterations=column('best_iteration'), boxes=column('boxes')[0])
+        method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
+        column('evidence'), column('search_ms'), column('coverage'), column('best_iteration'),
+        column('hypotheses'), column('boxes')[0])
 
 
 @dataclass(frozen=True)
