@@ -1,0 +1,306 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable evaluate, as its users run it."""
+
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.datasets.tum import read_tum_trajectory
+from cliploc_ros.evaluation.methods import PAPER_METHODS
+
+PROJECT = Path(__file__).resolve().parents[2]
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+            '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
+FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
+           'time_by_stage', 'success_by_boxes', 'precision_over_recall')
+TIMEOUT_S = 120.0
+
+
+def command(*arguments):
+    return [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *map(str, arguments)]
+
+
+def evaluate(*arguments, **options):
+    return subprocess.run(command(*arguments), cwd=PROJECT, text=True, capture_output=True,
+                          timeout=TIMEOUT_S, **options)
+
+
+def small(files, *arguments):
+    return ('--queries', files / 'queries.npz', '--map', files / 'map.yaml', *arguments)
+
+
+def results_of(folder):
+    """Everything in results.json but times."""
+    return [{key: value for key, value in row.items() if key != 'search_ms'}
+            for row in json.loads((folder / 'results.json').read_text())]
+
+
+def assert_error(done, *named):
+    assert done.returncode == 1, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith('error: ')]
+    assert len(lines) == 1, done.stderr
+    assert 'Traceback' not in done.stderr
+    for text in named:
+        assert text in lines[0]
+
+
+def test_the_papers_table_on_real_queries(shared_data, tmp_path):
+    office = shared_data / 'tum_fr3_office'
+    start = time.monotonic()
+    done = evaluate('--queries', office / 'queries.npz', '--map', office / 'map.yaml', '--methods',
+                    'all', '--trials', 5, '--out', tmp_path)
+    seconds = time.monotonic() - start
+    assert done.returncode == 0, done.stderr
+    print(f'\n{done.stdout}ten methods, five trials, sweep and figures in {seconds:.0f} s')
+    assert seconds < 60
+    table = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['table']
+    rows = {f'{matching}_{algorithm}': [float(rate) for rate in rates.split(' / ')]
+            for matching, algorithm, rates in re.findall(
+                r'^(\w+) +([\w-]+) +(\S+ / \S+ / \S+)', done.stdout, re.MULTILINE)}
+    assert tuple(rows) == PAPER_METHODS
+    for method, expected in table['success'].items():
+        tolerance = table['tolerance']['bf' if method.endswith('_bf') else 'sampled']
+        assert rows[method] == pytest.approx(expected, abs=tolerance + 0.005), method
+    assert {path.name for path in tmp_path.iterdir()} == {
+        'results.json', 'summary.csv', 'table.md', 'trajectories',
+        *(f'{name}.{kind}' for name in FIGURES for kind in ('png', 'svg'))}
+    for name in FIGURES:
+        image = cv2.imread(str(tmp_path / f'{name}.png'))
+        assert min(image.shape[:2]) > 400
+        assert image.std() > 10
+
+
+def test_trajectories_are_what_was_found(files, tmp_path):
+    assert evaluate(*small(files, '--methods', 'class_bf', '--out', tmp_path,
+                           '--no-figures')).returncode == 0
+    rows = results_of(tmp_path)
+    for name, chosen in (('class_bf', 'solved'), ('class_bf.accepted', 'accepted')):
+        trajectory = read_tum_trajectory(tmp_path / f'trajectories/{name}.txt')
+        own = [row for row in rows if row[chosen]]
+        assert own
+        np.testing.assert_allclose(
+            trajectory.positions_xyz,
+            [np.array(row['map_from_camera'])[:3, 3] for row in own], atol=1e-8)
+        assert trajectory.stamps_ns.tolist() == [row['timestamp'] * 1e9 for row in own]
+    assert not list(tmp_path.glob('*.png'))
+
+
+def test_one_worker_or_two(files, tmp_path):
+    arguments = small(files, '--trials', 3, '--seed', 7, '--iterations', 100, '--sweep', 50)
+    for workers in (1, 2):
+        assert evaluate(*arguments, '--workers', workers, '--out',
+                        tmp_path / str(workers)).returncode == 0
+    first, second = (re.sub(r'"search_ms": [-+.e\d]+', '', (tmp_path / name / 'results.json')
+                            .read_text()) for name in '12')
+    assert first == second
+    assert len(first) > 10_000
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_broken_off_and_resumed(files, tmp_path, number):
+    arguments = small(files, '--methods', 'hybrid_b-prosac', 'class_ransac', '--iterations', 20000,
+                      '--trials', 4, '--sweep', '--workers', 2, '--no-figures')
+    broken, whole = tmp_path / 'broken', tmp_path / 'whole'
+    process = subprocess.Popen(command(*arguments, '--out', broken), cwd=PROJECT,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = broken / 'unfinished.jsonl'
+    deadline = time.monotonic() + 60
+    while not (journal.exists() and len(journal.read_text().splitlines()) > 2):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    workers = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+    assert len(workers) >= 2
+    os.kill(process.pid, number)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == (-9 if number == signal.SIGKILL else 130)
+    assert 'Traceback' not in errors
+    deadline = time.monotonic() + 10
+    while any(Path(f'/proc/{worker}').exists() for worker in workers):
+        assert time.monotonic() < deadline, 'a worker lives on'
+        time.sleep(0.05)
+    done = len(journal.read_text().splitlines()) - 1
+    assert not (broken / 'results.json').exists()
+
+    assert_error(evaluate(*arguments, '--out', broken), 'unfinished run', '--resume')
+    other = (*arguments, '--out', broken, '--resume', '--seed', 5)
+    assert_error(evaluate(*other), 'begun with another methods')
+    assert evaluate(*arguments, '--out', broken, '--resume').returncode == 0
+    assert evaluate(*arguments, '--out', whole).returncode == 0
+    assert results_of(broken) == results_of(whole)
+    assert not journal.exists()
+    print(f'\nbroken off after {done} parts, then resumed')
+
+
+@pytest.fixture(scope='module')
+def walk(tmp_path_factory):
+    """The demo's walk as a folder of its own, two true poses of it missing, and as a bag."""
+    folder = tmp_path_factory.mktemp('walk')
+    shutil.copytree(ASSETS / 'sequence', folder / 'tum')
+    truth = folder / 'tum/groundtruth.txt'
+    lines = truth.read_text().splitlines()
+    rows = [number for number, line in enumerate(lines) if not line.startswith('#')]
+    gap = lines[rows[-1]].split()[0]
+    kept = [line for line in lines
+            if line.startswith('#') or float(line.split()[0]) < float(gap) - 0.75]
+    truth.write_text('\n'.join(kept) + '\n')
+    assert tum_to_bag([str(folder / 'tum'), str(folder / 'bag')]) == 0
+    return folder
+
+
+METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep')
+
+
+@pytest.fixture(scope='module')
+def evaluated_bag(walk):
+    done = evaluate('--bag', walk / 'bag', *NETWORKS, *METHODS, '--out', walk / 'from_bag',
+                    '--save-queries', walk / 'saved.npz')
+    assert done.returncode == 0, done.stderr
+    print('\n' + done.stdout)
+    return done
+
+
+def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag):
+    assert re.search(r'left out, as no true pose lies within 20 ms: \d of 48',
+                     evaluated_bag.stdout)
+    done = evaluate('--tum', walk / 'tum', *NETWORKS, *METHODS, '--out', walk / 'from_tum')
+    assert done.returncode == 0, done.stderr
+    done = evaluate('--queries', walk / 'saved.npz', '--map', ASSETS / 'map.yaml', *METHODS,
+                    '--out', walk / 'from_saved')
+    assert done.returncode == 0, done.stderr
+    results = results_of(walk / 'from_bag')
+    assert results == results_of(walk / 'from_saved')
+    # a bag's quaternions are rounded once more
+    for one, other in zip(results, results_of(walk / 'from_tum'), strict=True):
+        for name in ('error_m', 'error_deg'):
+            assert one.pop(name) == pytest.approx(other.pop(name), abs=1e-6)
+        assert one == other
+    results = results_of(walk / 'from_bag')
+    queries = len(load_queries(walk / 'saved.npz'))
+    assert 40 < queries < 48
+    assert len(results) == 2 * 2 * queries
+    right = [row for row in results if row['error_m'] is not None and row['error_m'] < 0.5]
+    assert len(right) > 0.9 * len(results)
+
+
+def test_detector_and_clip_run_once(walk, evaluated_bag):
+    cache, = walk.glob('bag.cliploc-*.npz')
+    before = cache.stat().st_mtime_ns
+    done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
+                    '--out', walk / 'again', '--no-figures')
+    assert done.returncode == 0, done.stderr
+    assert str(cache) in done.stderr
+    assert cache.stat().st_mtime_ns == before
+    cache.write_bytes(b'rubbish')
+    done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
+                    '--out', walk / 'once_more', '--no-figures')
+    assert done.returncode == 0
+    assert 'recording anew' in done.stderr
+    assert results_of(walk / 'again') == results_of(walk / 'once_more')
+
+
+def test_tuning_from_the_command_line(files, tmp_path):
+    done = evaluate(*small(files, '--methods', 'hybrid_b-prosac', '--tune', '--trials', 1, '--out',
+                           tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert 'on the 6 queries that did not choose' in done.stdout
+    parameters = yaml.safe_load((tmp_path / 'tuned.yaml').read_text())
+    assert parameters['relocalizer']['ros__parameters']['matching'] == 'hybrid'
+    assert_error(evaluate(*small(files, '--tune', '--out', tmp_path)), '--tune is for one method')
+
+
+def test_no_ros_is_needed(files, tmp_path):
+    code = ('import sys; from cliploc_ros.cli.evaluate import main; '
+            f'code = main({[*map(str, small(files, "--methods", "auto", "--out", tmp_path))]!r}); '
+            "assert 'rclpy' not in sys.modules and 'torch' not in sys.modules; sys.exit(code)")
+    assert subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=False,
+                          timeout=TIMEOUT_S).returncode == 0
+
+
+def changed(files, tmp_path, **arrays):
+    """A copy of the query file with some arrays changed, or left out where None."""
+    with np.load(files / 'queries.npz') as content:
+        everything = dict(content) | arrays
+    path = tmp_path / 'changed.npz'
+    np.savez(path, **{name: array for name, array in everything.items() if array is not None})
+    return path
+
+
+@pytest.mark.parametrize(('arrays', 'named'), [
+    ({'scores': None}, 'array scores is missing'),
+    ({'scores': np.ones(3)}, 'array scores has shape'),
+    ({'boxes_xyxy': 'nan'}, 'array boxes_xyxy is not finite in row 2'),
+    ({'landmark_ids': np.array([f'other_{i}' for i in range(12)])}, 'which the map does not know'),
+    ({'similarities': 'short'}, 'array similarities has shape'),
+])
+def test_bad_query_files_are_named(files, tmp_path, arrays, named):
+    with np.load(files / 'queries.npz') as content:
+        for name, value in arrays.items():
+            if isinstance(value, str):
+                array = content[name].copy()
+                array[2, 0] = np.nan
+                arrays = {name: array if value == 'nan' else array[:, :3]}
+    path = changed(files, tmp_path, **arrays)
+    assert_error(evaluate('--queries', path, '--map', files / 'map.yaml', '--out', tmp_path),
+                 'changed.npz', named)
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--image', '/camera'), 'has no topic /camera; it has /image (sensor_msgs'),
+    (('--ground-truth', '/image'), '/image is of type sensor_msgs/msg/Image, not'),
+    (('--body-from-camera', *'0000000'), 'needs x y z and a unit quaternion'),
+    (('--clip-model', 'ViT-L-15'), 'ViT-L-15'), (('--model', '/nowhere.pt'), '/nowhere.pt'),
+    (('--save-queries', '/nowhere/q.npz'), '/nowhere/q.npz'),
+])
+def test_bad_bags_and_options_are_named(walk, tmp_path, arguments, named):
+    assert_error(evaluate('--bag', walk / 'bag', *NETWORKS, *METHODS, *arguments, '--out',
+                          tmp_path), named)
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--queries', '/nowhere.npz'), '/nowhere.npz'), (('--bag', '/nowhere'), '/nowhere'),
+    (('--tum', '/nowhere'), '/nowhere')])
+def test_missing_input_is_named(files, tmp_path, arguments, named):
+    assert_error(evaluate(*arguments, '--map', files / 'map.yaml', '--out', tmp_path), named)
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--methods', 'best'), "'best' is none of"), (('--iterations', 0), 'iterations: 0'),
+    (('--out', '/proc/x'), '--out /proc/x'), (('--map', '/nowhere.yaml'), '/nowhere.yaml'),
+    (('--save-queries', 'q.npz'), '--save-queries is for')])
+def test_bad_options_are_named(files, tmp_path, arguments, named):
+    assert_error(evaluate(*small(files, '--out', tmp_path, *arguments)), named)
+
+
+def test_a_full_disk_leaves_nothing_half_written(files, tmp_path):
+    def allow_small_files():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
+
+    arguments = small(files, '--methods', 'class_bf', 'auto', '--trials', 1, '--sweep', 10, 20, 50,
+                      '--workers', 1, '--out', tmp_path)
+    done = evaluate(*arguments, preexec_fn=allow_small_files)
+    assert_error(done, 'cannot be written')
+    for path in tmp_path.rglob('*'):
+        assert not path.name.startswith('.')
+        assert path.suffix in ('', '.jsonl', '.txt', '.json', '.csv', '.md', '.png', '.svg')
+        if path.suffix == '.png':
+            assert cv2.imread(str(path)) is not None
+    assert evaluate(*arguments, '--resume').returncode == 0
+    assert len(results_of(tmp_path)) == 24

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which options a method's name stands for."""
+
+import pytest
+
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.methods import PAPER_METHODS, parse_methods
+
+PAPER = RelocalizerOptions(iterations=500, k=5, random_seed=4)
+
+
+def test_all_are_the_papers_ten():
+    methods = parse_methods(['all'], PAPER, 40)
+    assert tuple(method.name for method in methods) == PAPER_METHODS
+    for method in methods:
+        assert f'{method.options.matching}_{method.options.algorithm}' == method.name
+        assert (method.options.iterations, method.options.k) == (500, 5)
+        assert method.is_exhaustive == method.name.endswith('_bf')
+
+
+def test_auto_is_what_the_node_does():
+    method, = parse_methods(['auto'], PAPER, 40)
+    assert method.options == RelocalizerOptions(random_seed=4)
+
+
+def test_k_is_at_most_the_map():
+    assert {method.options.k for method in parse_methods(['all', 'auto'], PAPER, 2)} == {2}
+
+
+def test_a_name_given_twice_counts_once():
+    assert len(parse_methods(['auto', 'all', 'clip_bf'], PAPER, 40)) == 11
+
+
+def test_named_sets_of_options(tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_evidence: 6}\n')
+    wide, strict = parse_methods([str(path)], PAPER, 40)
+    assert (wide.name, wide.options.k, wide.options.iterations) == ('wide', 9, 500)
+    assert (strict.options.min_evidence, strict.options.iterations) == (6, 5000)
+
+
+@pytest.mark.parametrize(('text', 'named'), [
+    ('wide: {kk: 9}', "mine.yaml: wide: 'kk' is none of base, matching"),
+    ('wide: {k: many}', "mine.yaml: wide: k: 'many' is no int"),
+    ('wide: {k: true}', 'mine.yaml: wide: k: True is no int'),
+    ('wide: {k: 0}', 'mine.yaml: wide: k: 0 must lie within'),
+    ('wide: 3', 'mine.yaml: wide: is not a mapping'),
+    ('wide: {base: best}', "'best' is none of"),
+    ('a@b: {k: 2}', 'must hold neither'),
+    ('auto: {k: 2}', "two different methods are called 'auto'"),
+    ('[1, 2]', 'is not a mapping of names'),
+    ('{', 'is not YAML'),
+])
+def test_bad_files_are_named(tmp_path, text, named):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(text)
+    with pytest.raises(OptionsError) as caught:
+        parse_methods(['auto', str(path)], PAPER, 40)
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize(('words', 'named'), [
+    (['class_prosac'], "'class_prosac' is none of"), (['/nowhere.yaml'], '/nowhere.yaml'),
+    ([], 'no method is named')])
+def test_bad_names_are_named(words, named):
+    with pytest.raises(OptionsError, match=named):
+        parse_methods(words, PAPER, 40)

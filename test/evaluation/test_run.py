@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Runs: on any number of processes, broken off and resumed; and tuning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from test_summary import make_summary
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.queries import Queries
+from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.evaluation import tuning
+from cliploc_ros.evaluation.journal import Journal
+from cliploc_ros.evaluation.methods import parse_methods
+from cliploc_ros.evaluation.run import count_searches, run_methods
+from cliploc_ros.evaluation.summary import summarize
+from cliploc_ros.evaluation.trials import make_queries
+
+PAPER = RelocalizerOptions(iterations=60)
+
+
+@pytest.fixture(scope='module')
+def questions(room, recording):
+    return make_queries(recording, room)
+
+
+@pytest.fixture(scope='module')
+def methods(room):
+    return parse_methods(['class_bf', 'class_ransac', 'hybrid_b-prosac'], PAPER, len(room))
+
+
+def without_times(results):
+    return [replace(result, search_ms=0.0) for result in results]
+
+
+@pytest.fixture(scope='module')
+def results(room, questions, methods):
+    return run_methods(room, methods, questions, trials=3)
+
+
+def test_every_method_trial_and_query_is_there(results, methods, questions):
+    assert len(results) == count_searches(methods, len(questions), 3) == 7 * len(questions)
+    keys = [(result.method, result.trial, result.query) for result in results]
+    assert len(set(keys)) == len(keys)
+    assert [one.method for one in summarize(results)] == [one.name for one in methods]
+    solved = [result for result in results if result.solved]
+    assert solved
+    assert len(solved) < len(results)
+    for result in results:
+        assert (result.error_m is None) == (not result.solved) == (result.map_from_camera is None)
+
+
+def test_trials_differ_and_repeat(results, room, questions, methods):
+    sampled = [one for one in results if one.method == 'class_ransac']
+    count = len(questions)
+    assert ([one.score for one in sampled[:count]]
+            != [one.score for one in sampled[count:2 * count]])
+    again = run_methods(room, methods, questions, trials=3)
+    assert without_times(again) == without_times(results)
+
+
+def test_workers_do_not_matter(results, room, questions, methods):
+    assert without_times(run_methods(room, methods, questions, trials=3, workers=2)) \
+        == without_times(results)
+
+
+def test_what_is_done_is_not_run_again(results, room, questions, methods):
+    done = results[::3]
+    new = []
+    whole = run_methods(room, methods, questions, trials=3, done=done, advance=new.extend)
+    assert without_times(whole) == without_times(results)
+    assert len(new) == len(results) - len(done)
+
+
+def test_similarities_follow_the_maps_order(room, recording, questions):
+    turned = Queries(recording.landmark_ids[::-1], recording.intrinsics_fx_fy_cx_cy, tuple(
+        replace(frame, similarities=frame.similarities[:, ::-1]) for frame in recording.frames))
+    for one, other in zip(make_queries(turned, room), questions, strict=True):
+        np.testing.assert_array_equal(one.observation.similarities,
+                                      other.observation.similarities)
+
+
+def test_neighbours_are_asked_about_only_on_demand(room, recording):
+    frames = tuple(replace(frame, group=0, is_main=number == 0)
+                   for number, frame in enumerate(recording.frames))
+    grouped = replace(recording, frames=frames)
+    assert len(make_queries(grouped, room)) == 1
+    assert len(make_queries(grouped, room, every_frame=True)) == len(frames)
+
+
+def test_queries_of_another_map(room, recording):
+    larger = LandmarkMap(
+        room.frame_id, (*room.landmark_ids, 'new'), (*room.labels, 'new'),
+        (*room.class_ids, 'a'), np.r_[room.centers, [[0, 0, 1]]],
+        np.r_[room.semi_axes, [[1, 1, 1]]], np.r_[room.quats_xyzw, [[0, 0, 0, 1]]])
+    with pytest.raises(DatasetError, match="landmark 'new'"):
+        make_queries(recording, larger)
+
+
+def test_a_journal_forgets_only_a_line_cut_off(results, tmp_path):
+    journal = Journal(tmp_path / 'journal')
+    with journal.writing({'trials': 3}, results[:2]):
+        journal.add(results[2:5])
+    assert journal.read({'trials': 3}) == results[:5]
+    whole = journal._path.read_text()
+    journal._path.write_text(whole[:-20])
+    assert journal.read({'trials': 3}) == results[:2]
+    with pytest.raises(OptionsError, match='begun with another trials'):
+        journal.read({'trials': 4})
+    lines = whole.splitlines()
+    journal._path.write_text('\n'.join([lines[0], 'rubbish', lines[1]]))
+    with pytest.raises(OptionsError, match='damaged'):
+        journal.read({'trials': 3})
+
+
+def test_tuning_chooses_on_one_half_and_judges_on_the_other(room, questions):
+    start = RelocalizerOptions(k=1, iterations=500, min_evidence=100.0)
+    seen = []
+    tuned = tuning.tune(room, start, questions, trials=2, workers=1, seed=0, advance=seen.extend)
+    chose, judged = tuning.split(questions, 0)
+    assert len(seen) == tuning.count_searches(start, len(room), len(questions), 2)
+    assert not {one.number for one in chose} & {one.number for one in judged}
+    assert tuned.after.queries == tuned.before.queries == tuple(one.number for one in judged)
+    assert not tuned.before.accepted.any()
+    assert tuned.after.accepted.any()
+    assert tuned.options.min_evidence < 100.0
+    read = yaml.safe_load(tuning.as_parameter_file(tuned.options))['relocalizer']
+    assert read['ros__parameters']['k'] == tuned.options.k
+    with pytest.raises(OptionsError, match='at least 8'):
+        tuning.split(questions[:7], 0)
+
+
+def test_the_least_evidence_that_is_right_often_enough():
+    def evidence(errors, levels):
+        return tuning.least_evidence(make_summary(
+            errors, accepted=[True] * len(errors), evidence=levels))
+
+    assert evidence([0.1, 0.1, 2.0], [5.0, 4.0, 3.0]) == 4.0
+    assert evidence([0.1, 2.0, 0.1], [5.0, 4.004, 3.0]) == 5.0
+    assert evidence([2.0, 0.1], [5.0, 4.0]) > 5.0
