@@ -227,7 +227,7 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
     axes.invert_yaxis()
     if (start + search).max() > 50 * (start + search).min() and not observing_ms:
         axes.set_xscale('log')
-    axes.margins(x=0.2)
+    axes.margins(x=0.28)
     if observing_ms:
         _legend(figure)
     return figure
