@@ -33,6 +33,9 @@ class RelocalizerOptions:
     time_budget_s : float
         The search stops after this long [s]; what is cut short is refused, and says how far it
         came.
+    refine : bool
+        Improve the best hypotheses on all of their inliers, before the best of them is chosen;
+        the paper does not.
     min_inliers : int
         Fewer explained objects are refused.
     min_evidence : float
@@ -51,6 +54,7 @@ class RelocalizerOptions:
     iou_threshold: float = 0.2
     random_seed: int = 0
     time_budget_s: float = math.inf
+    refine: bool = True
     min_inliers: int = 4
     min_evidence: float = 4.0
 

@@ -4,8 +4,8 @@
 
 The outline of each matched landmark shall touch the edges of its box: four residuals a match, in
 shares of the box's size, since both a detector's and a mapper's errors grow with the object.
-Levenberg-Marquardt with Cauchy's weights minimizes them (Triggs et al., "Bundle Adjustment", 1999);
-matching and minimizing alternate until neither changes.
+Levenberg-Marquardt with Cauchy's weights minimizes them (Triggs et al., "Bundle Adjustment",
+1999); matching and minimizing alternate until neither changes.
 """
 
 from math import cos, sin, sqrt
@@ -20,6 +20,9 @@ from cliploc_ros.core.scoring import verify
 # fitted maps are off by a tenth or so, and by a pixel or so at least.
 RELATIVE_DEVIATION = 0.1
 LEAST_DEVIATION = 0.003
+#: What refine takes for a vertical that is not known.
+VERTICAL_UNKNOWN = np.zeros(7)
+
 # Residuals beyond this many deviations lose their say.
 _CAUCHY = 2.0
 _ROUNDS = 4
@@ -107,7 +110,7 @@ def _minimize(scene, detections, landmarks, vertical, rotation, translation, inf
         return
     cost = _robust_cost(residuals)
     for _ in range(_STEPS):
-        for axis in range(6):
+        for axis in range(6):  # forward differences
             step[:] = 0.0
             step[axis] = _DIFFERENCE
             _move(rotation, translation, step, trial_rotation, trial_translation)
@@ -154,7 +157,7 @@ def _residuals(scene, detections, landmarks, vertical, rotation, translation, re
     """Write by how many deviations outlines miss the edges; False if one is not in front."""
     for row in range(len(detections)):
         box, landmark = scene.box_ellipses[detections[row]], landmarks[row]
-        visible, cx, cy, exx, exy, eyy = project_ellipsoid(
+        visible, cx, cy, exx, _, eyy = project_ellipsoid(
             rotation, translation, scene.centers[landmark], scene.shapes[landmark])
         if not visible:
             return False

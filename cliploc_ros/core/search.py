@@ -55,11 +55,11 @@ class Leaders(NamedTuple):
     translations: NDArray[np.float64]
 
     @staticmethod
-    def none_yet() -> 'Leaders':
-        """Return an empty list of leaders."""
-        return Leaders(np.full(MAX_DISTINCT, -1.0), np.zeros(MAX_DISTINCT, dtype=np.int64),
-                       np.full((MAX_DISTINCT, 3), -1, dtype=np.int64),
-                       np.zeros((MAX_DISTINCT, 3, 3)), np.zeros((MAX_DISTINCT, 3)))
+    def none_yet(count: int = MAX_DISTINCT) -> 'Leaders':
+        """Return an empty list for so many leaders."""
+        return Leaders(np.full(count, -1.0), np.zeros(count, dtype=np.int64),
+                       np.full((count, 3), -1, dtype=np.int64),
+                       np.zeros((count, 3, 3)), np.zeros((count, 3)))
 
     def ranked(self) -> NDArray[np.int64]:
         """Return the used rows, best first."""
@@ -181,7 +181,7 @@ def _remember(score, iteration, sample, rotation, translation, leaders):
     for row in range(leaders.scores.shape[0]):
         if leaders.scores[row] < 0.0:
             continue
-        if not _same_place(rotation, translation, leaders.rotations[row],
+        if not same_place(rotation, translation, leaders.rotations[row],
                            leaders.translations[row]):
             continue
         if leaders.scores[row] >= score:
@@ -198,7 +198,7 @@ def _remember(score, iteration, sample, rotation, translation, leaders):
 
 
 @compiled
-def _same_place(rotation_a, translation_a, rotation_b, translation_b):
+def same_place(rotation_a, translation_a, rotation_b, translation_b):
     """Tell whether two camera_from_map poses lie within the distinct distance and angle."""
     trace, square = 0.0, 0.0
     for i in range(3):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.refinement import RELATIVE_DEVIATION
 from cliploc_ros.core.transforms import invert_transform
 
 # The scatter of box centres, as a share of the box, before anything is seen, and how many
@@ -15,6 +16,8 @@ _PRIOR_WEIGHT = 6.0
 # Errors of box and map are shared by neighbouring edges, so fewer are independent than counted.
 # Doubling the variance brings accepted poses of real TUM frames near their 95 % ellipsoids.
 _VARIANCE_INFLATION = 2.0
+# The same for refined poses.
+_REFINED_INFLATION = 2.0
 # No box centre is known better than this on the plane z = 1: a twentieth of a pixel or so.
 _MIN_DEVIATION = 1e-4
 # Finite-difference steps of position [m] and rotation [rad].
@@ -80,6 +83,28 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
                    + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
     covariance = np.linalg.inv(information)
     return (covariance + covariance.T) / 2
+
+
+def refined_covariance(information: NDArray[np.float64], scatter: float
+                       ) -> NDArray[np.float64]:
+    """Return the covariance of a pose that was refined on its inliers.
+
+    Parameters
+    ----------
+    information : ndarray (6, 6)
+        Of the last linearized system, of residuals in assumed deviations, see refine.
+    scatter : float
+        See box_scatter: by how much the deviations assumed are to be stretched.
+
+    Returns
+    -------
+    ndarray (6, 6)
+        As of pose_covariance.
+    """
+    stretch = _REFINED_INFLATION * max(1.0, scatter / RELATIVE_DEVIATION) ** 2
+    prior = np.diag(1.0 / np.array(_PRIOR_VARIANCES))
+    covariance = np.linalg.inv(information / stretch + prior)
+    return np.asarray((covariance + covariance.T) / 2)
 
 
 def _moved(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -77,7 +77,7 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
         options = RelocalizerOptions(random_seed=paper.random_seed)
     elif name in PAPER_METHODS:
         matching, algorithm = name.split('_')
-        options = replace(paper, matching=matching, algorithm=algorithm)
+        options = replace(paper, matching=matching, algorithm=algorithm, refine=False)
     else:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
                            'nor a YAML file')

@@ -58,6 +58,8 @@ RELOCALIZER = (
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
     ParameterRow('time_budget_s', 10.0, 'The search stops after this long, and what it found '
                  'is then refused.', unit='s', low=0.0, high=3600.0),
+    ParameterRow('refine', True, 'Improve the best poses on all of their inliers; the paper does '
+                 'not.'),
     ParameterRow('min_inliers', 4, 'A pose that explains fewer objects is refused.', low=3,
                  high=1000),
     ParameterRow('min_evidence', 4.0, 'A pose with less evidence (score plus twice its margin '

@@ -30,7 +30,7 @@ def test_success_rates(method, office_map, queries, observe, thresholds):
     rates = np.mean([success_rates(
         office_map, queries.main_frames(), observe,
         RelocalizerOptions(matching=matching, algorithm=algorithm, random_seed=seed,
-                           iterations=500))
+                           iterations=500, refine=False))
         for seed in seeds], axis=0)
     print(f'\n{method}: success {" / ".join(f"{rate:.2f}" for rate in rates)} at '
           '0.25 / 0.5 / 1 m')
