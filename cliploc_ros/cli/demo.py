@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
         '--rate', type=_positive, default=4.0, metavar='X',
         help='speed between wake-ups: 2 is twice as fast as recorded (default: %(default)g)')
     parser.add_argument(
-        '--method', default='hybrid_b-prosac', metavar='MATCHING_ALGORITHM',
+        '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',
         help='as the paper names them, such as class_bf, clip_prosac (default: %(default)s)')
     parser.add_argument(
         '--assets', type=Path, default=ASSETS, metavar='DIR',

@@ -47,12 +47,15 @@ class Evidence:
         The same of the best hypothesis elsewhere; 0 when there is none.
     coverage : float
         The share of its samples that the search tried, 0 to 1.
+    tried : int
+        How many these are.
     """
 
     inliers: int
     score: float
     rival_score: float
     coverage: float = 1.0
+    tried: int = 0
 
     @property
     def strength(self) -> float:
@@ -94,10 +97,14 @@ def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[n
 
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     """Return why the best hypothesis is not to be believed; empty if it is."""
-    if evidence.coverage < 1.0:
+    if evidence.coverage < 1.0 and options.algorithm == 'auto':
+        if evidence.tried < _MIN_ITERATIONS:
+            return (f'the search was cut short after {evidence.tried} hypotheses, too few to know '
+                    f'the rivals of a pose: raise time_budget_s and iterations')
+    elif evidence.coverage < 1.0:
         return (f'the search was cut short after {100 * evidence.coverage:.3g} %, so a better '
-                'pose may be elsewhere: raise time_budget_s, or sample (ransac, b-prosac)')
-    if options.algorithm != 'bf' and options.iterations < _MIN_ITERATIONS:
+                'pose may be elsewhere: raise time_budget_s, or set algorithm to auto')
+    elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
         return (f'iterations = {options.iterations} are too few to know the rivals of a pose: '
                 f'set at least {_MIN_ITERATIONS}')
     if evidence.inliers < options.min_inliers:

@@ -129,3 +129,19 @@ def balanced_order(candidates: Candidates) -> Candidates:
     from filling the head of the list.
     """
     return candidates.ordered(candidates.ranks, -candidates.similarities)
+
+
+def joined(first: Candidates, second: Candidates, shape: tuple[int, int]) -> Candidates:
+    """Return the candidates of both, those of the first before what the second adds.
+
+    Parameters
+    ----------
+    first, second : Candidates
+    shape : tuple of int
+        Number of detections and of landmarks.
+    """
+    new = np.nonzero(~candidate_mask(first, shape)[second.detections, second.landmarks])[0]
+    return Candidates(np.concatenate([first.detections, second.detections[new]]),
+                      np.concatenate([first.landmarks, second.landmarks[new]]),
+                      np.concatenate([first.ranks, second.ranks[new]]),
+                      np.concatenate([first.similarities, second.similarities[new]]))

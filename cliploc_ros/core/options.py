@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from cliploc_ros.core.association import MATCHINGS
 from cliploc_ros.errors import OptionsError
 
-ALGORITHMS = ('bf', 'ransac', 'prosac', 'b-prosac')
+ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
 
 
 @dataclass(frozen=True)
@@ -20,19 +20,22 @@ class RelocalizerOptions:
     matching : str
         'class', 'clip' or 'hybrid': what makes a correspondence candidate.
     algorithm : str
-        'bf', 'ransac', 'prosac' or 'b-prosac': which minimal samples are tried.
+        Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's;
+        'auto' tries every sample that boxes and map allow, in the order of b-prosac and without
+        repetition, as far as `iterations` and `time_budget_s` reach. In hybrid matching it goes
+        on to candidates of equal class when those of CLIP are done.
     k : int
         Landmarks retrieved for each crop.
     iterations : int
-        Minimal samples drawn; bf tries them all instead. The paper's 500 find the best pose
-        less often, and then not its rivals either.
+        Minimal samples drawn, of auto the most that are tried; bf tries them all instead. The
+        paper's 500 find the best pose less often, and then not its rivals either.
     iou_threshold : float
         A detection and a landmark that overlap more than this (0 to 1) are an inlier.
     random_seed : int
         Equal seed and input give equal output; below 0 every search differs.
     time_budget_s : float
-        The search stops after this long [s]; what is cut short is refused, and says how far it
-        came.
+        The search stops after this long [s]; what is cut short, but for auto, is refused, and
+        says how far it came.
     refine : bool
         Improve the best hypotheses on all of their inliers, before the best of them is chosen;
         the paper does not.
@@ -48,9 +51,9 @@ class RelocalizerOptions:
     """
 
     matching: str = 'hybrid'
-    algorithm: str = 'b-prosac'
+    algorithm: str = 'auto'
     k: int = 3
-    iterations: int = 5000
+    iterations: int = 10_000
     iou_threshold: float = 0.2
     random_seed: int = 0
     time_budget_s: float = math.inf

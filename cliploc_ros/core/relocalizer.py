@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one door to the method: Relocalizer.relocalize(observations) -> Relocalization."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from cliploc_ros.core import association
 from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
 from cliploc_ros.core.association import Candidates
 from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -28,6 +30,7 @@ from cliploc_ros.core.search import (
     Progress,
     same_place,
     search_exhaustively,
+    search_progressively,
     search_samples,
 )
 from cliploc_ros.core.transforms import invert_transform, make_transform
@@ -141,6 +144,7 @@ class Relocalizer:
                            centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
         list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
         list(search_exhaustively(scene, Leaders.none_yet()))
+        list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
         refine(scene, np.eye(3), np.zeros(3), VERTICAL_UNKNOWN, Workspace.allocate(3))
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
@@ -204,14 +208,21 @@ class Relocalizer:
             potential |= by_class
         if options.algorithm == 'prosac':
             candidates = association.prosac_order(candidates)
-        elif options.algorithm == 'b-prosac':
+        elif options.algorithm in ('b-prosac', 'auto'):
             candidates = association.balanced_order(candidates)
+        if options.matching == 'hybrid' and options.algorithm == 'auto':
+            candidates = association.joined(candidates, association.class_candidates(by_class),
+                                            shape)
         return candidates, potential
 
     def _search(self, scene: Scene, leaders: Leaders, start: float) -> Progress:
         """Run the algorithm that the options name, as far as time allows."""
         options = self._options
-        if options.algorithm == 'bf':
+        limit = math.inf
+        if options.algorithm == 'auto':
+            limit = options.iterations
+            search = search_progressively(scene, compatible_pairs(scene), leaders)
+        elif options.algorithm == 'bf':
             search = search_exhaustively(scene, leaders)
         else:
             draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
@@ -221,7 +232,7 @@ class Relocalizer:
         progress = Progress(0, 1.0)
         for step in search:
             progress = step
-            if time.perf_counter() - start > options.time_budget_s:
+            if progress.tried >= limit or time.perf_counter() - start > options.time_budget_s:
                 break
         return progress
 
@@ -241,7 +252,7 @@ class Relocalizer:
         evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
-            coverage=progress.coverage)
+            coverage=progress.coverage, tried=progress.tried)
         reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
                               progress.tried, finalists[0].iteration,

@@ -112,11 +112,11 @@ def sampled_iou(scene, pair, rotation, translation):
 
 @compiled
 def sample_pose(scene, sample, workspace):
-    """Return which P3P solution of a minimal sample to verify; -1 if there is none.
+    """Return which P3P solution of a minimal sample to verify, and the sum of its own IoUs.
 
     It is the one with the greatest sum of IoUs over the sampled pairs, among those for which all
     three ellipsoids lie wholly in front of the camera; an index into the workspace's rotations
-    and translations.
+    and translations; -1 if there is none.
     """
     for row in range(3):
         detection, landmark = scene.pairs[sample[row], 0], scene.pairs[sample[row], 1]
@@ -133,7 +133,7 @@ def sample_pose(scene, sample, workspace):
                  + sampled_iou(scene, sample[2], rotation, translation))
         if total > best_total:  # never true of NaN
             best, best_total = solution, total
-    return best
+    return best, best_total
 
 
 @compiled

@@ -20,6 +20,9 @@ DISTINCT_ANGLE_DEG = 20.0
 _DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
 
 
+#: A sample whose own three pairs overlap less than this in sum is not verified, where every
+#: sample is tried: a better one of the same place comes.
+MIN_SAMPLED_IOU = 0.9
 # A block of either search takes a few milliseconds, so that time limits hold.
 _SAMPLES_A_BLOCK = 100
 _WORK_A_BLOCK = 100_000
@@ -118,13 +121,71 @@ def search_exhaustively(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
         yield Progress(tried, 1.0 - left / comb(count, 3))
 
 
+def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders
+                         ) -> Iterator[Progress]:
+    """Try every sample of compatible candidates, those of the first candidates first.
+
+    All samples among the first n candidates are tried before one with the next: what PROSAC draws
+    at random, without repetition, and to the end where there is time.
+
+    Parameters
+    ----------
+    scene : Scene
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.compatibility.
+    leaders : Leaders
+        Changed in place.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    workspace = Workspace.allocate(len(scene.bearings))
+    count = len(scene.pairs)
+    cursor = np.array([2, 0, 1], dtype=np.int64)  # newest, first, second
+    tried = 0
+    while cursor[0] < count:
+        tried += _search_progressively(scene, compatible, cursor, tried, leaders, workspace)
+        done = comb(int(cursor[0]), 3) if cursor[0] < count else comb(count, 3)
+        yield Progress(tried, done / max(comb(count, 3), 1))
+
+
+@compiled
+def _search_progressively(scene, compatible, cursor, tried_before, leaders, workspace):
+    """Try the samples from a cursor on, for a bounded time; move the cursor behind them."""
+    count = scene.pairs.shape[0]
+    sample = np.empty(3, dtype=np.int64)
+    newest, first, second = cursor[0], cursor[1], cursor[2]
+    tried, work = 0, 0
+    while newest < count and work < _WORK_A_BLOCK:
+        if first >= newest - 1:
+            newest, first, second = newest + 1, 0, 1
+            continue
+        work += 1
+        if second >= newest or not compatible[newest, first]:
+            first += 1
+            second = first + 1
+            continue
+        if compatible[newest, second] and compatible[first, second]:
+            sample[0], sample[1], sample[2] = first, second, newest
+            tried += 1
+            work += _WORK_A_HYPOTHESIS
+            if _try_sample(scene, sample, tried_before + tried, MIN_SAMPLED_IOU, leaders,
+                           workspace):
+                work += scene.potential_landmarks.shape[0]
+        second += 1
+    cursor[0], cursor[1], cursor[2] = newest, first, second
+    return tried
+
+
 @compiled
 def _search_samples(scene, samples, start, stop, leaders, workspace):
     tried = 0
     for t in range(start, stop):
         if samples[t, 0] >= 0:
             tried += 1
-            _try_sample(scene, samples[t], t + 1, leaders, workspace)
+            _try_sample(scene, samples[t], t + 1, 0.0, leaders, workspace)
     return tried
 
 
@@ -150,7 +211,7 @@ def _search_from(scene, cursor, tried_before, leaders, workspace):
             sample[0], sample[1], sample[2] = first, second, third
             tried += 1
             work += _WORK_A_HYPOTHESIS + scene.potential_landmarks.shape[0]
-            _try_sample(scene, sample, tried_before + tried, leaders, workspace)
+            _try_sample(scene, sample, tried_before + tried, 0.0, leaders, workspace)
         third += 1
     cursor[0], cursor[1], cursor[2] = first, second, third
     return tried
@@ -163,15 +224,16 @@ def _clash(pairs, a, b):
 
 
 @compiled
-def _try_sample(scene, sample, iteration, leaders, workspace):
-    """Make the hypothesis of one sample, and remember it if it leads."""
-    solution = sample_pose(scene, sample, workspace)
-    if solution < 0:
-        return
+def _try_sample(scene, sample, iteration, least_iou, leaders, workspace):
+    """Make the hypothesis of one sample, and remember it if it leads; tell if it was verified."""
+    solution, total = sample_pose(scene, sample, workspace)
+    if solution < 0 or total < least_iou:
+        return False
     rotation, translation = workspace.rotations[solution], workspace.translations[solution]
     score = verify(scene, rotation, translation, workspace)
     if score > np.min(leaders.scores):
         _remember(score, iteration, sample, rotation, translation, leaders)
+    return True
 
 
 @compiled

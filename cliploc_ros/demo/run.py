@@ -59,7 +59,7 @@ class DemoOptions:
     rate : float
         Speed of the recording between the wake-ups; 1 is as recorded.
     method : str
-        Matching and algorithm as the paper joins them, ``hybrid_b-prosac``.
+        Matching and algorithm as the paper joins them, ``hybrid_auto``.
     rviz : bool
         Whether to open RViz where it is installed.
     """
@@ -68,7 +68,7 @@ class DemoOptions:
     out: Path
     wake_ups: int = 10
     rate: float = 4.0
-    method: str = 'hybrid_b-prosac'
+    method: str = 'hybrid_auto'
     rviz: bool = False
 
     @property

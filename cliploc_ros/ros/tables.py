@@ -48,16 +48,17 @@ RELOCALIZER = (
     ParameterRow('matching', 'hybrid', 'What makes a candidate: equal classes, similarity by '
                  'CLIP, or CLIP with classes for verification.', choices=MATCHINGS,
                  read_only=True),
-    ParameterRow('algorithm', 'b-prosac', 'How minimal samples are chosen; bf tries all.',
+    ParameterRow('algorithm', 'auto', 'How minimal samples are chosen: auto goes through all '
+                 "that can be, the likeliest first; bf tries all; the others are the paper's.",
                  choices=ALGORITHMS),
     ParameterRow('k', 3, 'Landmarks retrieved for each crop.', low=1, high=1000),
-    ParameterRow('iterations', 5000, 'Minimal samples drawn for a request.', low=1,
+    ParameterRow('iterations', 10_000, 'The most minimal samples tried for a request.', low=1,
                  high=1_000_000),
     ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
                  low=0.0, high=1.0),
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
     ParameterRow('time_budget_s', 10.0, 'The search stops after this long, and what it found '
-                 'is then refused.', unit='s', low=0.0, high=3600.0),
+                 'is then refused, but for auto.', unit='s', low=0.0, high=3600.0),
     ParameterRow('refine', True, 'Improve the best poses on all of their inliers; the paper does '
                  'not.'),
     ParameterRow('min_inliers', 4, 'A pose that explains fewer objects is refused.', low=3,

@@ -78,8 +78,13 @@ def test_evidence_is_score_and_twice_the_margin():
 @pytest.mark.parametrize(('evidence', 'options', 'reason'), [
     (Evidence(3, 2.5, 0.0), {}, 'only 3 objects'),
     (Evidence(5, 3.5, 3.5), {}, 'ambiguous'),
-    (Evidence(5, 3.5, 1.0, coverage=0.5), {}, 'the search was cut short after 50 %'),
-    (Evidence(5, 3.5, 1.0), {'iterations': 100}, 'iterations = 100 are too few'),
+    (Evidence(5, 3.5, 1.0, coverage=0.5), {'algorithm': 'bf'},
+     'the search was cut short after 50 %'),
+    (Evidence(5, 3.5, 1.0, coverage=0.5, tried=100), {},
+     'the search was cut short after 100 hypotheses'),
+    (Evidence(5, 3.5, 1.0, coverage=0.5, tried=5000), {}, ''),
+    (Evidence(5, 3.5, 1.0), {'iterations': 100, 'algorithm': 'b-prosac'},
+     'iterations = 100 are too few'),
     (Evidence(5, 3.5, 1.0), {'iterations': 100, 'algorithm': 'bf'}, ''),
     (Evidence(5, 3.5, 1.0), {}, ''),
 ])

@@ -38,7 +38,7 @@ def test_named_sets_of_options(tmp_path):
     path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_evidence: 6}\n')
     wide, strict = parse_methods([str(path)], PAPER, 40)
     assert (wide.name, wide.options.k, wide.options.iterations) == ('wide', 9, 500)
-    assert (strict.options.min_evidence, strict.options.iterations) == (6, 5000)
+    assert (strict.options.min_evidence, strict.options.iterations) == (6, 10_000)
 
 
 @pytest.mark.parametrize(('text', 'named'), [

@@ -95,7 +95,7 @@ def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
 
 
 @pytest.mark.parametrize(('name', 'value', 'reason'), [
-    ('algorithm', 'luck', 'is none of bf, ransac'),
+    ('algorithm', 'luck', 'is none of auto, bf, ransac'),
     ('algorithm', 'b-prosc', "did you mean 'b-prosac'"),
     ('algorithm', 'prosac', "which matching 'class' has none of"),
     ('iterations', 0, '0 must be 1 to'),

@@ -28,12 +28,12 @@ def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
     start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
         'detector ready')
     start('nodes.relocalizer', parameters={
-        'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid', 'algorithm': 'b-prosac',
+        'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid',
         'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
         'cache_dir': tmp_path}).wait_for_output('ready after')
     tester.connect()
-    # slow enough to be asked about nearly every frame in one round
-    start('cli.replay', recording, '--loop')
+    # so slow that one round is enough to ask about nearly every frame
+    start('cli.replay', recording, '--loop', '--rate', '0.6')
     answers = wake_up_on_every_frame(tester, FRAMES)
     errors_m, wrong = judge(answers, read_tum(ASSETS / 'sequence'))
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['nodes']

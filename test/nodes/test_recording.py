@@ -46,7 +46,7 @@ def convert(office, tmp_path_factory):
 def core_answer(office, detections):
     """What the core says of detections, without any ROS."""
     relocalizer = Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
-                              RelocalizerOptions(matching='class', algorithm='bf'))
+                              RelocalizerOptions(matching='class'))
     return relocalizer.relocalize([Observation(PRESETS['fr3'],
                                                detections.usable(640, 480, 50))])
 
@@ -56,12 +56,14 @@ def test_recorded_detections(office, convert, limits, start, tester, monkeypatch
     recording = convert('boxes', '--detections', office / 'detections.json',
                         monkeypatch=monkeypatch)
     start('nodes.relocalizer', parameters={
-        'map_file': office / 'map.yaml', 'matching': 'class', 'algorithm': 'bf'
+        'map_file': office / 'map.yaml', 'matching': 'class',
     }).wait_for_output('ready after')
     tester.connect()
     start('cli.replay', recording, '--loop', '--rate', '3')
     with tester.hearing_detections() as heard:
         answers = wake_up_on_every_frame(tester, FRAMES)
+        # a busy machine may drop a message on its way here; the recording comes round again
+        tester.wait(lambda: set(answers) <= set(heard), 'the detections of every answer')
     for stamp, (answer, hypotheses) in answers.items():
         expected = core_answer(office, heard[stamp])
         assert answer.success == expected.accepted
@@ -103,8 +105,7 @@ def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, lim
     start('nodes.detector', parameters={
         'model': shared_data / 'weights/yolov8n_coco.pt'}).wait_for_output('detector ready')
     start('nodes.relocalizer', parameters={
-        'map_file': office / 'map.yaml', 'matching': 'class', 'algorithm': 'ransac',
-        'iterations': 5000}).wait_for_output('ready after')
+        'map_file': office / 'map.yaml', 'matching': 'class'}).wait_for_output('ready after')
     tester.connect()
     start('cli.replay', recording, '--loop', '--rate', '2')
     with tester.hearing_detections() as detected:
