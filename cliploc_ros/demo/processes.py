@@ -83,12 +83,10 @@ def running(command: Sequence[object], log: Path) -> Iterator[Process]:
         The file for its output.
     """
     arguments = [str(argument) for argument in command]
-    # Two networks share the cores: a thread that waits by spinning slows the other one tenfold.
-    environment = {'OMP_WAIT_POLICY': 'PASSIVE'} | os.environ
     with log.open('wb') as output:
         # Killed itself, the demo could end nothing any more: then the kernel does.
         popen = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=output,
-                                 stderr=subprocess.STDOUT, env=environment,
+                                 stderr=subprocess.STDOUT,
                                  preexec_fn=_end_with_parent)
     process = Process(Path(arguments[0]).name, popen, log)
     try:

@@ -82,6 +82,9 @@ def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
 
 def run_node(make_node: Callable[[], WorkingNode]) -> NoReturn:
     """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
+    # Two networks share a robot's cores, each in a process of its own: a thread of PyTorch that
+    # waits by spinning, as they do, slows the other one tenfold. Read when PyTorch is loaded.
+    os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     try:
         rclpy.init(args=sys.argv)
     except Exception as error:  # rcl raises its own types for arguments and for missing folders
