@@ -14,6 +14,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 _SAME_BOX_IOU = 0.8
 # Fewer samples have not looked for rivals: the margin over them would mean nothing.
 _MIN_ITERATIONS = 500
+# A rival as good as a pose that was met so often is missed with a chance of .05.
+_MIN_MEETINGS = 3
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,10 @@ class Evidence:
         The share of its samples that the search tried, 0 to 1.
     tried : int
         How many these are.
+    meetings : int
+        How many samples, of those that the search tried, hold nothing but inliers of the best
+        hypothesis. A rival with as many inliers is met about as often, and missed with a chance
+        of about exp(-meetings) (Fischler and Bolles 1981).
     """
 
     inliers: int
@@ -56,6 +62,7 @@ class Evidence:
     rival_score: float
     coverage: float = 1.0
     tried: int = 0
+    meetings: int = 1_000_000
 
     @property
     def strength(self) -> float:
@@ -107,6 +114,11 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
         return (f'iterations = {options.iterations} are too few to know the rivals of a pose: '
                 f'set at least {_MIN_ITERATIONS}')
+    if evidence.meetings < _MIN_MEETINGS and not (
+            options.algorithm in ('auto', 'bf') and evidence.coverage == 1.0):
+        return (f'the search met this pose only {evidence.meetings} times in {evidence.tried} '
+                'samples, so one as good may have been missed: raise iterations, or set '
+                'algorithm to auto')
     if evidence.inliers < options.min_inliers:
         return (f'only {evidence.inliers} objects are where the map has them, '
                 f'{options.min_inliers} are needed: turn to where more are in view')

@@ -75,6 +75,20 @@ def class_candidates(mask: NDArray[np.bool_]) -> Candidates:
     return Candidates(detections, landmarks, zeros.astype(np.int64), zeros)
 
 
+def rarest_first(candidates: Candidates, mask: NDArray[np.bool_]) -> Candidates:
+    """Return candidates of equal class, those of few landmarks before those of many.
+
+    Where a class has few landmarks, a pair is the likelier to be right.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    mask : ndarray (n, L) of bool
+        See same_class.
+    """
+    return candidates.ordered(mask.sum(axis=1)[candidates.detections])
+
+
 def check_k(k: int, landmark_count: int) -> None:
     """Refuse with an OptionsError a k that the map cannot give."""
     if not 1 <= k <= landmark_count:

@@ -185,16 +185,19 @@ class Relocalizer:
         scene = make_scene(np.where(sound[:, None], bboxes, 1.0), self._map.centers, self._shapes,
                            potential, pairs, self._options.iou_threshold)
         leaders = Leaders.none_yet(_REFINED if self._options.refine else MAX_DISTINCT)
-        progress = self._search(scene, leaders, start)
-        return self._conclude(observation, scene, leaders, progress, start)
+        progress, samples = self._search(scene, leaders, start)
+        return self._conclude(observation, scene, leaders, progress, samples, start)
 
     def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
         """Return the candidates in the sampler's order, and the verification mask (n, L)."""
         options = self._options
         shape = (len(observation.detections), len(self._map))
         by_class = association.same_class(observation.detections.class_ids, self._map.class_ids)
+        of_class = association.class_candidates(by_class)
+        if options.algorithm == 'auto':
+            of_class = association.rarest_first(of_class, by_class)
         if not options.needs_similarities:
-            return association.class_candidates(by_class), by_class
+            return of_class, by_class
         similarities = observation.similarities
         if similarities is None or similarities.shape != shape:
             found = 'none' if similarities is None else f'{similarities.shape}'
@@ -211,14 +214,17 @@ class Relocalizer:
         elif options.algorithm in ('b-prosac', 'auto'):
             candidates = association.balanced_order(candidates)
         if options.matching == 'hybrid' and options.algorithm == 'auto':
-            candidates = association.joined(candidates, association.class_candidates(by_class),
-                                            shape)
+            candidates = association.joined(candidates, of_class, shape)
         return candidates, potential
 
-    def _search(self, scene: Scene, leaders: Leaders, start: float) -> Progress:
-        """Run the algorithm that the options name, as far as time allows."""
+    def _search(self, scene: Scene, leaders: Leaders, start: float
+                ) -> tuple[Progress, NDArray[np.int64] | None]:
+        """Run the algorithm that the options name, as far as time allows.
+
+        Returns how far it came, and the samples (t, 3) where these were drawn.
+        """
         options = self._options
-        limit = math.inf
+        limit, samples = math.inf, None
         if options.algorithm == 'auto':
             limit = options.iterations
             search = search_progressively(scene, compatible_pairs(scene), leaders)
@@ -227,17 +233,18 @@ class Relocalizer:
         else:
             draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
             seed = options.random_seed if options.random_seed >= 0 else None
-            search = search_samples(
-                scene, draw(scene.pairs, options.iterations, np.random.default_rng(seed)), leaders)
+            samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
+            search = search_samples(scene, samples, leaders)
         progress = Progress(0, 1.0)
         for step in search:
             progress = step
             if progress.tried >= limit or time.perf_counter() - start > options.time_budget_s:
                 break
-        return progress
+        return progress, samples
 
     def _conclude(self, observation: Observation, scene: Scene, leaders: Leaders,
-                  progress: Progress, start: float) -> Relocalization:
+                  progress: Progress, samples: NDArray[np.int64] | None, start: float
+                  ) -> Relocalization:
         """Turn the leaders into a result, and decide whether to believe the first."""
         finalists = _refined(scene, leaders) if self._options.refine else _as_found(leaders)
         if not finalists:
@@ -252,7 +259,8 @@ class Relocalizer:
         evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
-            coverage=progress.coverage, tried=progress.tried)
+            coverage=progress.coverage, tried=progress.tried,
+            meetings=_meetings(scene, explained[0], progress, samples))
         reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
                               progress.tried, finalists[0].iteration,
@@ -306,6 +314,19 @@ def _matches(scene: Scene, pose: _Finalist) -> tuple[Match, ...]:
     verify(scene, pose.rotation, pose.translation, workspace)
     return tuple(Match(int(row), int(workspace.landmarks[row]), float(workspace.ious[row]))
                  for row in np.nonzero(workspace.landmarks >= 0)[0])
+
+
+def _meetings(scene: Scene, matches: tuple[Match, ...], progress: Progress,
+              samples: NDArray[np.int64] | None) -> int:
+    """Return how many of the samples tried hold nothing but inliers."""
+    landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
+    for match in matches:
+        landmark_of[match.detection] = match.landmark
+    is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
+    if samples is None:  # all samples of the first candidates were tried
+        return math.comb(int(is_inlier[:progress.reach].sum()), SAMPLE_SIZE)
+    tried = samples[:round(progress.coverage * len(samples))]
+    return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
 
 
 def _covariance(scene: Scene, pose: _Finalist, matches: tuple[Match, ...]

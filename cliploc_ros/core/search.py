@@ -31,10 +31,21 @@ _WORK_A_HYPOTHESIS = 100
 
 
 class Progress(NamedTuple):
-    """How far a search is: hypotheses tried so far, and the share of its samples, 0 to 1."""
+    """How far a search is.
+
+    Parameters
+    ----------
+    tried : int
+        Hypotheses tried so far.
+    coverage : float
+        The share of its samples that were tried, 0 to 1.
+    reach : int
+        Of a progressive search, among how many of the first candidates all samples were tried.
+    """
 
     tried: int
     coverage: float
+    reach: int = 0
 
 
 class Leaders(NamedTuple):
@@ -148,7 +159,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     while cursor[0] < count:
         tried += _search_progressively(scene, compatible, cursor, tried, leaders, workspace)
         done = comb(int(cursor[0]), 3) if cursor[0] < count else comb(count, 3)
-        yield Progress(tried, done / max(comb(count, 3), 1))
+        yield Progress(tried, done / max(comb(count, 3), 1), min(int(cursor[0]), count))
 
 
 @compiled

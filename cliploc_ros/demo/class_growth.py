@@ -33,7 +33,7 @@ from cliploc_ros.evaluation.trials import make_queries
 COUNTS = (6, 12, 24, 48)
 _TOTAL = 48
 _CLASSES = ('book', 'box', 'bottle', 'plant', 'mug', 'can', 'bowl', 'clock')
-METHODS = ('class_ransac', 'class_bf', 'hybrid_ransac', 'hybrid_b-prosac')
+METHODS = ('class_ransac', 'class_bf', 'hybrid_ransac', 'hybrid_b-prosac', 'auto')
 _SUCCESS_M = 0.5
 _TRIALS = 5
 # A search is cut short after two seconds: whole, exhaustive ones would take hours.
@@ -69,7 +69,7 @@ def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
     left, right = figure.subplots(1, 2)
     # Okabe and Ito's colours, which the colour-blind tell apart.
     styles = dict(zip(METHODS, (('#D55E00', 'o-'), ('#E69F00', 's--'), ('#56B4E9', '^-.'),
-                                ('#0072B2', 'D-')), strict=True))
+                                ('#0072B2', 'D-'), ('#000000', 'v-')), strict=True))
     for method, (color, style) in styles.items():
         own = [one for same in summaries.values() for one in same if one.method == method]
         left.plot([*summaries], [one.success(_SUCCESS_M) for one in own], style, color=color)

@@ -9,8 +9,10 @@ from cliploc_ros.core.association import (
     balanced_order,
     candidate_mask,
     class_candidates,
+    joined,
     nearest_candidates,
     prosac_order,
+    rarest_first,
     same_class,
 )
 from cliploc_ros.errors import OptionsError
@@ -66,3 +68,12 @@ def test_classes_the_map_does_not_know_match_nothing():
 def test_mask_of_candidates():
     mask = candidate_mask(nearest_candidates(SIMILARITIES, 1), (2, 3))
     assert mask.tolist() == [[True, False, False], [False, True, False]]
+
+
+def test_rare_classes_come_first_and_nothing_twice():
+    mask = same_class(('a', 'b', 'a'), ('a', 'a', 'a', 'b'))
+    rare = rarest_first(class_candidates(mask), mask)
+    assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
+    similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
+    both = joined(nearest_candidates(similarities, 1), rare, mask.shape)
+    assert both.pairs.tolist() == [[0, 1], [1, 1], [2, 1], [1, 3], [0, 0], [0, 2], [2, 0], [2, 2]]

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which correspondences can hold at once, and the search that tries no others."""
+
+from math import comb
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.compatibility import FARTHEST, NEAREST, _distance_range, compatible_pairs
+from cliploc_ros.core.scoring import make_scene
+from cliploc_ros.core.search import Leaders, search_exhaustively, search_progressively
+from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
+
+
+@pytest.fixture(scope='module')
+def room():
+    return make_room()
+
+
+def scene_of(room, rows=slice(None)):
+    seen = see_room(room)
+    potential = (np.array(seen.class_ids)[:, None] == np.array(room.class_ids)[None])[rows]
+    return make_scene(CAMERA.normalize_bboxes(seen.bboxes_xyxy[rows]), room.centers, room.shapes,
+                      potential, np.argwhere(potential), 0.2)
+
+
+def test_the_range_holds_every_distance(rng):
+    for _ in range(200):
+        a, b = rng.uniform(1, 10, 2)
+        cosine = rng.uniform(0.3, 1.0)
+        low, high = _distance_range(a, b, cosine)
+        u, v = np.meshgrid(np.linspace(NEAREST, FARTHEST, 60) * a,
+                           np.linspace(NEAREST, FARTHEST, 60) * b)
+        distances = np.sqrt(np.maximum(0, u**2 + v**2 - 2 * u * v * cosine))
+        assert low <= distances.min() + 1e-9
+        assert high == pytest.approx(distances.max())
+        assert low == pytest.approx(distances.min(), abs=0.05 * max(a, b))
+
+
+def test_what_is_true_is_compatible_and_much_else_is_not(room):
+    scene = scene_of(room)
+    compatible = compatible_pairs(scene)
+    true = np.nonzero(scene.pairs[:, 0] == scene.pairs[:, 1])[0]
+    assert len(true) == len(room)
+    assert (compatible == compatible.T).all()
+    among = compatible[np.ix_(true, true)]
+    assert among.sum() == len(true) * (len(true) - 1)
+    for first, second in np.argwhere(compatible):
+        assert (scene.pairs[first] != scene.pairs[second]).all()
+    assert compatible.mean() < 0.8
+
+
+def test_it_ends_where_the_exhaustive_search_ends(room):
+    scene = scene_of(room)
+    whole, gated = Leaders.none_yet(), Leaders.none_yet()
+    *_, all_tried = search_exhaustively(scene, whole)
+    *_, progress = search_progressively(scene, compatible_pairs(scene), gated)
+    assert (progress.coverage, progress.reach) == (1.0, len(scene.pairs))
+    assert progress.tried < 0.8 * all_tried.tried
+    print(f'\n{progress.tried} of {all_tried.tried} samples tried')
+    best = [leaders.ranked()[0] for leaders in (whole, gated)]
+    assert gated.scores[best[1]] == pytest.approx(whole.scores[best[0]], rel=1e-6)
+    pose = invert_transform(make_transform(gated.rotations[best[1]], gated.translations[best[1]]))
+    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 1e-2
+
+
+def test_the_first_candidates_are_done_before_the_next(room):
+    scene = scene_of(room, slice(0, 9))
+    everything = np.ones((len(scene.pairs),) * 2, dtype=bool)
+    steps = list(search_progressively(scene, everything, Leaders.none_yet()))
+    reaches = [step.reach for step in steps]
+    assert reaches == sorted(reaches)
+    count = len(scene.pairs)
+    for step in steps[:-1]:
+        assert step.coverage == pytest.approx(comb(step.reach, 3) / comb(count, 3))
+    assert steps[-1].coverage == 1.0
+    assert steps[-1].tried == comb(count, 3)
+
+
+def test_too_few_candidates_end_at_once(room):
+    scene = scene_of(room, slice(0, 1))
+    short = scene._replace(pairs=scene.pairs[:2])
+    steps = list(search_progressively(short, np.ones((2, 2), dtype=bool), Leaders.none_yet()))
+    assert steps == []
