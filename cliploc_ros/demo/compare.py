@@ -114,7 +114,8 @@ def run(arguments: list[str]) -> int:
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
     Session(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
             workers=options.workers).compare(
-        parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True, frames=queries.frames)
+        parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
+        frames=queries.frames)
     return 0
 
 
