@@ -8,10 +8,10 @@ Levenberg-Marquardt with Cauchy's weights minimizes them (Triggs et al., "Bundle
 1999); matching and minimizing alternate until neither changes.
 
 Over all 258 recorded frames edges solved most and most exactly, against Wasserstein's distance of
-ellipses, the level sets of Zins et al. ("Level Set-Based Camera Pose Estimation From Multiple 2D/3D
-Ellipse-Ellipsoid Correspondences", IROS 2022), and logarithms of sizes. Edges that the image's
-border cuts count as others: leaving them out, or letting them push to one side only, made poses
-no more often right.
+ellipses, the level sets of Zins et al. ("Level Set-Based Camera Pose Estimation From Multiple
+2D/3D Ellipse-Ellipsoid Correspondences", IROS 2022), and logarithms of sizes. Edges that the
+image's border cuts count as others: leaving them out, or letting them push to one side only, made
+poses no more often right.
 """
 
 from math import cos, sin, sqrt
