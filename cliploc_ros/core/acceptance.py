@@ -126,4 +126,8 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
         return (f'ambiguous: evidence {evidence.strength:.2f} is below '
                 f'{options.min_evidence:.2f} (score {evidence.score:.2f}, best elsewhere '
                 f'{evidence.rival_score:.2f})')
+    if evidence.rival_score > options.max_rival * evidence.score:
+        return (f'ambiguous: a pose elsewhere explains the image nearly as well (score '
+                f'{evidence.score:.2f}, best elsewhere {evidence.rival_score:.2f}): turn to where '
+                'more can be told apart')
     return ''

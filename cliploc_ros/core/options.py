@@ -43,6 +43,8 @@ class RelocalizerOptions:
         Fewer explained objects are refused.
     min_evidence : float
         Less evidence is refused, see cliploc_ros.core.acceptance.
+    max_rival : float
+        A pose is refused if one elsewhere scores more than this share of its score (0 to 1).
 
     Raises
     ------
@@ -60,6 +62,7 @@ class RelocalizerOptions:
     refine: bool = True
     min_inliers: int = 4
     min_evidence: float = 4.0
+    max_rival: float = 0.9
 
     def __post_init__(self) -> None:
         """Refuse values outside what each option allows."""
@@ -74,6 +77,7 @@ class RelocalizerOptions:
         _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
         _check_range('min_inliers', self.min_inliers, 3, math.inf)
         _check_range('min_evidence', self.min_evidence, 0.0, math.inf)
+        _check_range('max_rival', self.max_rival, 0.0, 1.0)
 
     @property
     def needs_similarities(self) -> bool:

@@ -30,9 +30,9 @@ class Method:
     options: RelocalizerOptions
 
     @property
-    def is_exhaustive(self) -> bool:
-        """Return whether it tries every sample, and so gives equal results in every trial."""
-        return self.options.algorithm == 'bf'
+    def draws_nothing(self) -> bool:
+        """Return whether it tries samples in a fixed order: all trials would be equal."""
+        return self.options.algorithm in ('auto', 'bf')
 
 
 def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int

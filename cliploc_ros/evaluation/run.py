@@ -44,7 +44,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     ----------
     landmark_map : LandmarkMap
     methods : sequence of Method
-        Exhaustive ones, which draw nothing, run one trial.
+        Those that draw nothing run one trial.
     queries : sequence of Query
     trials : int
     workers : int
@@ -77,17 +77,17 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
 
 def count_searches(methods: Sequence[Method], queries: int, trials: int) -> int:
     """Return how many searches a run makes."""
-    return sum(1 if method.is_exhaustive else trials for method in methods) * queries
+    return sum(1 if method.draws_nothing else trials for method in methods) * queries
 
 
 def _parts(methods: Sequence[Method], queries: Sequence[Query], trials: int,
            known: set[tuple[str, int, int]]) -> Iterator[_Part]:
-    """Yield what is to be done, exhaustive searches first: they take longest."""
-    for method in sorted(methods, key=lambda method: not method.is_exhaustive):
-        for trial in range(1 if method.is_exhaustive else trials):
+    """Yield what is to be done, those that draw nothing first: they take longest."""
+    for method in sorted(methods, key=lambda method: not method.draws_nothing):
+        for trial in range(1 if method.draws_nothing else trials):
             places = [place for place, query in enumerate(queries)
                       if (method.name, trial, query.number) not in known]
-            for some in batched(places, 1 if method.is_exhaustive else _QUERIES_A_PART):
+            for some in batched(places, 1 if method.draws_nothing else _QUERIES_A_PART):
                 yield _Part(method, trial, some)
 
 

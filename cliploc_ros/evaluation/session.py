@@ -175,7 +175,7 @@ class Session:
 
 def _swept(methods: Sequence[Method], counts: Sequence[int]) -> list[Method]:
     return [Method(f'{one.name}{_AT}{count}', replace(one.options, iterations=count))
-            for one in methods if not one.is_exhaustive
+            for one in methods if not one.draws_nothing
             for count in counts if count != one.options.iterations]
 
 
@@ -183,7 +183,7 @@ def _by_count(summaries: Sequence[Summary], methods: Sequence[Method]
               ) -> dict[str, dict[int, Summary]]:
     """Return the summaries of the sweep and of the methods themselves, by iterations."""
     counts: dict[str, dict[int, Summary]] = {}
-    iterations = {one.name: one.options.iterations for one in methods if not one.is_exhaustive}
+    iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
     for one in summaries:
         name, _, count = one.method.partition(_AT)
         if name in iterations:

@@ -52,7 +52,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     """Return what a reader of the table must know, in sentences."""
     best = find_best(summaries)
     lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
-             '(exhaustive methods one: they draw nothing); ± is the standard deviation over '
+             '(bf and auto one: they draw nothing); ± is the standard deviation over '
              'trials, at 1 m.']
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: not to be told from {best.method} by so many queries '

@@ -110,7 +110,7 @@ def candidates(start: RelocalizerOptions, landmarks: int) -> dict[str, list[Any]
 
 def count_searches(start: RelocalizerOptions, landmarks: int, queries: int, trials: int) -> int:
     """Return how many searches tuning makes."""
-    trials = 1 if start.algorithm == 'bf' else trials
+    trials = 1 if start.algorithm in ('auto', 'bf') else trials
     tried = sum(map(len, candidates(start, landmarks).values())) + 1
     return trials * (tried * (queries // 2) + 2 * (queries - queries // 2))
 

@@ -65,6 +65,8 @@ RELOCALIZER = (
                  high=1000),
     ParameterRow('min_evidence', 4.0, 'A pose with less evidence (score plus twice its margin '
                  'over the best elsewhere) is refused.', low=0.0, high=1e6),
+    ParameterRow('max_rival', 0.9, 'A pose is refused if one elsewhere scores more than this '
+                 'share of it.', low=0.0, high=1.0),
     ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),
     ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config '
                  '(.json).', read_only=True),

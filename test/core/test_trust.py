@@ -75,7 +75,9 @@ def test_evidence_is_score_and_twice_the_margin():
 
 @pytest.mark.parametrize(('evidence', 'options', 'reason'), [
     (Evidence(3, 2.5, 0.0), {}, 'only 3 objects'),
-    (Evidence(5, 3.5, 3.5), {}, 'ambiguous'),
+    (Evidence(5, 3.5, 3.5), {}, 'ambiguous: evidence'),
+    (Evidence(8, 6.0, 5.5), {}, 'ambiguous: a pose elsewhere'),
+    (Evidence(8, 6.0, 5.5), {'max_rival': 0.95}, ''),
     (Evidence(5, 3.5, 1.0, coverage=0.5), {'algorithm': 'bf'},
      'the search was cut short after 50 %'),
     (Evidence(5, 3.5, 1.0, coverage=0.5, tried=100), {},

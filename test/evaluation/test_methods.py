@@ -17,7 +17,7 @@ def test_all_are_the_papers_ten():
     for method in methods:
         assert f'{method.options.matching}_{method.options.algorithm}' == method.name
         assert (method.options.iterations, method.options.k) == (500, 5)
-        assert method.is_exhaustive == method.name.endswith('_bf')
+        assert method.draws_nothing == method.name.endswith('_bf')
 
 
 def test_auto_is_what_the_node_does():
