@@ -143,6 +143,7 @@ def test_every_box_twice_is_no_more_evidence(office_map, queries, observe):
 def test_a_search_cut_short_is_refused(office_map, queries, observe):
     relocalizer = Relocalizer(office_map, RelocalizerOptions(
         matching='class', algorithm='bf', time_budget_s=0.0))
+    relocalizer.warm_up()
     results = [relocalizer.relocalize([observe(frame)]) for frame in queries.main_frames()]
     cut = [result for result in results if result.coverage < 1.0]
     assert len(cut) > 10
