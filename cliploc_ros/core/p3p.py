@@ -52,12 +52,9 @@ def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
 @compiled
 def p3p(bearings, points, rotations, translations):
     """Write up to four poses into the two arrays; return how many (see solve_p3p)."""
-    m12 = _dot(bearings[0], bearings[1])
-    m13 = _dot(bearings[0], bearings[2])
-    m23 = _dot(bearings[1], bearings[2])
-    a12 = _squared_distance(points[0], points[1])
-    a13 = _squared_distance(points[0], points[2])
-    a23 = _squared_distance(points[1], points[2])
+    m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
+    a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
+                     _squared_distance(points, 1, 2))
     longest = max(a12, a13, a23)
     if not min(a12, a13, a23) > _MIN_SINE * _MIN_SINE * longest:
         return 0
@@ -72,8 +69,8 @@ def p3p(bearings, points, rotations, translations):
     if not real:
         return 0
 
-    frame = np.empty((3, 3))
-    if not _inverse_triangle_frame(points, frame):
+    frame, sound = _inverse_triangle_frame(points)
+    if not sound:
         return 0
     count = 0
     for line in (line1, line2):
@@ -88,19 +85,21 @@ def p3p(bearings, points, rotations, translations):
             if not (d1 > 0.0 and d2 > 0.0 and d3 > 0.0):
                 continue
             _pose_from_depths(d1 * scale, d2 * scale, d3 * scale, bearings, points, frame,
-                              rotations[count], translations[count])
+                              rotations, translations, count)
             count += 1
     return count
 
 
 @compiled
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _cosine(vectors, i, j):
+    return (vectors[i, 0] * vectors[j, 0] + vectors[i, 1] * vectors[j, 1]
+            + vectors[i, 2] * vectors[j, 2])
 
 
 @compiled
-def _squared_distance(a, b):
-    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+def _squared_distance(points, i, j):
+    x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1],
+               points[i, 2] - points[j, 2])
     return x * x + y * y + z * z
 
 
@@ -165,7 +164,9 @@ def _split_lines(c):
 
 @compiled
 def _longest(a, b, c):
-    na, nb, nc = _dot(a, a), _dot(b, b), _dot(c, c)
+    na = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+    nb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+    nc = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
     if na >= nb and na >= nc:
         return a
     return b if nb >= nc else c
@@ -234,8 +235,11 @@ def _polish(d1, d2, d3, m12, m13, m23, a12, a13, a23):
 
 
 @compiled
-def _inverse_triangle_frame(points, inverse):
-    """Write the inverse of [X1-X2, X1-X3, their cross product]; False for points on a line."""
+def _inverse_triangle_frame(points):
+    """Return the rows of the inverse of [X1-X2, X1-X3, their cross product], and True.
+
+    False for points on a line.
+    """
     u0, u1, u2 = (points[0, 0] - points[1, 0], points[0, 1] - points[1, 1],
                   points[0, 2] - points[1, 2])
     v0, v1, v2 = (points[0, 0] - points[2, 0], points[0, 1] - points[2, 1],
@@ -243,30 +247,33 @@ def _inverse_triangle_frame(points, inverse):
     w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
     square = w0 * w0 + w1 * w1 + w2 * w2
     sides = (u0 * u0 + u1 * u1 + u2 * u2) * (v0 * v0 + v1 * v1 + v2 * v2)
-    if not square > _MIN_SINE * _MIN_SINE * sides:
-        return False
-    inverse[0, 0] = (v1 * w2 - v2 * w1) / square
-    inverse[0, 1] = (v2 * w0 - v0 * w2) / square
-    inverse[0, 2] = (v0 * w1 - v1 * w0) / square
-    inverse[1, 0] = (w1 * u2 - w2 * u1) / square
-    inverse[1, 1] = (w2 * u0 - w0 * u2) / square
-    inverse[1, 2] = (w0 * u1 - w1 * u0) / square
-    inverse[2, 0], inverse[2, 1], inverse[2, 2] = w0 / square, w1 / square, w2 / square
-    return True
+    sound = square > _MIN_SINE * _MIN_SINE * sides
+    scale = 1.0 / square if sound else 0.0
+    return (((v1 * w2 - v2 * w1) * scale, (v2 * w0 - v0 * w2) * scale,
+             (v0 * w1 - v1 * w0) * scale),
+            ((w1 * u2 - w2 * u1) * scale, (w2 * u0 - w0 * u2) * scale,
+             (w0 * u1 - w1 * u0) * scale),
+            (w0 * scale, w1 * scale, w2 * scale)), sound
 
 
 @compiled
-def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotation, translation):
+def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translations, which):
     """Write camera_from_map: the rotation carries the map's triangle into the camera's."""
     y0, y1, y2 = d1 * bearings[0, 0], d1 * bearings[0, 1], d1 * bearings[0, 2]
     u0, u1, u2 = (y0 - d2 * bearings[1, 0], y1 - d2 * bearings[1, 1], y2 - d2 * bearings[1, 2])
     v0, v1, v2 = (y0 - d3 * bearings[2, 0], y1 - d3 * bearings[2, 1], y2 - d3 * bearings[2, 2])
     w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    for column in range(3):
-        i0, i1, i2 = inverse[0, column], inverse[1, column], inverse[2, column]
-        rotation[0, column] = u0 * i0 + v0 * i1 + w0 * i2
-        rotation[1, column] = u1 * i0 + v1 * i1 + w1 * i2
-        rotation[2, column] = u2 * i0 + v2 * i1 + w2 * i2
-    for row, y in enumerate((y0, y1, y2)):
-        translation[row] = y - (rotation[row, 0] * points[0, 0] + rotation[row, 1] * points[0, 1]
-                                + rotation[row, 2] * points[0, 2])
+    p0, p1, p2 = points[0, 0], points[0, 1], points[0, 2]
+    i, j, k = inverse
+    r0, r1, r2 = (u0 * i[0] + v0 * j[0] + w0 * k[0], u0 * i[1] + v0 * j[1] + w0 * k[1],
+                  u0 * i[2] + v0 * j[2] + w0 * k[2])
+    rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2] = r0, r1, r2
+    translations[which, 0] = y0 - (r0 * p0 + r1 * p1 + r2 * p2)
+    r0, r1, r2 = (u1 * i[0] + v1 * j[0] + w1 * k[0], u1 * i[1] + v1 * j[1] + w1 * k[1],
+                  u1 * i[2] + v1 * j[2] + w1 * k[2])
+    rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2] = r0, r1, r2
+    translations[which, 1] = y1 - (r0 * p0 + r1 * p1 + r2 * p2)
+    r0, r1, r2 = (u2 * i[0] + v2 * j[0] + w2 * k[0], u2 * i[1] + v2 * j[1] + w2 * k[1],
+                  u2 * i[2] + v2 * j[2] + w2 * k[2])
+    rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2] = r0, r1, r2
+    translations[which, 2] = y2 - (r0 * p0 + r1 * p1 + r2 * p2)

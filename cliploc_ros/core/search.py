@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.scoring import Scene, Workspace, sample_pose, verify
+from cliploc_ros.core.p3p import p3p
+from cliploc_ros.core.sampling import (
+    enumerate_compatible_pairs,
+    enumerate_compatible_triples,
+    enumerate_triples,
+)
+from cliploc_ros.core.scoring import Scene
+from cliploc_ros.core.screening import Prior, choose_pose, load_sample, set_up, verify_beyond
+from cliploc_ros.core.two_point import two_point
 
 MAX_DISTINCT = 8
 # Hypotheses nearer than this to a better one are the same place, seen twice.
@@ -23,11 +31,12 @@ _DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
 #: A sample whose own three pairs overlap less than this in sum is not verified, where every
 #: sample is tried: a better one of the same place comes.
 MIN_SAMPLED_IOU = 0.9
-# A block of either search takes a few milliseconds, so that time limits hold.
-_SAMPLES_A_BLOCK = 100
-_WORK_A_BLOCK = 100_000
-# trying a hypothesis against passing over a sample that is not valid
-_WORK_A_HYPOTHESIS = 100
+# The same of two pairs, see search_vertically: of noisy verticals these are looser.
+MIN_SAMPLED_PAIR_IOU = 0.2
+# Scores nearer than this are equal, but for rounding: the hypothesis found first stays.
+_TIE = 1e-9
+# A block of a search takes a few milliseconds, so that time limits hold.
+_SAMPLES_A_BLOCK = 500
 
 
 class Progress(NamedTuple):
@@ -81,8 +90,8 @@ class Leaders(NamedTuple):
         return order[self.scores[order] >= 0.0]
 
 
-def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders
-                   ) -> Iterator[Progress]:
+def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
+                   prior: Prior | None = None) -> Iterator[Progress]:
     """Try given minimal samples, a block at a time.
 
     Parameters
@@ -92,21 +101,25 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders
         Candidate numbers; rows of -1 are left out.
     leaders : Leaders
         Changed in place.
+    prior : Prior, optional
+        Poses that it rules out are left.
 
     Yields
     ------
     Progress
         After each block; the caller may stop there.
     """
-    workspace = Workspace.allocate(len(scene.bearings))
+    bench = set_up(scene, prior)
     tried = 0
     for start in range(0, len(samples), _SAMPLES_A_BLOCK):
-        stop = min(start + _SAMPLES_A_BLOCK, len(samples))
-        tried += _search_samples(scene, samples, start, stop, leaders, workspace)
-        yield Progress(tried, stop / len(samples))
+        block = np.ascontiguousarray(samples[start:start + _SAMPLES_A_BLOCK])
+        _try_samples(bench, block, len(block), start, 0.0, leaders)
+        tried += int((block[:, 0] >= 0).sum())
+        yield Progress(tried, (start + len(block)) / len(samples))
 
 
-def search_exhaustively(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
+def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
+                        ) -> Iterator[Progress]:
     """Try every valid sample, a block at a time. Nothing is stored.
 
     Parameters
@@ -114,26 +127,31 @@ def search_exhaustively(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
     scene : Scene
     leaders : Leaders
         Changed in place.
+    prior : Prior, optional
+        Poses that it rules out are left.
 
     Yields
     ------
     Progress
         After each block; the caller may stop there.
     """
-    workspace = Workspace.allocate(len(scene.bearings))
+    bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
+    block = np.empty((_SAMPLES_A_BLOCK, 3), dtype=np.int64)
     tried = 0
     while cursor[0] < count - 2:
-        tried += _search_from(scene, cursor, tried, leaders, workspace)
+        found = enumerate_triples(scene.pairs, cursor, block)
+        _try_samples(bench, block, found, tried, 0.0, leaders)
+        tried += found
         first, second, third = (int(row) for row in cursor)
         left = (comb(max(0, count - first - 1), 3) + comb(max(0, count - second - 1), 2)
                 + max(0, count - third)) if first < count - 2 else 0
         yield Progress(tried, 1.0 - left / comb(count, 3))
 
 
-def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders
-                         ) -> Iterator[Progress]:
+def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
+                         prior: Prior | None = None) -> Iterator[Progress]:
     """Try every sample of compatible candidates, those of the first candidates first.
 
     All samples among the first n candidates are tried before one with the next: what PROSAC draws
@@ -146,105 +164,92 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         See cliploc_ros.core.compatibility.
     leaders : Leaders
         Changed in place.
+    prior : Prior, optional
+        Poses that it rules out are left.
 
     Yields
     ------
     Progress
         After each block; the caller may stop there.
     """
-    workspace = Workspace.allocate(len(scene.bearings))
+    bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([2, 0, 1], dtype=np.int64)  # newest, first, second
+    block = np.empty((_SAMPLES_A_BLOCK, 3), dtype=np.int64)
     tried = 0
     while cursor[0] < count:
-        tried += _search_progressively(scene, compatible, cursor, tried, leaders, workspace)
+        found = enumerate_compatible_triples(compatible, cursor, block)
+        _try_samples(bench, block, found, tried, MIN_SAMPLED_IOU, leaders)
+        tried += found
         done = comb(int(cursor[0]), 3) if cursor[0] < count else comb(count, 3)
         yield Progress(tried, done / max(comb(count, 3), 1), min(int(cursor[0]), count))
 
 
-@compiled
-def _search_progressively(scene, compatible, cursor, tried_before, leaders, workspace):
-    """Try the samples from a cursor on, for a bounded time; move the cursor behind them."""
-    count = scene.pairs.shape[0]
-    sample = np.empty(3, dtype=np.int64)
-    newest, first, second = cursor[0], cursor[1], cursor[2]
-    tried, work = 0, 0
-    while newest < count and work < _WORK_A_BLOCK:
-        if first >= newest - 1:
-            newest, first, second = newest + 1, 0, 1
-            continue
-        work += 1
-        if second >= newest or not compatible[newest, first]:
-            first += 1
-            second = first + 1
-            continue
-        if compatible[newest, second] and compatible[first, second]:
-            sample[0], sample[1], sample[2] = first, second, newest
-            tried += 1
-            work += _WORK_A_HYPOTHESIS
-            if _try_sample(scene, sample, tried_before + tried, MIN_SAMPLED_IOU, leaders,
-                           workspace):
-                work += scene.potential_landmarks.shape[0]
-        second += 1
-    cursor[0], cursor[1], cursor[2] = newest, first, second
-    return tried
+def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
+                      prior: Prior) -> Iterator[Progress]:
+    """Try every pair of compatible candidates with a known vertical, the first candidates first.
 
+    Two correspondences and the vertical fix a pose (see cliploc_ros.core.two_point). Of the
+    leaders' samples the third column is -1; the reach of the progress counts candidates of which
+    all pairs were tried.
 
-@compiled
-def _search_samples(scene, samples, start, stop, leaders, workspace):
+    Parameters
+    ----------
+    scene : Scene
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.compatibility.
+    leaders : Leaders
+        Changed in place.
+    prior : Prior
+        Its verticals are held equal; poses outside of its heights are left.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    bench = set_up(scene, prior)
+    count = len(scene.pairs)
+    cursor = np.array([1, 0], dtype=np.int64)  # newest, first
+    block = np.full((_SAMPLES_A_BLOCK, 3), -1, dtype=np.int64)
     tried = 0
-    for t in range(start, stop):
-        if samples[t, 0] >= 0:
-            tried += 1
-            _try_sample(scene, samples[t], t + 1, 0.0, leaders, workspace)
-    return tried
+    while cursor[0] < count:
+        found = enumerate_compatible_pairs(compatible, cursor, block)
+        _try_samples(bench, block, found, tried, MIN_SAMPLED_PAIR_IOU, leaders)
+        tried += found
+        done = comb(int(cursor[0]), 2) if cursor[0] < count else comb(count, 2)
+        yield Progress(tried, done / max(comb(count, 2), 1), min(int(cursor[0]), count))
 
 
 @compiled
-def _search_from(scene, cursor, tried_before, leaders, workspace):
-    """Try the valid samples from a cursor on, for a bounded time; move the cursor behind them."""
-    pairs = scene.pairs
-    count = pairs.shape[0]
-    sample = np.empty(3, dtype=np.int64)
-    first, second, third = cursor[0], cursor[1], cursor[2]
-    tried, work = 0, 0
-    while first < count - 2 and work < _WORK_A_BLOCK:
-        if second >= count - 1:
-            first += 1
-            second, third = first + 1, first + 2
+def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
+    """Make the hypotheses of samples of three, or of two and -1; remember those that lead."""
+    floor = np.min(leaders.scores)
+    for t in range(count):
+        if samples[t, 0] < 0:
             continue
-        work += 1
-        if third >= count or _clash(pairs, first, second):
-            second += 1
-            third = second + 1
+        size = 3 if samples[t, 2] >= 0 else 2
+        load_sample(bench.candidates, samples, t, size, bench.bearings, bench.points,
+                    bench.sampled_boxes, bench.sampled_landmarks)
+        if size == 3:
+            poses = p3p(bench.bearings, bench.points, bench.rotations, bench.translations)
+        else:
+            poses = two_point(bench.bearings, bench.points, bench.prior, bench.rotations,
+                              bench.translations)
+        if poses == 0:
             continue
-        if not (_clash(pairs, first, third) or _clash(pairs, second, third)):
-            sample[0], sample[1], sample[2] = first, second, third
-            tried += 1
-            work += _WORK_A_HYPOTHESIS + scene.potential_landmarks.shape[0]
-            _try_sample(scene, sample, tried_before + tried, 0.0, leaders, workspace)
-        third += 1
-    cursor[0], cursor[1], cursor[2] = first, second, third
-    return tried
-
-
-@compiled
-def _clash(pairs, a, b):
-    """Tell whether two candidates share a detection or a landmark."""
-    return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
-
-
-@compiled
-def _try_sample(scene, sample, iteration, least_iou, leaders, workspace):
-    """Make the hypothesis of one sample, and remember it if it leads; tell if it was verified."""
-    solution, total = sample_pose(scene, sample, workspace)
-    if solution < 0 or total < least_iou:
-        return False
-    rotation, translation = workspace.rotations[solution], workspace.translations[solution]
-    score = verify(scene, rotation, translation, workspace)
-    if score > np.min(leaders.scores):
-        _remember(score, iteration, sample, rotation, translation, leaders)
-    return True
+        which = choose_pose(bench.prior, bench.rotations, bench.translations, size, poses,
+                            bench.sampled_boxes, bench.sampled_landmarks,
+                            bench.sampled_outlines, bench.uppers, least_iou)
+        if which < 0:
+            continue
+        score = verify_beyond(bench.landmarks, bench.boxes, bench.starts, bench.columns,
+                              bench.iou_threshold, bench.rotations, bench.translations, which,
+                              bench.outlines, bench.bounds, bench.best_bounds, floor)
+        if score > floor:
+            _remember(score, tried_before + t + 1, samples[t], bench.rotations[which],
+                      bench.translations[which], leaders)
+            floor = np.min(leaders.scores)
 
 
 @compiled
@@ -257,7 +262,7 @@ def _remember(score, iteration, sample, rotation, translation, leaders):
         if not same_place(rotation, translation, leaders.rotations[row],
                            leaders.translations[row]):
             continue
-        if leaders.scores[row] >= score:
+        if leaders.scores[row] >= score - _TIE:
             return
         leaders.scores[row] = -1.0
         free = row

@@ -1,0 +1,334 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Choice and verification of a pose as scoring has them, but no further than the pose may lead.
+
+Upper bounds of IoUs, from extents and areas alone, stand in for the IoUs wherever these cannot
+change what is found: a pose whose bounds sum to no more than the worst leader's score is left, and
+of a detection's landmarks only those are compared exactly whose bound beats what it has. Results
+are those of scoring, to rounding.
+"""
+
+from math import cos, inf, pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.ellipse import ellipse_iou
+from cliploc_ros.core.p3p import MAX_SOLUTIONS
+from cliploc_ros.core.scoring import Scene
+
+# A bound is raised by this, more than rounding can make an IoU or a sum of them greater.
+_ROUNDING = 1e-9
+
+
+class Prior(NamedTuple):
+    """What is known of the camera before it looks; by default nothing.
+
+    Parameters
+    ----------
+    up_in_camera, up_in_map : tuple of float
+        The vertical, unit vectors in the camera's optical frame and in the map frame.
+    min_height, max_height : float
+        Of the camera's centre, along up_in_map from the map's origin [m].
+    max_tilt : float
+        Greatest angle between both verticals at a pose from three points [rad]. Poses from two
+        points hold them equal.
+    """
+
+    up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    min_height: float = -inf
+    max_height: float = inf
+    max_tilt: float = pi
+
+    def as_array(self) -> NDArray[np.float64]:
+        """Return up in the camera and in the map, least and greatest height, least cosine."""
+        least_cosine = cos(self.max_tilt) if self.max_tilt < pi else -inf
+        return np.array([*self.up_in_camera, *self.up_in_map, self.min_height, self.max_height,
+                         least_cosine])
+
+
+class Bench(NamedTuple):
+    """A scene laid out for one search, and the memory its hypotheses use again and again.
+
+    Parameters
+    ----------
+    candidates : ndarray (c, 16)
+        Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
+        landmark of each correspondence candidate.
+    landmarks : ndarray (u, 9)
+        Centre and shape of each landmark that any detection may show.
+    landmark_rows : ndarray (u,)
+        Which landmarks of the scene these are.
+    boxes : ndarray (n, 4)
+        Box ellipses of the detections.
+    starts, columns : ndarray (n + 1,), (v,)
+        Where each detection's landmarks begin in columns, which holds rows of landmarks.
+    prior : ndarray (9,)
+        See Prior.as_array.
+    iou_threshold : float
+        See Scene.
+    bearings, points : ndarray (3, 3)
+        The minimal sample.
+    rotations, translations : ndarray (4, 3, 3), (4, 3)
+        The poses that it allows.
+    sampled_boxes, sampled_landmarks : ndarray (3, 4), (3, 9)
+        Rows of boxes and landmarks that are the minimal sample.
+    sampled_outlines : ndarray (12, 6)
+        Outlines of the sampled landmarks, three for each pose.
+    uppers : ndarray (4,)
+        Upper bounds of the sums of their IoUs; -1 where a pose is out of the question.
+    outlines : ndarray (u, 6)
+        Of the landmarks at one pose: centre, half extents, exy, half-axes' product.
+    bounds, best_bounds : ndarray (v,), (n,)
+        Upper bounds of the IoUs, and the greatest of each detection.
+    """
+
+    candidates: NDArray[np.float64]
+    landmarks: NDArray[np.float64]
+    landmark_rows: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    prior: NDArray[np.float64]
+    iou_threshold: float
+    bearings: NDArray[np.float64]
+    points: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    sampled_boxes: NDArray[np.float64]
+    sampled_landmarks: NDArray[np.float64]
+    sampled_outlines: NDArray[np.float64]
+    uppers: NDArray[np.float64]
+    outlines: NDArray[np.float64]
+    bounds: NDArray[np.float64]
+    best_bounds: NDArray[np.float64]
+
+
+def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
+    """Return the bench of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    prior : Prior, optional
+        Poses that it rules out are not verified.
+    """
+    detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
+    rows = scene.potential_landmarks
+    columns = np.repeat(np.arange(len(rows)), np.diff(scene.potential_starts))
+    by_detection = np.argsort(scene.potential_detections, kind='stable')
+    count = len(scene.bearings)
+    starts = np.searchsorted(scene.potential_detections[by_detection], np.arange(count + 1))
+    return Bench(
+        np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
+                        scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
+        np.concatenate([scene.centers[rows], scene.shapes[rows]], axis=1),
+        np.asarray(rows, dtype=np.int64), scene.box_ellipses, starts.astype(np.int64),
+        columns[by_detection].astype(np.int64), (prior or Prior()).as_array(),
+        scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
+        np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
+        np.empty((3, 4)), np.empty((3, 9)),
+        np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS), np.empty((len(rows), 6)),
+        np.empty(len(columns)), np.empty(count))
+
+
+@compiled
+def load_sample(candidates, samples, number, size, bearings, points, sampled_boxes,
+                sampled_landmarks):
+    """Copy one of some minimal samples to where the solver and the choice of a pose take it."""
+    for row in range(size):
+        candidate = samples[number, row]
+        for axis in range(3):
+            bearings[row, axis] = candidates[candidate, axis]
+            points[row, axis] = candidates[candidate, 7 + axis]
+        for column in range(4):
+            sampled_boxes[row, column] = candidates[candidate, 3 + column]
+        for column in range(9):
+            sampled_landmarks[row, column] = candidates[candidate, 7 + column]
+
+
+@compiled
+def allowed(prior, rotations, translations, which):
+    """Tell whether a pose agrees with what is known of vertical and height."""
+    r, height, cosine = rotations, 0.0, 0.0
+    for axis in range(3):
+        up = (r[which, axis, 0] * prior[3] + r[which, axis, 1] * prior[4]
+              + r[which, axis, 2] * prior[5])
+        cosine += up * prior[axis]
+        height -= up * translations[which, axis]
+    return prior[6] <= height <= prior[7] and cosine >= prior[8]
+
+
+@compiled
+def project(rotations, translations, which, landmarks, count, outlines, first):
+    """Write the outlines of landmarks at one pose into rows from the first on.
+
+    As project_ellipsoid, in one loop without calls, which is several times faster; of ellipsoids
+    that are not wholly in front the half extents are minus infinity.
+    """
+    r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
+    r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
+    r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
+    t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
+    for row in range(count):
+        px, py, pz = landmarks[row, 0], landmarks[row, 1], landmarks[row, 2]
+        sxx, sxy, sxz = landmarks[row, 3], landmarks[row, 4], landmarks[row, 5]
+        syy, syz, szz = landmarks[row, 6], landmarks[row, 7], landmarks[row, 8]
+        x = r00 * px + r01 * py + r02 * pz + t0
+        y = r10 * px + r11 * py + r12 * pz + t1
+        z = r20 * px + r21 * py + r22 * pz + t2
+        x0 = sxx * r00 + sxy * r01 + sxz * r02
+        x1 = sxy * r00 + syy * r01 + syz * r02
+        x2 = sxz * r00 + syz * r01 + szz * r02
+        y0 = sxx * r10 + sxy * r11 + sxz * r12
+        y1 = sxy * r10 + syy * r11 + syz * r12
+        y2 = sxz * r10 + syz * r11 + szz * r12
+        z0 = sxx * r20 + sxy * r21 + sxz * r22
+        z1 = sxy * r20 + syy * r21 + syz * r22
+        z2 = sxz * r20 + syz * r21 + szz * r22
+        weight = z * z - (r20 * z0 + r21 * z1 + r22 * z2)
+        out = first + row
+        outlines[out, 2] = outlines[out, 3] = -inf
+        if not (z > 0.0 and weight > 0.0):
+            continue
+        inverse = 1.0 / weight
+        cx = (x * z - (r00 * z0 + r01 * z1 + r02 * z2)) * inverse
+        cy = (y * z - (r10 * z0 + r11 * z1 + r12 * z2)) * inverse
+        exx = cx * cx + (r00 * x0 + r01 * x1 + r02 * x2 - x * x) * inverse
+        exy = cx * cy + (r00 * y0 + r01 * y1 + r02 * y2 - x * y) * inverse
+        eyy = cy * cy + (r10 * y0 + r11 * y1 + r12 * y2 - y * y) * inverse
+        if exx > 0.0 and eyy > 0.0:
+            outlines[out, 0], outlines[out, 1] = cx, cy
+            outlines[out, 2], outlines[out, 3] = sqrt(exx), sqrt(eyy)
+            outlines[out, 4] = exy
+            outlines[out, 5] = sqrt(max(0.0, exx * eyy - exy * exy))
+
+
+@compiled
+def iou_bound(u, v, half_width, half_height, cx, cy, half_x, half_y, axes):
+    """Return an upper bound of the IoU of a box's ellipse and another.
+
+    Parameters
+    ----------
+    u, v, half_width, half_height : float
+        Centre and semi-axes of the box's ellipse.
+    cx, cy, half_x, half_y, axes : float
+        Centre and half extents of the other, and the product of its semi-axes.
+    """
+    width = min(u + half_width, cx + half_x) - max(u - half_width, cx - half_x)
+    height = min(v + half_height, cy + half_y) - max(v - half_height, cy - half_y)
+    if not (width > 0.0 and height > 0.0):
+        return 0.0
+    # in units of pi: the shared area lies in both ellipses, and in what their boxes share
+    box_axes = half_width * half_height
+    shared = min(width * height * (1.0 / pi), min(axes, box_axes))
+    return shared / (axes + box_axes - shared) + _ROUNDING
+
+
+@compiled
+def choose_pose(prior, rotations, translations, size, count, boxes, landmarks, outlines, uppers,
+                least_iou):
+    """Return which of some poses to verify; -1 for none.
+
+    It is sample_pose's: the one with the greatest sum of IoUs over the sampled pairs, of those
+    in front of which all sampled ellipsoids lie and which the prior allows; none if the sum is
+    below least_iou.
+    """
+    visible, last = 0, -1
+    for which in range(count):
+        uppers[which] = -1.0
+        if allowed(prior, rotations, translations, which):
+            project(rotations, translations, which, landmarks, size, outlines, 3 * which)
+            uppers[which] = _sampled_upper(boxes, size, outlines, 3 * which)
+        if uppers[which] >= least_iou:
+            visible += 1
+            last = which
+    if visible == 0 or (visible == 1 and least_iou <= 0.0):
+        return last
+    best, best_total = -1, -1.0
+    for _ in range(visible):
+        which = 0  # whose bound is the greatest, the first of equals
+        for other in range(1, count):
+            if uppers[other] > uppers[which]:
+                which = other
+        if uppers[which] < max(best_total, least_iou):
+            break
+        total = _sampled_total(boxes, size, outlines, 3 * which)
+        uppers[which] = -1.0
+        if total > best_total or (total == best_total and which < best):
+            best, best_total = which, total
+    return best if best_total >= least_iou else -1
+
+
+@compiled
+def _sampled_upper(boxes, size, outlines, first):
+    """Return an upper bound of the sum of IoUs of the sampled pairs; -1 if one is not in front."""
+    upper = 0.0
+    for row in range(size):
+        out = first + row
+        if not outlines[out, 2] > 0.0:
+            return -1.0
+        upper += iou_bound(boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3],
+                           outlines[out, 0], outlines[out, 1], outlines[out, 2],
+                           outlines[out, 3], outlines[out, 5])
+    return upper
+
+
+@compiled
+def _sampled_total(boxes, size, outlines, first):
+    """Return the sum of IoUs of the sampled pairs."""
+    total = 0.0
+    for row in range(size):
+        out = first + row
+        total += ellipse_iou(boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3],
+                             outlines[out, 0], outlines[out, 1],
+                             outlines[out, 2] * outlines[out, 2], outlines[out, 4],
+                             outlines[out, 3] * outlines[out, 3])
+    return total
+
+
+@compiled
+def verify_beyond(landmarks, boxes, starts, columns, iou_threshold, rotations, translations,
+                  which, outlines, bounds, best_bounds, floor):
+    """Return the score of a pose if it is above a floor; if not, the floor."""
+    project(rotations, translations, which, landmarks, landmarks.shape[0], outlines, 0)
+    upper = 0.0
+    for detection in range(boxes.shape[0]):
+        u, v = boxes[detection, 0], boxes[detection, 1]
+        half_width, half_height = boxes[detection, 2], boxes[detection, 3]
+        best = 0.0
+        for entry in range(starts[detection], starts[detection + 1]):
+            row = columns[entry]
+            bound = iou_bound(u, v, half_width, half_height, outlines[row, 0], outlines[row, 1],
+                              outlines[row, 2], outlines[row, 3], outlines[row, 5])
+            bounds[entry] = bound
+            best = max(best, bound)
+        best_bounds[detection] = best
+        if best > iou_threshold:
+            upper += best
+    if upper <= floor:
+        return floor
+    score = 0.0
+    for detection in range(boxes.shape[0]):
+        if best_bounds[detection] <= iou_threshold:
+            continue
+        best = iou_threshold
+        for entry in range(starts[detection], starts[detection + 1]):
+            if bounds[entry] <= best:
+                continue
+            row = columns[entry]
+            best = max(best, ellipse_iou(
+                boxes[detection, 0], boxes[detection, 1], boxes[detection, 2],
+                boxes[detection, 3], outlines[row, 0], outlines[row, 1],
+                outlines[row, 2] * outlines[row, 2], outlines[row, 4],
+                outlines[row, 3] * outlines[row, 3]))
+        if best <= iou_threshold:
+            best = 0.0
+        score += best
+        upper += best - best_bounds[detection]
+        if upper <= floor:
+            return floor
+    return score

@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The fast choice and verification of poses against the plain ones of scoring."""
+
+from math import radians
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.compatibility import compatible_pairs
+from cliploc_ros.core.ellipse import ellipse_iou
+from cliploc_ros.core.p3p import p3p
+from cliploc_ros.core.sampling import draw_ransac
+from cliploc_ros.core.scoring import Workspace, make_scene, sample_pose, verify
+from cliploc_ros.core.screening import (
+    Prior,
+    choose_pose,
+    iou_bound,
+    load_sample,
+    set_up,
+    verify_beyond,
+)
+from cliploc_ros.core.search import (
+    Leaders,
+    search_exhaustively,
+    search_progressively,
+    search_samples,
+    search_vertically,
+)
+from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
+
+UP_IN_MAP = np.array([0.0, -1.0, 0.0])
+UP_IN_CAMERA = MAP_FROM_CAMERA[:3, :3].T @ UP_IN_MAP
+HEIGHT = float(MAP_FROM_CAMERA[:3, 3] @ UP_IN_MAP)
+
+
+def upright(**known):
+    return Prior(tuple(UP_IN_CAMERA), tuple(UP_IN_MAP), **known)
+
+
+@pytest.fixture(scope='module')
+def scene():
+    room = make_room()
+    seen = see_room(room)
+    rng = np.random.default_rng(3)
+    potential = np.array(seen.class_ids)[:, None] == np.array(room.class_ids)[None]
+    boxes = CAMERA.normalize_bboxes(seen.bboxes_xyxy + rng.normal(0, 4, (len(room), 4)))
+    return make_scene(boxes, room.centers, room.shapes, potential, np.argwhere(potential), 0.2)
+
+
+def poses_of(scene, samples, prior=None, least_iou=0.0):
+    """Bench, number of the chosen pose, and how many there were, for each sample."""
+    bench = set_up(scene, prior)
+    for t in range(len(samples)):
+        load_sample(bench.candidates, samples, t, 3, bench.bearings, bench.points,
+                    bench.sampled_boxes, bench.sampled_landmarks)
+        count = p3p(bench.bearings, bench.points, bench.rotations, bench.translations)
+        which = choose_pose(bench.prior, bench.rotations, bench.translations, 3, count,
+                            bench.sampled_boxes, bench.sampled_landmarks,
+                            bench.sampled_outlines, bench.uppers, least_iou)
+        yield samples[t], bench, which
+
+
+def score_beyond(bench, which, floor):
+    return verify_beyond(bench.landmarks, bench.boxes, bench.starts, bench.columns,
+                         bench.iou_threshold, bench.rotations, bench.translations, which,
+                         bench.outlines, bench.bounds, bench.best_bounds, floor)
+
+
+def test_it_chooses_and_scores_as_the_plain_way(scene, rng):
+    workspace, compared = Workspace.allocate(len(scene.bearings)), 0
+    for sample, bench, which in poses_of(scene, draw_ransac(scene.pairs, 2_000, rng)):
+        expected, total = sample_pose(scene, sample, workspace)
+        assert which == expected
+        if which < 0:
+            continue
+        compared += 1
+        score = verify(scene, workspace.rotations[which], workspace.translations[which],
+                       workspace)
+        assert score_beyond(bench, which, -1.0) == pytest.approx(score, abs=1e-9)
+        for floor in (0.5 * score, score - 1e-6, score + 1e-6, score + 1.0):
+            found = score_beyond(bench, which, floor)
+            assert found == pytest.approx(max(score, floor), abs=1e-9)
+        assert total >= 0.0
+    assert compared > 500
+
+
+def test_a_least_overlap_leaves_what_overlaps_less(scene, rng):
+    samples, left = draw_ransac(scene.pairs, 500, rng), 0
+    workspace = Workspace.allocate(len(scene.bearings))
+    for sample, _, which in poses_of(scene, samples, least_iou=1.0):
+        expected, total = sample_pose(scene, sample, workspace)
+        assert which == (expected if total >= 1.0 else -1)
+        left += expected >= 0 and which < 0
+    assert left > 20
+
+
+sizes = st.floats(0.05, 20.0)
+offsets = st.floats(-3.0, 3.0)
+
+
+@given(sizes, sizes, sizes, sizes, offsets, offsets, st.floats(0.0, np.pi))
+def test_the_bound_is_never_below_the_iou(a, b, p, q, x, y, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    exx, eyy, exy = (p * c)**2 + (q * s)**2, (p * s)**2 + (q * c)**2, (p * p - q * q) * c * s
+    iou = ellipse_iou(0.0, 0.0, a, b, x, y, exx, exy, eyy)
+    assert iou <= iou_bound(0.0, 0.0, a, b, x, y, np.sqrt(exx), np.sqrt(eyy), p * q)
+
+
+def test_leaders_are_those_of_scoring_every_sample(scene, rng):
+    samples = draw_ransac(scene.pairs, 1_000, rng)
+    workspace = Workspace.allocate(len(scene.bearings))
+    scores = []
+    for sample in samples:
+        which, _ = sample_pose(scene, sample, workspace)
+        scores.append(-1.0 if which < 0 else verify(
+            scene, workspace.rotations[which], workspace.translations[which], workspace))
+    leaders = Leaders.none_yet()
+    *_, progress = search_samples(scene, samples, leaders)
+    best = leaders.ranked()[0]
+    assert progress.tried == len(samples)
+    assert leaders.scores[best] == pytest.approx(max(scores), abs=1e-9)
+    assert scores[leaders.iterations[best] - 1] == pytest.approx(max(scores), abs=1e-8)
+    assert (samples[leaders.iterations[best] - 1] == leaders.samples[best]).all()
+
+
+@pytest.mark.parametrize(('prior', 'remains'), [
+    (upright(min_height=HEIGHT - 0.3, max_height=HEIGHT + 0.3), True),
+    (upright(max_tilt=radians(10)), True),
+    (upright(min_height=HEIGHT + 0.3), False),
+    (upright(max_height=HEIGHT - 0.3), False),
+    (Prior(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
+])
+def test_a_prior_rules_poses_out(scene, prior, remains):
+    search = (search_exhaustively, lambda *given: search_progressively(
+        scene, compatible_pairs(scene), *given[1:]))
+    for one in search:
+        leaders = Leaders.none_yet()
+        *_, progress = one(scene, leaders, prior)
+        assert progress.coverage == 1.0
+        near = False
+        for row in leaders.ranked():
+            pose = invert_transform(make_transform(leaders.rotations[row],
+                                                   leaders.translations[row]))
+            height = pose[:3, 3] @ UP_IN_MAP
+            assert prior.min_height <= height <= prior.max_height
+            tilt = (pose[:3, :3] @ np.array(prior.up_in_camera)) @ UP_IN_MAP
+            assert tilt >= np.cos(prior.max_tilt) - 1e-12
+            near |= pose_error(pose, MAP_FROM_CAMERA)[0] < 0.3
+        assert near == remains
+
+
+def test_pairs_and_a_vertical_find_the_pose(scene):
+    leaders = Leaders.none_yet()
+    steps = list(search_vertically(scene, compatible_pairs(scene), leaders, upright()))
+    best = leaders.ranked()[0]
+    pose = invert_transform(make_transform(leaders.rotations[best], leaders.translations[best]))
+    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 0.2
+    assert leaders.samples[best, 2] == -1
+    assert (scene.pairs[leaders.samples[best, 0]] != scene.pairs[leaders.samples[best, 1]]).all()
+    assert steps[-1].tried == np.tril(compatible_pairs(scene)).sum()
+    assert (steps[-1].coverage, steps[-1].reach) == (1.0, len(scene.pairs))
+
+
+def test_pairs_mind_the_height(scene):
+    leaders = Leaders.none_yet()
+    list(search_vertically(scene, compatible_pairs(scene), leaders,
+                           upright(min_height=HEIGHT + 0.5)))
+    for row in leaders.ranked():
+        pose = invert_transform(make_transform(leaders.rotations[row],
+                                               leaders.translations[row]))
+        assert pose[:3, 3] @ UP_IN_MAP >= HEIGHT + 0.5

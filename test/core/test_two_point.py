@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.two_point import solve_two_point
+
+coordinates = st.floats(-5.0, 5.0)
+UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def random_problem(rng):
+    """Two points of random bearings and depths in front of a camera at a random pose."""
+    seen = rng.uniform(-1, 1, (2, 3))
+    seen[:, 2] = rng.uniform(0.5, 6.0, 2)
+    seen[:, :2] *= seen[:, 2:]
+    rotation = Rotation.from_rotvec(rng.normal(size=3) * 2).as_matrix()
+    translation = rng.normal(size=3) * 2
+    up_in_map = rng.normal(size=3)
+    up_in_map /= np.linalg.norm(up_in_map)
+    return seen, (seen - translation) @ rotation, rotation, translation, up_in_map
+
+
+def bearings_of(seen):
+    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+
+
+def nearest(rotations, translations, rotation, translation):
+    """How far the nearest of some poses is from another, as the largest difference."""
+    return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
+                for r, t in zip(rotations, translations, strict=True)), default=np.inf)
+
+
+def test_recovers_random_poses(rng):
+    worst = 0.0
+    for _ in range(10_000):
+        seen, points, rotation, translation, up_in_map = random_problem(rng)
+        poses = solve_two_point(bearings_of(seen), points, rotation @ up_in_map, up_in_map)
+        worst = max(worst, nearest(*poses, rotation, translation))
+    print(f'\n10,000 random poses recovered to {worst:.1e}')
+    assert worst < 1e-9
+
+
+def test_every_pose_found_is_an_upright_solution_and_none_is_found_twice(rng):
+    twice = 0
+    for _ in range(2_000):
+        seen, points, rotation, _, up_in_map = random_problem(rng)
+        up_in_camera = rotation @ up_in_map
+        bearings = bearings_of(seen)
+        rotations, translations = solve_two_point(bearings, points, up_in_camera, up_in_map)
+        twice += len(rotations) == 2
+        for index, (found, translation) in enumerate(zip(rotations, translations, strict=True)):
+            assert np.abs(found @ found.T - np.eye(3)).max() < 1e-12
+            assert np.linalg.det(found) > 0
+            assert np.abs(found @ up_in_map - up_in_camera).max() < 1e-12
+            assert np.abs(bearings_of(points @ found.T + translation) - bearings).max() < 1e-7
+            assert nearest(rotations[:index], translations[:index], found, translation) > 1e-9
+    assert twice > 100
+
+
+@given(st.lists(st.tuples(coordinates, coordinates, coordinates), min_size=2, max_size=2),
+       st.lists(st.tuples(coordinates, coordinates), min_size=2, max_size=2))
+def test_any_input_gives_finite_poses_or_none(points, image):
+    seen = np.concatenate([np.array(image), np.ones((2, 1))], axis=1)
+    rotations, translations = solve_two_point(bearings_of(seen), np.array(points), *UP)
+    assert np.isfinite(rotations).all()
+    assert np.isfinite(translations).all()
+
+
+@pytest.mark.parametrize('points', [
+    np.zeros((2, 3)),                              # one point
+    np.array([[0.0, 0, 1], [0, 0, 2]]),            # one above the other
+    np.full((2, 3), np.nan),
+])
+def test_degenerate_pairs_have_no_pose(points):
+    bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0.1, 1]]))
+    assert len(solve_two_point(bearings, points, *UP)[0]) == 0
+
+
+def test_two_points_level_with_the_camera_have_no_pose():
+    bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0, 1]]))
+    points = np.array([[0.0, 3, 1], [1, 3, 1]])
+    assert len(solve_two_point(bearings, points, *UP)[0]) == 0
