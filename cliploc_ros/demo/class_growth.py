@@ -55,8 +55,9 @@ def render(folder: Path, count: int, images: int, seed: int) -> None:
 
 
 def _whole_search_s(one: Summary) -> float:
-    """Return the mean time of a search [s]; of one cut short, what all of it would take."""
-    return float((one.search_ms / np.maximum(one.coverage, 1e-9)).mean()) / 1e3
+    """Return the mean time of a search [s]; of bf cut short, what all of it would take."""
+    share = np.maximum(one.coverage, 1e-9) if one.method.endswith('_bf') else 1.0
+    return float((one.search_ms / share).mean()) / 1e3
 
 
 def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
