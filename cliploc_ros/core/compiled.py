@@ -1,7 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the numerical kernels are compiled: one decorator, so that all share its settings."""
+"""How the numerical kernels are compiled: one decorator, so that all share its settings.
 
+Where numba is absent the kernels run as they stand, as plain Python: equal results, hundreds of
+times slower.
+"""
+
+import functools
 import logging
 import pickle
 from collections.abc import Callable
@@ -9,7 +14,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+import numpy as np
+
+try:
+    from numba import njit
+except ImportError:
+    njit = None
 
 logger = logging.getLogger(__name__)
 _kernels: list[Any] = []
@@ -23,6 +33,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     The GIL is released while the kernel runs, so that a node answers during a search, and
     divisions by zero give inf and NaN as in NumPy.
     """
+    if njit is None:
+        return _interpreted(function)
     settings = {'nogil': True, 'error_model': 'numpy'}
     try:
         kernel = njit(cache=True, **settings)(function)
@@ -30,6 +42,15 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         # Neither the package's folder nor the user's cache can be written: compile each time.
         kernel = njit(**settings)(function)
     _kernels.append(kernel)
+    return kernel
+
+
+def _interpreted(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a kernel run as plain Python, as silent about infinities as compiled code."""
+    @functools.wraps(function)
+    def kernel(*args: Any) -> Any:
+        with np.errstate(all='ignore'):
+            return function(*args)
     return kernel
 
 

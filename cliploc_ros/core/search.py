@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.p3p import p3p
 from cliploc_ros.core.sampling import (
+    SAMPLE_SIZE,
     enumerate_compatible_pairs,
     enumerate_compatible_triples,
     enumerate_triples,
@@ -35,8 +36,10 @@ MIN_SAMPLED_IOU = 0.9
 MIN_SAMPLED_PAIR_IOU = 0.2
 # Scores nearer than this are equal, but for rounding: the hypothesis found first stays.
 _TIE = 1e-9
-# A block of a search takes a few milliseconds, so that time limits hold.
+# A block of a search takes a millisecond or so, so that time limits hold: so many samples, and
+# fewer where each is verified against many landmarks and pairs.
 _SAMPLES_A_BLOCK = 500
+_WORK_A_BLOCK = 200_000
 
 
 class Progress(NamedTuple):
@@ -111,8 +114,9 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     """
     bench = set_up(scene, prior)
     tried = 0
-    for start in range(0, len(samples), _SAMPLES_A_BLOCK):
-        block = np.ascontiguousarray(samples[start:start + _SAMPLES_A_BLOCK])
+    size = len(_new_block(scene))
+    for start in range(0, len(samples), size):
+        block = np.ascontiguousarray(samples[start:start + size])
         _try_samples(bench, block, len(block), start, 0.0, leaders)
         tried += int((block[:, 0] >= 0).sum())
         yield Progress(tried, (start + len(block)) / len(samples))
@@ -138,7 +142,7 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
-    block = np.empty((_SAMPLES_A_BLOCK, 3), dtype=np.int64)
+    block = _new_block(scene)
     tried = 0
     while cursor[0] < count - 2:
         found = enumerate_triples(scene.pairs, cursor, block)
@@ -175,7 +179,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([2, 0, 1], dtype=np.int64)  # newest, first, second
-    block = np.empty((_SAMPLES_A_BLOCK, 3), dtype=np.int64)
+    block = _new_block(scene)
     tried = 0
     while cursor[0] < count:
         found = enumerate_compatible_triples(compatible, cursor, block)
@@ -211,7 +215,7 @@ def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Lead
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([1, 0], dtype=np.int64)  # newest, first
-    block = np.full((_SAMPLES_A_BLOCK, 3), -1, dtype=np.int64)
+    block = _new_block(scene)
     tried = 0
     while cursor[0] < count:
         found = enumerate_compatible_pairs(compatible, cursor, block)
@@ -219,6 +223,13 @@ def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Lead
         tried += found
         done = comb(int(cursor[0]), 2) if cursor[0] < count else comb(count, 2)
         yield Progress(tried, done / max(comb(count, 2), 1), min(int(cursor[0]), count))
+
+
+def _new_block(scene: Scene) -> NDArray[np.int64]:
+    """Return memory (b, 3) for a block of samples, filled with -1."""
+    work = len(scene.potential_landmarks) + len(scene.potential_detections)
+    size = min(_SAMPLES_A_BLOCK, max(1, _WORK_A_BLOCK // (work + 1)))
+    return np.full((size, SAMPLE_SIZE), -1, dtype=np.int64)
 
 
 @compiled

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -46,3 +47,50 @@ def test_a_damaged_cache_is_mended(warm_cache, ending, size):
     assert done.stdout == 'warm\n', done.stderr
     # and is whole again
     assert 'compiling anew' not in run(warm_cache).stderr
+
+
+SEARCH = """
+import sys
+if len(sys.argv) > 1:
+    sys.modules['numba'] = None  # as if it were not installed
+import numpy as np
+sys.path.insert(0, 'test')
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from cliploc_ros.core.compatibility import compatible_pairs
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.sampling import draw_prosac
+from cliploc_ros.core.scoring import make_scene
+from cliploc_ros.core.screening import Prior
+from cliploc_ros.core.search import Leaders, search_samples, search_vertically
+room = make_room()
+Relocalizer(room, RelocalizerOptions()).warm_up()
+rows = slice(0, 6)
+seen = see_room(room)
+potential = (np.array(seen.class_ids)[:, None] == np.array(room.class_ids)[None])[rows]
+scene = make_scene(CAMERA.normalize_bboxes(seen.bboxes_xyxy[rows]), room.centers, room.shapes,
+                   potential, np.argwhere(potential), 0.2)
+samples = draw_prosac(scene.pairs, 100, np.random.default_rng(0))
+up = (0.0, -1.0, 0.0)
+prior = Prior(tuple(MAP_FROM_CAMERA[:3, :3].T @ up), up)
+for search, given in ((search_samples, (samples,)), (search_vertically,
+                                                     (compatible_pairs(scene),))):
+    leaders = Leaders.none_yet()
+    list(search(scene, *given, leaders, prior))
+    ranked = leaders.ranked()
+    np.savetxt(sys.stdout, np.c_[leaders.scores, leaders.iterations, leaders.samples,
+                                 leaders.translations][ranked])
+"""
+
+
+def test_without_numba_the_results_are_equal():
+    """What is compiled also runs as plain Python."""
+    results = []
+    for argument in ((), ('plain',)):
+        done = subprocess.run([sys.executable, '-c', SEARCH, *argument], capture_output=True,
+                              text=True, cwd=PROJECT, check=False)
+        assert done.returncode == 0, done.stderr
+        results.append(np.array([line.split() for line in done.stdout.splitlines()],
+                                dtype=np.float64))
+    assert results[0][0, 0] > 5.0
+    assert results[1] == pytest.approx(results[0], abs=1e-9)
