@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.culling import Tree, make_tree, morton_order, visible_ranges
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.p3p import MAX_SOLUTIONS
 from cliploc_ros.core.scoring import Scene
@@ -58,14 +59,14 @@ class Bench(NamedTuple):
     candidates : ndarray (c, 16)
         Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
         landmark of each correspondence candidate.
-    landmarks : ndarray (u, 9)
-        Centre and shape of each landmark that any detection may show.
-    landmark_rows : ndarray (u,)
-        Which landmarks of the scene these are.
+    tree : Tree
+        Of the landmarks that any detection may show.
+    landmarks : ndarray (u, 10)
+        Their centres, shapes and squared reaches, neighbours together.
     boxes : ndarray (n, 4)
         Box ellipses of the detections.
-    starts, columns : ndarray (n + 1,), (v,)
-        Where each detection's landmarks begin in columns, which holds rows of landmarks.
+    starts, detections : ndarray (u + 1,), (v,)
+        Where each landmark's detections begin in detections.
     prior : ndarray (9,)
         See Prior.as_array.
     iou_threshold : float
@@ -74,24 +75,28 @@ class Bench(NamedTuple):
         The minimal sample.
     rotations, translations : ndarray (4, 3, 3), (4, 3)
         The poses that it allows.
-    sampled_boxes, sampled_landmarks : ndarray (3, 4), (3, 9)
+    sampled_boxes, sampled_landmarks : ndarray (3, 4), (3, 10)
         Rows of boxes and landmarks that are the minimal sample.
     sampled_outlines : ndarray (12, 6)
         Outlines of the sampled landmarks, three for each pose.
     uppers : ndarray (4,)
         Upper bounds of the sums of their IoUs; -1 where a pose is out of the question.
+    ranges : ndarray (l, 2)
+        Runs of landmarks that one pose may see.
     outlines : ndarray (u, 6)
-        Of the landmarks at one pose: centre, half extents, exy, half-axes' product.
-    bounds, best_bounds : ndarray (v,), (n,)
-        Upper bounds of the IoUs, and the greatest of each detection.
+        Of these: centre, half extents, exy, the semi-axes' product.
+    entries, bounds : ndarray (v, 2), (v,)
+        Pairs of detection and outline that may overlap enough, and upper bounds of their IoUs.
+    best_bounds : ndarray (n,)
+        The greatest of each detection.
     """
 
     candidates: NDArray[np.float64]
+    tree: Tree
     landmarks: NDArray[np.float64]
-    landmark_rows: NDArray[np.int64]
     boxes: NDArray[np.float64]
     starts: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    detections: NDArray[np.int64]
     prior: NDArray[np.float64]
     iou_threshold: float
     bearings: NDArray[np.float64]
@@ -102,7 +107,9 @@ class Bench(NamedTuple):
     sampled_landmarks: NDArray[np.float64]
     sampled_outlines: NDArray[np.float64]
     uppers: NDArray[np.float64]
+    ranges: NDArray[np.int64]
     outlines: NDArray[np.float64]
+    entries: NDArray[np.int64]
     bounds: NDArray[np.float64]
     best_bounds: NDArray[np.float64]
 
@@ -118,21 +125,34 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
     """
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     rows = scene.potential_landmarks
-    columns = np.repeat(np.arange(len(rows)), np.diff(scene.potential_starts))
-    by_detection = np.argsort(scene.potential_detections, kind='stable')
-    count = len(scene.bearings)
-    starts = np.searchsorted(scene.potential_detections[by_detection], np.arange(count + 1))
+    table = np.concatenate([scene.centers[rows], scene.shapes[rows]], axis=1)
+    numbers = np.diff(scene.potential_starts)
+    box_axes = scene.box_ellipses[:, 2:].prod(axis=1)
+    if len(rows):
+        least_axes = np.minimum.reduceat(box_axes[scene.potential_detections],
+                                         scene.potential_starts[:-1])
+        order = morton_order(table[:, :3])
+    else:
+        table, least_axes, order = np.zeros((1, 9)), np.zeros(1), np.zeros(1, dtype=np.int64)
+        numbers = np.zeros(1, dtype=np.int64)
+    table, numbers = table[order], numbers[order]
+    starts = np.concatenate([[0], np.cumsum(numbers)]).astype(np.int64)
+    begins = np.repeat(np.append(scene.potential_starts[:-1], 0)[order], numbers)
+    pairs = begins + np.arange(starts[-1]) - np.repeat(starts[:-1], numbers)
+    tree, reaches = make_tree(table, least_axes[order], scene.box_ellipses,
+                              scene.iou_threshold)
     return Bench(
         np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                         scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
-        np.concatenate([scene.centers[rows], scene.shapes[rows]], axis=1),
-        np.asarray(rows, dtype=np.int64), scene.box_ellipses, starts.astype(np.int64),
-        columns[by_detection].astype(np.int64), (prior or Prior()).as_array(),
+        tree, np.column_stack([table, reaches * reaches]), scene.box_ellipses, starts,
+        scene.potential_detections[pairs].astype(np.int64), (prior or Prior()).as_array(),
         scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
         np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
-        np.empty((3, 4)), np.empty((3, 9)),
-        np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS), np.empty((len(rows), 6)),
-        np.empty(len(columns)), np.empty(count))
+        np.empty((3, 4)), np.full((3, 10), inf),
+        np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS),
+        np.empty((int(tree.leaves.sum()), 2), dtype=np.int64), np.empty((len(table), 6)),
+        np.empty((len(pairs), 2), dtype=np.int64), np.empty(len(pairs)),
+        np.empty(len(scene.bearings)))
 
 
 @compiled
@@ -163,23 +183,27 @@ def allowed(prior, rotations, translations, which):
 
 
 @compiled
-def project(rotations, translations, which, landmarks, count, outlines, first):
-    """Write the outlines of landmarks at one pose into rows from the first on.
+def project(rotations, translations, which, landmarks, first, last, outlines, out):
+    """Write the outlines of landmarks first to last at one pose into rows from out on.
 
     As project_ellipsoid, in one loop without calls, which is several times faster; of ellipsoids
-    that are not wholly in front the half extents are minus infinity.
+    that are not wholly in front, or beyond their reach, the half extents are minus infinity.
     """
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
     r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
     r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
     t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
-    for row in range(count):
+    for row in range(first, last):
         px, py, pz = landmarks[row, 0], landmarks[row, 1], landmarks[row, 2]
         sxx, sxy, sxz = landmarks[row, 3], landmarks[row, 4], landmarks[row, 5]
         syy, syz, szz = landmarks[row, 6], landmarks[row, 7], landmarks[row, 8]
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
         z = r20 * px + r21 * py + r22 * pz + t2
+        outlines[out, 2] = outlines[out, 3] = -inf
+        if not (z > 0.0 and x * x + y * y + z * z <= landmarks[row, 9]):
+            out += 1
+            continue
         x0 = sxx * r00 + sxy * r01 + sxz * r02
         x1 = sxy * r00 + syy * r01 + syz * r02
         x2 = sxz * r00 + syz * r01 + szz * r02
@@ -190,9 +214,8 @@ def project(rotations, translations, which, landmarks, count, outlines, first):
         z1 = sxy * r20 + syy * r21 + syz * r22
         z2 = sxz * r20 + syz * r21 + szz * r22
         weight = z * z - (r20 * z0 + r21 * z1 + r22 * z2)
-        out = first + row
-        outlines[out, 2] = outlines[out, 3] = -inf
-        if not (z > 0.0 and weight > 0.0):
+        if not weight > 0.0:
+            out += 1
             continue
         inverse = 1.0 / weight
         cx = (x * z - (r00 * z0 + r01 * z1 + r02 * z2)) * inverse
@@ -205,6 +228,7 @@ def project(rotations, translations, which, landmarks, count, outlines, first):
             outlines[out, 2], outlines[out, 3] = sqrt(exx), sqrt(eyy)
             outlines[out, 4] = exy
             outlines[out, 5] = sqrt(max(0.0, exx * eyy - exy * exy))
+        out += 1
 
 
 @compiled
@@ -241,7 +265,7 @@ def choose_pose(prior, rotations, translations, size, count, boxes, landmarks, o
     for which in range(count):
         uppers[which] = -1.0
         if allowed(prior, rotations, translations, which):
-            project(rotations, translations, which, landmarks, size, outlines, 3 * which)
+            project(rotations, translations, which, landmarks, 0, size, outlines, 3 * which)
             uppers[which] = _sampled_upper(boxes, size, outlines, 3 * which)
         if uppers[which] >= least_iou:
             visible += 1
@@ -291,24 +315,23 @@ def _sampled_total(boxes, size, outlines, first):
 
 
 @compiled
-def verify_beyond(landmarks, boxes, starts, columns, iou_threshold, rotations, translations,
-                  which, outlines, bounds, best_bounds, floor):
+def verify_beyond(tree, landmarks, boxes, starts, detections, iou_threshold, rotations,
+                  translations, which, ranges, outlines, entries, bounds, best_bounds, floor):
     """Return the score of a pose if it is above a floor; if not, the floor."""
-    project(rotations, translations, which, landmarks, landmarks.shape[0], outlines, 0)
+    spheres, rows, leaves, frustum = tree
+    runs = visible_ranges(spheres, rows, leaves, frustum, rotations, translations, which, ranges)
+    best_bounds[:] = iou_threshold
+    count, out = 0, 0
+    for run in range(runs):
+        first, last = ranges[run, 0], ranges[run, 1]
+        project(rotations, translations, which, landmarks, first, last, outlines, out)
+        count = _bound(boxes, starts, detections, iou_threshold, first, last, outlines, out,
+                       entries, bounds, best_bounds, count)
+        out += last - first
     upper = 0.0
     for detection in range(boxes.shape[0]):
-        u, v = boxes[detection, 0], boxes[detection, 1]
-        half_width, half_height = boxes[detection, 2], boxes[detection, 3]
-        best = 0.0
-        for entry in range(starts[detection], starts[detection + 1]):
-            row = columns[entry]
-            bound = iou_bound(u, v, half_width, half_height, outlines[row, 0], outlines[row, 1],
-                              outlines[row, 2], outlines[row, 3], outlines[row, 5])
-            bounds[entry] = bound
-            best = max(best, bound)
-        best_bounds[detection] = best
-        if best > iou_threshold:
-            upper += best
+        if best_bounds[detection] > iou_threshold:
+            upper += best_bounds[detection]
     if upper <= floor:
         return floor
     score = 0.0
@@ -316,15 +339,14 @@ def verify_beyond(landmarks, boxes, starts, columns, iou_threshold, rotations, t
         if best_bounds[detection] <= iou_threshold:
             continue
         best = iou_threshold
-        for entry in range(starts[detection], starts[detection + 1]):
-            if bounds[entry] <= best:
-                continue
-            row = columns[entry]
-            best = max(best, ellipse_iou(
-                boxes[detection, 0], boxes[detection, 1], boxes[detection, 2],
-                boxes[detection, 3], outlines[row, 0], outlines[row, 1],
-                outlines[row, 2] * outlines[row, 2], outlines[row, 4],
-                outlines[row, 3] * outlines[row, 3]))
+        for entry in range(count):
+            if entries[entry, 0] == detection and bounds[entry] > best:
+                row = entries[entry, 1]
+                best = max(best, ellipse_iou(
+                    boxes[detection, 0], boxes[detection, 1], boxes[detection, 2],
+                    boxes[detection, 3], outlines[row, 0], outlines[row, 1],
+                    outlines[row, 2] * outlines[row, 2], outlines[row, 4],
+                    outlines[row, 3] * outlines[row, 3]))
         if best <= iou_threshold:
             best = 0.0
         score += best
@@ -332,3 +354,26 @@ def verify_beyond(landmarks, boxes, starts, columns, iou_threshold, rotations, t
         if upper <= floor:
             return floor
     return score
+
+
+@compiled
+def _bound(boxes, starts, detections, iou_threshold, first, last, outlines, out, entries, bounds,
+           best_bounds, count):
+    """Add the pairs of some landmarks that may overlap enough; return how many there are now."""
+    for row in range(first, last):
+        outline = out + row - first
+        half_x = outlines[outline, 2]
+        if not half_x > 0.0:
+            continue
+        cx, cy, half_y = outlines[outline, 0], outlines[outline, 1], outlines[outline, 3]
+        axes = outlines[outline, 5]
+        for pair in range(starts[row], starts[row + 1]):
+            detection = detections[pair]
+            bound = iou_bound(boxes[detection, 0], boxes[detection, 1], boxes[detection, 2],
+                              boxes[detection, 3], cx, cy, half_x, half_y, axes)
+            if bound > iou_threshold:
+                entries[count, 0], entries[count, 1] = detection, outline
+                bounds[count] = bound
+                best_bounds[detection] = max(best_bounds[detection], bound)
+                count += 1
+    return count
