@@ -78,9 +78,16 @@ class Observation:
         landmarks, in the map's order. None where only classes are known.
     stamp_ns : int
         When the image was taken [ns].
+    up_in_camera : ndarray (3,) or None
+        The vertical, a unit vector in the camera's optical frame; None where it is not known.
+    odom_from_camera : ndarray (4, 4) or None
+        The camera in a frame that is continuous, as odometry has it; what joins this frame with
+        others. None where it is not known.
     """
 
     camera: Camera
     detections: Detections
     similarities: NDArray[np.float32] | None = None
     stamp_ns: int = 0
+    up_in_camera: NDArray[np.float64] | None = None
+    odom_from_camera: NDArray[np.float64] | None = None
