@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.similarity import Similarities, nearest_landmarks
 from cliploc_ros.errors import OptionsError
 
 MATCHINGS = ('class', 'clip', 'hybrid')
@@ -52,12 +53,6 @@ class Candidates:
                           self.similarities[order])
 
 
-def cosine_similarities(crop_embeddings: NDArray[np.float32],
-                        label_embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the similarities (n, L) of unit embeddings (n, d) and (L, d)."""
-    return crop_embeddings @ label_embeddings.T
-
-
 def same_class(detection_classes: tuple[str, ...], landmark_classes: tuple[str, ...]
                ) -> NDArray[np.bool_]:
     """Return a mask (n, L): detection and landmark have the same class name."""
@@ -96,12 +91,12 @@ def check_k(k: int, landmark_count: int) -> None:
                            f'set k to {landmark_count} or less')
 
 
-def nearest_candidates(similarities: NDArray[np.float32], k: int) -> Candidates:
+def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
     Parameters
     ----------
-    similarities : ndarray (n, L)
+    similarities : ndarray (n, L) or CropSimilarities
         Cosine similarity of each crop and label.
     k : int
         1 to L.
@@ -113,15 +108,9 @@ def nearest_candidates(similarities: NDArray[np.float32], k: int) -> Candidates:
     """
     detection_count, landmark_count = similarities.shape
     check_k(k, landmark_count)
-    nearest = np.argpartition(-similarities, k - 1, axis=1)[:, :k] if k < landmark_count \
-        else np.tile(np.arange(landmark_count), (detection_count, 1))
-    nearest.sort(axis=1)
-    values = np.take_along_axis(similarities, nearest, axis=1)
-    order = np.argsort(-values, axis=1, kind='stable')
-    return Candidates(np.repeat(np.arange(detection_count), k),
-                      np.take_along_axis(nearest, order, axis=1).ravel(),
-                      np.tile(np.arange(k), detection_count),
-                      np.take_along_axis(values, order, axis=1).ravel().astype(np.float64))
+    landmarks, values = nearest_landmarks(similarities, k)
+    return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
+                      np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
 
 
 def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np.bool_]:

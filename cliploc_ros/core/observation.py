@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.similarity import Similarities
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Observation:
     camera : Camera
     detections : Detections
         n of them.
-    similarities : ndarray (n, L) or None
+    similarities : ndarray (n, L), CropSimilarities or None
         Cosine similarity of each detection's crop with the label of each of the map's L
         landmarks, in the map's order. None where only classes are known.
     stamp_ns : int
@@ -87,7 +88,7 @@ class Observation:
 
     camera: Camera
     detections: Detections
-    similarities: NDArray[np.float32] | None = None
+    similarities: Similarities | None = None
     stamp_ns: int = 0
     up_in_camera: NDArray[np.float64] | None = None
     odom_from_camera: NDArray[np.float64] | None = None

@@ -144,7 +144,9 @@ class Reviewer:
         repeated = _same_pose(found.map_from_camera, judged.pose)
         true_boxes = self._true_boxes.get(stamp)
         return Review(judged, image_rgb, self._camera, detections,
-                      found.matches if repeated else (), observation.similarities,
+                      found.matches if repeated else (),
+                      None if observation.similarities is None
+                      else np.asarray(observation.similarities),
                       None if true_boxes is None else _true_ids(detections, true_boxes), repeated)
 
 

@@ -83,8 +83,8 @@ def _record(frame: Frame, detector: ObjectDetector, observer: Observer, number: 
     detected = time.perf_counter()
     observation = observer.observe(frame.image_rgb, camera, detections, frame.stamp_ns)
     compared = time.perf_counter()
-    similarities = observation.similarities
-    assert similarities is not None and frame.map_from_camera is not None
+    assert observation.similarities is not None and frame.map_from_camera is not None
+    similarities = np.asarray(observation.similarities)
     bboxes = _undistorted(detections, camera)
     rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
     sound = detections.select(rows)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.similarity import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
@@ -35,7 +36,7 @@ class LoadedEncoder(NamedTuple):
     """An encoder ready for crops, and the embeddings (L, d) of the labels it was loaded for."""
 
     encoder: 'ClipEncoder'
-    label_embeddings: NDArray[np.float32]
+    label_embeddings: LabelEmbeddings
 
 
 def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
@@ -74,7 +75,8 @@ def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
     logger.info('CLIP %s is ready after %.1f s, %d labels %s', weights.model,
                 time.monotonic() - started, len(unique), source)
     rows = {label: row for row, label in enumerate(unique)}
-    return LoadedEncoder(encoder, embeddings[[rows[label] for label in labels]])
+    of_landmarks = np.array([rows[label] for label in labels], dtype=np.int64)
+    return LoadedEncoder(encoder, LabelEmbeddings(embeddings, of_landmarks))
 
 
 class ClipEncoder:

@@ -5,9 +5,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association import cosine_similarities
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.similarity import CropSimilarities, LabelEmbeddings
 from cliploc_ros.models.protocols import ImageTextEncoder
 
 
@@ -17,13 +17,14 @@ class Observer:
     Parameters
     ----------
     encoder : ImageTextEncoder
-    label_embeddings : ndarray (L, d)
+    label_embeddings : LabelEmbeddings or ndarray (L, d)
         Unit rows, one for each landmark of the map.
     """
 
-    def __init__(self, encoder: ImageTextEncoder, label_embeddings: NDArray[np.float32]) -> None:
+    def __init__(self, encoder: ImageTextEncoder,
+                 label_embeddings: LabelEmbeddings | NDArray[np.float32]) -> None:
         self._encoder = encoder
-        self._label_embeddings = label_embeddings
+        self._labels = LabelEmbeddings.of(label_embeddings)
 
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:
@@ -39,5 +40,4 @@ class Observer:
             When the image was taken [ns].
         """
         crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
-        return Observation(camera, detections,
-                           cosine_similarities(crops, self._label_embeddings), stamp_ns)
+        return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)
