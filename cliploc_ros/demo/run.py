@@ -183,7 +183,7 @@ def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
                   options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),
                   options.out / 'relocalizer.log') as relocalizer):
-        detector.wait_for_output('detector ready', _PATIENCE_S)
+        detector.wait_for_output('ready after', _PATIENCE_S)
         relocalizer.wait_for_output('landmarks in frame', _PATIENCE_S)
         print(f'both are ready after {time.monotonic() - start:.1f} s', flush=True)
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """CLIP through open_clip: crops and labels in, unit embeddings out."""
 
-import ctypes
-import gc
 import logging
 import sys
 import time
@@ -17,7 +15,7 @@ from cliploc_ros.core.similarity import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
-from cliploc_ros.models.devices import resolve_device, resolve_precision
+from cliploc_ros.models.devices import free_memory, resolve_device, resolve_precision
 from cliploc_ros.models.files import resolve_cache_dir
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache
@@ -190,7 +188,7 @@ def encode_labels(
     if not labels:
         return np.empty((0, weights.embed_dim), dtype=np.float32)
     embeddings = _run_text_tower(weights, labels, device)
-    _free_memory()
+    free_memory()
     return _as_rows(embeddings, weights.embed_dim, weights)
 
 
@@ -251,16 +249,3 @@ def _as_rows(
         raise ModelError(f'{weights.file} gives embeddings that are not finite: the weights are '
                          'corrupt, or overflow in fp16 (set the precision to fp32)')
     return rows
-
-
-def _free_memory() -> None:
-    """Give what a freed network held back to the system."""
-    import torch
-
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
-    # glibc keeps freed blocks below 32 MB for later; a robot's other processes want them now.
-    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
-    if trim is not None:
-        trim(0)

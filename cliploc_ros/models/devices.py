@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a network runs and how precisely."""
 
+import ctypes
+import gc
+import sys
 from typing import TYPE_CHECKING
 
 from cliploc_ros.errors import OptionsError
@@ -48,3 +51,15 @@ def resolve_precision(precision: str, device: 'torch.device') -> str:
     if precision == 'auto':
         return 'fp16' if device.type == 'cuda' else 'fp32'
     return precision
+
+
+def free_memory() -> None:
+    """Give what freed networks held back to the system."""
+    gc.collect()
+    torch = sys.modules.get('torch')  # where it was never loaded, it holds nothing
+    if torch is not None and torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    # glibc keeps freed blocks below 32 MB for later; a robot's other processes want them now.
+    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
+    if trim is not None:
+        trim(0)

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector node: images in, detections out, and only while something listens."""
 
+import threading
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
+from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
@@ -14,63 +15,76 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.parameters import NodeParameters, Value
-from cliploc_ros.ros.process import WorkingNode, run_node
+from cliploc_ros.ros.lifecycle import ManagedNode
+from cliploc_ros.ros.parameters import Value
+from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.subscription import AdaptiveSubscription
 from cliploc_ros.ros.tables import DETECTOR
-from cliploc_ros.ros.worker import LatestOnly, Retrying
+from cliploc_ros.ros.worker import LatestOnly
 
-_RETRY_PAUSE_S = 5.0
 _LOG_PERIOD_S = 5.0
 
 
-class DetectorNode(WorkingNode):
+class DetectorNode(ManagedNode):
     """Publishes what a YOLO network sees in the newest image."""
 
     def __init__(self) -> None:
-        super().__init__('detector')
-        self._settings = NodeParameters(self, DETECTOR, detector_options)
-        self._detector = Retrying(self._load, _RETRY_PAUSE_S)
+        super().__init__('detector', DETECTOR, detector_options)
+        self._detector: YoloDetector | None = None
         self._images: LatestOnly[Image | CompressedImage] = LatestOnly(self.worker, self._detect)
+        # matched in one thread, activated in another
+        self._lock = threading.Lock()
+        self._open = False
         self._subscription: AdaptiveSubscription | None = None
         self._publisher = self.create_publisher(
             Detection2DArray, 'detections', qos.DETECTIONS_OUT,
-            event_callbacks=PublisherEventCallbacks(matched=self._on_matched),
+            event_callbacks=PublisherEventCallbacks(matched=lambda _: self._listen_if_wanted()),
             qos_overriding_options=qos.overridable())
-        self.worker.submit(self._load_ahead)
 
-    def _load(self) -> YoloDetector:
-        return YoloDetector(detector_options(self._settings.snapshot()))
+    def load(self) -> str:
+        """Load the network."""
+        self._detector = YoloDetector(detector_options(self.settings.snapshot()))
+        return f"detector {self.settings['model']}"
 
-    def _load_ahead(self) -> None:
-        """Load the network before the first image needs it."""
-        try:
-            self._detector.get()
-            self.get_logger().info(f"detector ready: {self._settings['model']}")
-        except CliplocError as error:
-            self.get_logger().error(str(error))
+    def unload(self) -> None:
+        """Let go the network."""
+        self._detector = None
 
-    def _on_matched(self, info: QoSPublisherMatchedInfo) -> None:
-        """Listen to images exactly while somebody listens to detections."""
-        if info.current_count > 0 and self._subscription is None:
-            raw = self._settings['image_transport'] == 'raw'
-            self._subscription = AdaptiveSubscription(
-                self, Image if raw else CompressedImage, 'image' if raw else 'image/compressed',
-                self._images.offer, qos.IMAGE)
-        elif info.current_count == 0 and self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
+    def open(self) -> None:
+        """Listen to images while somebody listens to detections."""
+        self._open = True
+        self._listen_if_wanted()
+
+    def close(self) -> None:
+        """Listen to nothing."""
+        self._open = False
+        self._listen_if_wanted()
+
+    def _listen_if_wanted(self) -> None:
+        """Listen to images exactly while this node is open and its detections are heard."""
+        with self._lock:
+            wanted = self._open and self._publisher.get_subscription_count() > 0
+            if wanted and self._subscription is None:
+                raw = self.settings['image_transport'] == 'raw'
+                self._subscription = AdaptiveSubscription(
+                    self, Image if raw else CompressedImage, 'image' if raw else
+                    'image/compressed', self._images.offer, qos.IMAGE)
+            elif not wanted and self._subscription is not None:
+                self._subscription.destroy()
+                self._subscription = None
 
     def _detect(self, msg: Image | CompressedImage) -> None:
         """Detect in one image and publish; in the worker's thread."""
+        if not self.active or self._detector is None:
+            return  # deactivated while the image waited
         try:
-            detector = self._detector.get()
-            detector.configure(detector_options(self._settings.snapshot()))
-            detections = detector.detect(image_from_msg(msg))
+            self._detector.configure(detector_options(self.settings.snapshot()))
+            detections = self._detector.detect(image_from_msg(msg))
         except CliplocError as error:
             self.get_logger().error(str(error), throttle_duration_sec=_LOG_PERIOD_S)
             return
-        self._publisher.publish(detections_to_msg(detections, msg.header))
+        if self.active:
+            self._publisher.publish(detections_to_msg(detections, msg.header))
 
 
 def detector_options(values: Mapping[str, Value]) -> YoloOptions:

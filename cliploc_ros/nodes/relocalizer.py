@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer node: from image and detections to the robot's pose, when asked."""
 
-import time
 import traceback
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -19,12 +19,12 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
 from cliploc_ros.ros.frame_source import Frame, FrameSource
 from cliploc_ros.ros.frames import BaseFrame
+from cliploc_ros.ros.lifecycle import ManagedNode
 from cliploc_ros.ros.localizer import Localizer, load_localizer
-from cliploc_ros.ros.parameters import NodeParameters
-from cliploc_ros.ros.process import WorkingNode, run_node
+from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
-from cliploc_ros.ros.worker import LatestOnly, Retrying
+from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
 
@@ -37,48 +37,56 @@ class Answer:
     message: str
 
 
-class RelocalizerNode(WorkingNode):
+class RelocalizerNode(ManagedNode):
     """Answers where the robot is, when asked or with every frame."""
 
     def __init__(self) -> None:
-        super().__init__('relocalizer')
-        self._settings = NodeParameters(self, RELOCALIZER, relocalizer_options)
-        self._localizer: Retrying[Localizer] = Retrying(self._load)
+        super().__init__('relocalizer', RELOCALIZER, relocalizer_options)
+        self._localizer: Localizer | None = None
         self._base = BaseFrame(self)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._initial_pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose',
                                                    qos.POSE)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
-        self._frames = FrameSource(self, self._settings['image_transport'], self._on_frame)
+        self._frames: FrameSource | None = None
+        self._listening = ExitStack()
         self._flights: Flights[Answer] = Flights(self._wake_up)
         requests = BoundedCallbackGroup(MAX_REQUESTS)
         self.create_service(Trigger, '~/relocalize', self._on_relocalize,
                             qos_profile=qos.SERVICE, callback_group=requests)
         self.create_service(Empty, 'reinitialize_global_localization', self._on_reinitialize,
                             qos_profile=qos.SERVICE, callback_group=requests)
-        self.worker.submit(self._load_ahead)
-        if self._settings['mode'] == 'continuous':
-            self._frames.open()
+
+    def load(self) -> str:
+        """Load map and network."""
+        values: Mapping[str, Any] = self.settings.snapshot()
+        if values['base_frame'] and not any(values['base_from_camera']):
+            self._base.listen()
+        self._localizer = load_localizer(self, values)
+        return self._localizer.description
+
+    def unload(self) -> None:
+        """Let go map and network."""
+        self._localizer = None
+        self._base.forget()
+
+    def open(self) -> None:
+        """Be ready for requests; in continuous mode listen to frames."""
+        self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
+        if self.settings['mode'] == 'continuous':
+            self._listening.enter_context(self._frames.listening())
+
+    def close(self) -> None:
+        """Let go the request that waits for frames, and stop to listen."""
+        if self._frames is not None:
+            self._frames.stop('the node was deactivated')
+        self._listening.close()
 
     def release(self) -> None:
-        """Let go the request that waits for frames."""
-        self._frames.stop()
-
-    def _load(self) -> Localizer:
-        return load_localizer(self, self._settings.snapshot())
-
-    def _load_ahead(self) -> None:
-        """Load map and network before the first request needs them."""
-        start = time.monotonic()
-        try:
-            localizer = self._localizer.get()
-            self.get_logger().info(f'ready after {time.monotonic() - start:.1f} s: '
-                                   f'{localizer.description}')
-            if self._settings['base_frame'] and not any(self._settings['base_from_camera']):
-                self._base.listen()
-        except CliplocError as error:
-            self.get_logger().error(str(error))
+        """Let go the request that waits for frames: the process ends."""
+        if self._frames is not None:
+            self._frames.stop('the node is shutting down')
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._flights.board()
@@ -98,9 +106,10 @@ class RelocalizerNode(WorkingNode):
         """
         try:
             # A map or weights that were missing may have been mended since.
-            self.worker.run(self._localizer.get)
+            self.bring_up()
+            assert self._frames is not None  # an active node has them
             with self._frames.listening():
-                frame = self._frames.wait_for_fresh(self._settings['timeout_s'])
+                frame = self._frames.wait_for_fresh(self.settings['timeout_s'])
             depart()
             answer = self.worker.run(lambda: self._localize(frame))
         except CliplocError as error:
@@ -114,7 +123,7 @@ class RelocalizerNode(WorkingNode):
         return answer
 
     def _on_frame(self, frame: Frame) -> None:
-        if self._settings['mode'] == 'continuous':
+        if self.settings['mode'] == 'continuous':
             self._continuous.offer(frame)
 
     def _localize_and_log(self, frame: Frame) -> None:
@@ -126,13 +135,16 @@ class RelocalizerNode(WorkingNode):
 
     def _localize(self, frame: Frame) -> Answer:
         """Localize from one frame and publish what was found; in the worker's thread."""
-        values: Mapping[str, Any] = self._settings.snapshot()
-        localizer = self._localizer.get()
+        values: Mapping[str, Any] = self.settings.snapshot()
+        self.check_active()
+        localizer = self._localizer
+        assert localizer is not None  # an active node has one
         found, times = localizer.localize(frame, values)
         header = Header(stamp=frame.image.header.stamp, frame_id=localizer.map_frame)
         camera_from_base = self._base.camera_from_base(
             values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
             header.stamp, values['tf_timeout_s'])
+        self.check_active()
         bases = [hypothesis.map_from_camera @ camera_from_base
                  for hypothesis in found.hypotheses]
         self._hypotheses.publish(pose_array_msg(header, bases))

@@ -69,7 +69,7 @@ class FrameSource:
         self._subscriptions: list[AdaptiveSubscription] = []
         self._listeners = 0
         self._newest: Frame | None = None
-        self._stopped = False
+        self._stopped = ''
 
     def open(self) -> None:
         """Listen until closed as often as opened."""
@@ -107,24 +107,24 @@ class FrameSource:
         NoFrameError
             None came in time; the message says what was missing.
         StoppedError
-            The node is shutting down.
+            Somebody called stop; the message says why.
         """
         now = time.monotonic()
         with self._changed:
             self._changed.wait_for(lambda: self._stopped or self._newest_since(now) is not None,
                                    timeout_s)
             if self._stopped:
-                raise StoppedError('the node is shutting down')
+                raise StoppedError(self._stopped)
             frame = self._newest_since(now)
             if frame is None:
                 raise NoFrameError(f'no fresh frame within {timeout_s:g} s: '
                                    f'{self._why_none(now)}')
             return frame
 
-    def stop(self) -> None:
-        """Release everybody who waits."""
+    def stop(self, reason: str) -> None:
+        """Release for good everybody who waits, with a reason to give them."""
         with self._changed:
-            self._stopped = True
+            self._stopped = reason
             self._changed.notify_all()
 
     def _newest_since(self, moment: float) -> Frame | None:

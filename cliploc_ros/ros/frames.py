@@ -83,3 +83,9 @@ class BaseFrame:
                              'set base_from_camera') from error
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self._node)
+
+    def forget(self) -> None:
+        """Hear of transforms no longer."""
+        if self._listener is not None:
+            self._listener.unregister()
+        self._buffer = self._listener = None

@@ -3,7 +3,6 @@
 """The life of a node's process: the only caller of rclpy.init."""
 
 import atexit
-import logging
 import os
 import signal
 import sys
@@ -15,58 +14,16 @@ from typing import NoReturn
 import rclpy
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
-from rclpy.node import Node
 
+from cliploc_ros.ros.lifecycle import ManagedNode
 from cliploc_ros.ros.requests import MAX_REQUESTS
-from cliploc_ros.ros.worker import Worker
 
-# For the requests that may wait, for frames, for parameters and the rest. Threads are made when
-# they are first needed.
-_THREADS = MAX_REQUESTS + 3
-
-
-class RosLogHandler(logging.Handler):
-    """Passes what the package's modules without ROS log on to a node's logger."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(logging.INFO)
-        self._logger = node.get_logger()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Log one record at its level."""
-        if record.levelno >= logging.ERROR:
-            self._logger.error(record.getMessage())
-        elif record.levelno >= logging.WARNING:
-            self._logger.warning(record.getMessage())
-        else:
-            self._logger.info(record.getMessage())
+# For the requests that may wait, for transitions, frames, parameters and the rest. Threads are
+# made when they are first needed.
+_THREADS = MAX_REQUESTS + 8
 
 
-class WorkingNode(Node):
-    """A node whose networks run in a worker beside its executor.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node. Parameters given at start-up are declared as they come.
-    """
-
-    def __init__(self, name: str) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self.worker = Worker(self._report)
-        package_logger = logging.getLogger('cliploc_ros')
-        package_logger.setLevel(logging.INFO)
-        package_logger.addHandler(RosLogHandler(self))
-
-    def _report(self, traceback_text: str) -> None:
-        """Log a defect; one that comes with every frame must not fill the disk."""
-        self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
-
-    def release(self) -> None:
-        """Let go whoever waits in this node: the process ends."""
-
-
-def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
+def _spin(executor: MultiThreadedExecutor, node: ManagedNode) -> None:
     """Execute callbacks until the process is told to end; no failure of one ends the node."""
     while node.context.ok():
         try:
@@ -77,10 +34,11 @@ def _spin(executor: MultiThreadedExecutor, node: WorkingNode) -> None:
             # again.
             continue
         except Exception:
-            node.get_logger().error(f'internal error: {traceback.format_exc()}')
+            if node.context.ok():  # else the process is told to end, and rclpy stumbles over that
+                node.get_logger().error(f'internal error: {traceback.format_exc()}')
 
 
-def run_node(make_node: Callable[[], WorkingNode]) -> NoReturn:
+def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
     """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
     # Two networks share a robot's cores, each in a process of its own: a thread of PyTorch that
     # waits by spinning, as they do, slows the other one tenfold. Read when PyTorch is loaded.

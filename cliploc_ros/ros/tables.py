@@ -13,6 +13,9 @@ from cliploc_ros.ros.parameters import ParameterRow, Value
 TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 
+_AUTOSTART = ParameterRow(
+    'autostart', True, 'Configure and activate by itself; false: a lifecycle manager does.',
+    read_only=True)
 _IMAGE_TRANSPORT = ParameterRow(
     'image_transport', 'raw', "Listen to 'image' or to 'image/compressed'.",
     choices=TRANSPORTS, read_only=True)
@@ -36,6 +39,7 @@ DETECTOR = (
     _DEVICE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
+    _AUTOSTART,
 )
 
 RELOCALIZER = (
@@ -77,6 +81,7 @@ RELOCALIZER = (
     _DEVICE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
+    _AUTOSTART,
     ParameterRow('rectified', False, 'The image is rectified: take P of camera_info and no '
                  'distortion.'),
     ParameterRow('base_frame', '', "Publish the pose of this frame; empty: the camera's."),

@@ -3,7 +3,6 @@
 """Work beside the executor: the node answers while a network runs."""
 
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
@@ -98,42 +97,3 @@ class LatestOnly[T]:
         with self._lock:
             item = self._items.pop()
         self._work(item)
-
-
-class Retrying[T]:
-    """Something that is made when first needed, and again after it failed.
-
-    Parameters
-    ----------
-    make : callable
-        Makes it, or raises CliplocError.
-    pause_s : float
-        After a failure the same error is raised for so long, without another attempt [s].
-    """
-
-    def __init__(self, make: Callable[[], T], pause_s: float = 0.0) -> None:
-        self._make = make
-        self._pause_s = pause_s
-        self._made: list[T] = []
-        self._error: CliplocError | None = None
-        self._failed_at = 0.0
-
-    def get(self) -> T:
-        """Return it.
-
-        Raises
-        ------
-        CliplocError
-            It cannot be made; mend what the message names and ask again.
-        """
-        if self._made:
-            return self._made[0]
-        if self._error is not None and time.monotonic() - self._failed_at < self._pause_s:
-            # a traceback grows with every raise, and would keep what its callers hold
-            raise self._error.with_traceback(None)
-        try:
-            self._made.append(self._make())
-        except CliplocError as error:
-            self._error, self._failed_at = error, time.monotonic()
-            raise
-        return self._made[0]

@@ -63,6 +63,17 @@ class Process:
         status = Path(f'/proc/{self._popen.pid}/status').read_text()
         return int(status.split(f'{field}:')[1].split()[0]) / 1024
 
+    def descriptors(self):
+        """Return how many files, sockets and the like are open."""
+        return len(list(Path(f'/proc/{self._popen.pid}/fd').iterdir()))
+
+    def wait_for_import(self, library):
+        """Wait until a part of a library is in memory: its loading has begun."""
+        maps = Path(f'/proc/{self._popen.pid}/maps')
+        wait_for(lambda: not self.alive or f'/{library}/' in maps.read_text(),
+                 f'{library} to be loaded')
+        assert self.alive, self.output()
+
     def cpu_s(self):
         """Processor time used so far [s]."""
         fields = Path(f'/proc/{self._popen.pid}/stat').read_text().rsplit(')', 1)[1].split()

@@ -26,7 +26,7 @@ def recording(tmp_path, monkeypatch):
 def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
     print()
     start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
-        'detector ready')
+        'ready after')
     start('nodes.relocalizer', parameters={
         'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid',
         'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',

@@ -103,7 +103,7 @@ def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, lim
     print()
     recording = convert('images', monkeypatch=monkeypatch)
     start('nodes.detector', parameters={
-        'model': shared_data / 'weights/yolov8n_coco.pt'}).wait_for_output('detector ready')
+        'model': shared_data / 'weights/yolov8n_coco.pt'}).wait_for_output('ready after')
     start('nodes.relocalizer', parameters={
         'map_file': office / 'map.yaml', 'matching': 'class'}).wait_for_output('ready after')
     tester.connect()
@@ -122,7 +122,7 @@ def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, lim
 def test_the_detector_works_only_while_something_listens(shared_data, start, tester):
     detector = start('nodes.detector', parameters={
         'model': shared_data / 'weights/yolov8n_coco.pt'})
-    detector.wait_for_output('detector ready')
+    detector.wait_for_output('ready after')
     tester.wait(lambda: tester.count_publishers('/detections') == 2, 'the detector to publish')
     assert tester.images.get_subscription_count() == 0
     with tester.hearing_detections() as detected:

@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-import gc
 import threading
 import time
-import weakref
 from concurrent.futures import CancelledError
 
 import pytest
@@ -11,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError
-from cliploc_ros.ros.worker import LatestOnly, Retrying, Worker
+from cliploc_ros.ros.worker import LatestOnly, Worker
 
 PATIENCE_S = 20.0
 
@@ -249,87 +247,3 @@ def test_offers_of_many_threads_are_all_accounted_for(worker):
     assert len(done) + latest.dropped == 1000
     assert len(set(done)) == len(done)
     assert done[-1] % 250 == 249, 'the last item of some thread comes last'
-
-
-class Maker:
-    """Fails a number of times, then makes; remembers when it was asked [s]."""
-
-    def __init__(self, failures, error=ModelError):
-        self._failures, self._error, self.attempts = failures, error, []
-
-    def __call__(self):
-        self.attempts.append(time.monotonic())
-        if len(self.attempts) <= self._failures:
-            raise self._error(f'attempt {len(self.attempts)}')
-        return object()
-
-
-def test_what_was_made_is_kept():
-    make = Maker(failures=0)
-    kept = Retrying(make, pause_s=3600.0)
-    assert make.attempts == []
-    assert kept.get() is kept.get()
-    assert len(make.attempts) == 1
-
-
-def test_something_false_is_made_once_too():
-    made = []
-    kept = Retrying(lambda: made.append(1))
-    assert kept.get() is None and kept.get() is None
-    assert made == [1]
-
-
-def test_after_a_failure_it_is_made_anew():
-    make = Maker(failures=2)
-    retrying = Retrying(make)
-    for attempt in (1, 2):
-        with pytest.raises(ModelError, match=f'attempt {attempt}'):
-            retrying.get()
-    assert retrying.get() is retrying.get()
-    assert len(make.attempts) == 3
-
-
-def test_in_the_pause_the_same_error_comes_without_an_attempt():
-    make = Maker(failures=1)
-    retrying = Retrying(make, pause_s=3600.0)
-    for _ in range(5):
-        with pytest.raises(ModelError, match='attempt 1'):
-            retrying.get()
-    assert len(make.attempts) == 1
-
-
-def test_in_the_pause_nothing_is_kept_of_those_who_asked():
-    retrying, images = Retrying(Maker(failures=1), pause_s=3600.0), []
-
-    def ask():
-        image = threading.Event()  # anything that can be referred to weakly
-        images.append(weakref.ref(image))
-        with pytest.raises(ModelError):
-            retrying.get()
-    for _ in range(5):
-        ask()
-    gc.collect()
-    # one traceback tells where the error is from
-    assert sum(image() is not None for image in images) <= 1
-
-
-def test_after_the_pause_it_is_tried_again(wait):
-    pause_s, make, made = 0.05, Maker(failures=2), []
-    retrying = Retrying(make, pause_s)
-
-    def attempt():
-        try:
-            made.append(retrying.get())
-        except ModelError:
-            time.sleep(0.001)
-    wait(lambda: made, 'the third attempt', attempt)
-    first, second, third = make.attempts
-    assert second - first >= pause_s and third - second >= pause_s
-
-
-def test_a_defect_of_the_maker_is_no_reason_to_pause():
-    make = Maker(failures=1, error=ValueError)
-    retrying = Retrying(make, pause_s=3600.0)
-    with pytest.raises(ValueError, match='attempt 1'):
-        retrying.get()
-    assert retrying.get() is retrying.get()

@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Both nodes are managed: every transition over the real services, in any order."""
+
+import signal
+
+import numpy as np
+import pytest
+from conftest import PROJECT, class_matching, make_frame
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+# What each transition makes of each state where it is possible.
+TRANSITIONS = {('unconfigured', 'configure'): 'inactive', ('inactive', 'activate'): 'active',
+               ('active', 'deactivate'): 'inactive', ('inactive', 'cleanup'): 'unconfigured'}
+IDS = {'configure': Transition.TRANSITION_CONFIGURE, 'activate': Transition.TRANSITION_ACTIVATE,
+       'deactivate': Transition.TRANSITION_DEACTIVATE, 'cleanup': Transition.TRANSITION_CLEANUP}
+SHUTDOWN_IDS = {'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+                'inactive': Transition.TRANSITION_INACTIVE_SHUTDOWN,
+                'active': Transition.TRANSITION_ACTIVE_SHUTDOWN}
+WAY_TO = {'unconfigured': (), 'inactive': ('configure',), 'active': ('configure', 'activate')}
+
+
+class Manager:
+    """Drives one node as Nav2's lifecycle manager does."""
+
+    def __init__(self, tester, name):
+        self._tester = tester
+        self._change = tester.create_client(ChangeState, f'/{name}/change_state')
+        self._get = tester.create_client(GetState, f'/{name}/get_state')
+        for client in (self._change, self._get):
+            tester.wait(client.service_is_ready, client.srv_name)
+
+    def change(self, transition_id):
+        request = ChangeState.Request(transition=Transition(id=transition_id))
+        return self._tester.answer(self._change.call_async(request)).success
+
+    def do(self, *transitions):
+        for transition in transitions:
+            assert self.change(IDS[transition]), transition
+
+    @property
+    def state(self):
+        return self._tester.answer(
+            self._get.call_async(GetState.Request())).current_state.label
+
+    def close(self):
+        for client in (self._change, self._get):
+            self._tester.destroy_client(client)
+
+
+@pytest.fixture
+def manage(start, tester):
+    """Start a node that waits for its manager; return both."""
+    managers = []
+
+    def run(name, **parameters):
+        process = start(f'nodes.{name}', parameters={'autostart': 'false', **parameters})
+        managers.append(Manager(tester, name))
+        return process, managers[-1]
+    yield run
+    for manager in managers:
+        manager.close()
+
+
+def with_networks(name, folder):
+    """Parameters that make a node load its real, small networks."""
+    if name == 'detector':
+        return {'model': ASSETS / 'yolo.pt'}
+    return {'map_file': ASSETS / 'map.yaml', 'clip_model': ASSETS / 'clip.json',
+            'clip_pretrained': ASSETS / 'clip.safetensors', 'cache_dir': folder}
+
+
+@pytest.mark.parametrize('name', ['detector', 'relocalizer'])
+def test_a_hundred_transitions_in_any_order_leak_nothing(manage, tmp_path, name):
+    process, manager = manage(name, **with_networks(name, tmp_path))
+    rng, state, measured = np.random.default_rng(0), 'unconfigured', []
+    for number in range(100):
+        allowed = [wanted for start, wanted in TRANSITIONS if start == state]
+        transition = str(rng.choice(allowed if rng.random() < 0.7 else list(IDS)))
+        possible = transition in allowed
+        assert manager.change(IDS[transition]) == possible, (number, state, transition)
+        state = TRANSITIONS.get((state, transition), state)
+        assert manager.state == state
+        if state == 'unconfigured' and possible:
+            measured.append((process.memory_mib(), process.descriptors()))
+    assert len(measured) >= 5
+    # the first round loads PyTorch itself, which stays
+    (before_mib, before_fds), (after_mib, after_fds) = measured[1], measured[-1]
+    print(f'\n{name} after {len(measured)} cleanups: {before_mib:.0f} to {after_mib:.0f} MiB, '
+          f'{before_fds} to {after_fds} file descriptors')
+    assert after_mib - before_mib < 0.05 * before_mib
+    assert after_fds <= before_fds
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('state', [*WAY_TO, 'finalized'])
+@pytest.mark.parametrize('name', ['detector', 'relocalizer'])
+def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
+    parameters = class_matching(room_map) if name == 'relocalizer' else with_networks(name, '')
+    process, manager = manage(name, **parameters)
+    if state == 'finalized':
+        assert manager.change(SHUTDOWN_IDS['unconfigured'])
+    else:
+        manager.do(*WAY_TO[state])
+    assert manager.state == state
+    code, seconds = process.stop(signal.SIGTERM)
+    assert code == 0, process.output()
+    assert seconds < 2.0
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('state', WAY_TO)
+def test_shutdown_works_from_every_state(manage, room_map, state):
+    process, manager = manage('relocalizer', **class_matching(room_map))
+    manager.do(*WAY_TO[state])
+    assert manager.change(SHUTDOWN_IDS[state])
+    assert manager.state == 'finalized'
+    assert not manager.change(IDS['configure'])
+    assert process.alive
+
+
+def test_sigterm_while_weights_load(start, tmp_path):
+    for name in ('detector', 'relocalizer'):
+        process = start(f'nodes.{name}', parameters=with_networks(name, tmp_path))
+        process.wait_for_import('torch')
+        code, seconds = process.stop(signal.SIGTERM)
+        assert code == 0, process.output()
+        assert seconds < 2.0
+        assert 'Traceback' not in process.output()
+
+
+def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
+    _, manager = manage('relocalizer', **class_matching(room_map))
+    tester.connect()
+    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    manager.do('configure')
+    assert 'the node is inactive' in tester.answer(tester.ask()).message
+    assert tester.listened_to() == 0
+    manager.do('activate')
+    assert tester.relocalize(make_frame()).success
+    manager.do('deactivate')
+    tester.answer(tester.ask_reinitialize())
+    assert 'the node is inactive' in tester.answer(tester.ask()).message
+
+
+def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
+    _, manager = manage('relocalizer', **class_matching(room_map))
+    tester.connect()
+    manager.do('configure', 'activate')
+    future = tester.ask()
+    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
+    manager.do('deactivate')
+    answer = tester.answer(future)
+    assert not answer.success
+    assert answer.message == 'the node was deactivated'
+    tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')
+
+
+def test_a_failing_configure_can_be_tried_again(manage, tester, room_map, tmp_path):
+    path = tmp_path / 'map.yaml'
+    process, manager = manage('relocalizer', **class_matching(path))
+    tester.connect()
+    assert not manager.change(IDS['configure'])
+    assert manager.state == 'unconfigured'
+    assert f'{path}: No such file' in process.output()
+    assert f'{path}: No such file' in tester.answer(tester.ask()).message
+    path.write_text(room_map.read_text())
+    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    manager.do('configure', 'activate')
+    assert tester.relocalize(make_frame()).success
+
+
+def test_who_takes_over_a_node_that_started_itself_is_its_manager(own_relocalizer, tester):
+    own_relocalizer()
+    assert tester.relocalize(make_frame()).success
+    manager = Manager(tester, 'relocalizer')
+    manager.do('deactivate', 'cleanup')
+    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    assert manager.state == 'unconfigured'
+    manager.close()
+
+
+def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
+    weights = tmp_path / 'yolo.pt'
+    process = start('nodes.detector', parameters={'model': weights})
+    process.wait_for_output('[ERROR]')
+    assert str(weights) in process.output()
+    weights.symlink_to(ASSETS / 'yolo.pt')
+    process.wait_for_output('ready after')
+    with tester.hearing_detections() as detected:
+        tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
+
+
+def test_an_inactive_detector_costs_nothing(manage, tester):
+    _, manager = manage('detector', **with_networks('detector', ''))
+    with tester.hearing_detections() as detected:
+        manager.do('configure')
+        assert tester.images.get_subscription_count() == 0
+        manager.do('activate')
+        tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
+        manager.do('deactivate')
+        tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
