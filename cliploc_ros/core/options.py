@@ -36,6 +36,14 @@ class RelocalizerOptions:
     time_budget_s : float
         The search stops after this long [s]; what is cut short, but for auto, is refused, and
         says how far it came.
+    height_range_m : tuple of float
+        The least and the greatest height of the camera in the map [m]; poses outside are left.
+    max_tilt_deg : float
+        How far the camera may be turned or tipped off upright [deg], 180 is any way; where the
+        vertical is known, how far it may be off at a pose from three points.
+    vertical_deviation_deg : float
+        Standard deviation of a known vertical [deg], 1 sigma. Where one is known, auto samples
+        two candidates in place of three.
     refine : bool
         Improve the best hypotheses on all of their inliers, before the best of them is chosen;
         the paper does not.
@@ -59,6 +67,9 @@ class RelocalizerOptions:
     iou_threshold: float = 0.2
     random_seed: int = 0
     time_budget_s: float = math.inf
+    height_range_m: tuple[float, float] = (-math.inf, math.inf)
+    max_tilt_deg: float = 180.0
+    vertical_deviation_deg: float = 1.0
     refine: bool = True
     min_inliers: int = 4
     min_evidence: float = 4.0
@@ -75,6 +86,9 @@ class RelocalizerOptions:
         _check_range('iterations', self.iterations, 1, 1_000_000)
         _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)
         _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
+        _check_height_range(self.height_range_m)
+        _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
+        _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
         _check_range('min_inliers', self.min_inliers, 3, math.inf)
         _check_range('min_evidence', self.min_evidence, 0.0, math.inf)
         _check_range('max_rival', self.max_rival, 0.0, 1.0)
@@ -93,3 +107,8 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')
+
+
+def _check_height_range(heights: tuple[float, float]) -> None:
+    if len(heights) != 2 or not heights[0] < heights[1]:
+        raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater height')

@@ -23,8 +23,8 @@ from cliploc_ros.core.ellipsoid import project_ellipsoid
 from cliploc_ros.core.scoring import verify
 
 # Of an edge, as a share of its box's mean side, and on the plane z = 1: boxes of detectors and of
-# fitted maps are off by a tenth or so, and by a pixel or so at least.
-RELATIVE_DEVIATION = 0.1
+# fitted maps are off by so much, in the median, and by a pixel or so at least.
+RELATIVE_DEVIATION = 0.06
 LEAST_DEVIATION = 0.003
 #: What refine takes for a vertical that is not known.
 VERTICAL_UNKNOWN = np.zeros(7)
@@ -65,6 +65,8 @@ def refine(scene, rotation, translation, vertical, workspace):
     information : ndarray (6, 6)
         Of the camera's position [m] and its rotation about the map's axes [rad].
     """
+    # so many boxes fix a pose
+    least = 2 if vertical[6] > 0.0 else 3
     score = verify(scene, rotation, translation, workspace)
     best_score = score
     information = np.zeros((6, 6))
@@ -73,7 +75,7 @@ def refine(scene, rotation, translation, vertical, workspace):
     landmarks = np.empty(len(workspace.landmarks), dtype=np.int64)
     for _ in range(_ROUNDS):
         count = _one_to_one(workspace, detections, landmarks)
-        if count < 3:
+        if count < least:
             break
         _minimize(scene, detections[:count], landmarks[:count], vertical, new_rotation,
                   new_translation)
@@ -88,7 +90,7 @@ def refine(scene, rotation, translation, vertical, workspace):
             break
     score = verify(scene, rotation, translation, workspace)
     count = _one_to_one(workspace, detections, landmarks)
-    if count >= 3:
+    if count >= least:
         _inform(scene, detections[:count], landmarks[:count], vertical, rotation, translation,
                 information)
     return score, information

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +17,14 @@ from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.ellipsoid import project_ellipsoids
+from cliploc_ros.core.finalists import as_found, covariance_of, matches_of, meetings_of, refined
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, refine
 from cliploc_ros.core.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
-from cliploc_ros.core.scoring import Scene, Workspace, make_scene, verify
+from cliploc_ros.core.scoring import Scene, Workspace, make_scene
+from cliploc_ros.core.screening import Prior
 from cliploc_ros.core.search import (
     MAX_DISTINCT,
     Leaders,
@@ -32,11 +33,14 @@ from cliploc_ros.core.search import (
     search_exhaustively,
     search_progressively,
     search_samples,
+    search_vertically,
 )
-from cliploc_ros.core.transforms import invert_transform, make_transform
-from cliploc_ros.core.uncertainty import box_scatter, pose_covariance, refined_covariance
 from cliploc_ros.errors import OptionsError
 
+# The map's third axis is up (REP 103), and the optical frame's second is down.
+_UP_IN_MAP = (0.0, 0.0, 1.0)
+_UPRIGHT = (0.0, -1.0, 0.0)
+_UNIT_TOLERANCE = 1e-3
 # So many of the best are refined: what is worse has never led afterwards on real frames.
 _REFINED = 32
 
@@ -145,6 +149,7 @@ class Relocalizer:
         list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
         list(search_exhaustively(scene, Leaders.none_yet()))
         list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
+        list(search_vertically(scene, compatible_pairs(scene), Leaders.none_yet(), Prior()))
         refine(scene, np.eye(3), np.zeros(3), VERTICAL_UNKNOWN, Workspace.allocate(3))
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
@@ -165,8 +170,8 @@ class Relocalizer:
         Raises
         ------
         OptionsError
-            The matching type needs similarities that are missing or of the wrong shape, or not
-            exactly one observation was given.
+            The matching type needs similarities that are missing or of the wrong shape, the
+            vertical is no unit vector, or not exactly one observation was given.
         """
         if len(observations) != 1:
             raise OptionsError(f'one observation at a time, not {len(observations)}')
@@ -178,15 +183,33 @@ class Relocalizer:
         sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1)
         potential &= sound[:, None]
         pairs = candidates.pairs[sound[candidates.detections]]
-        if _too_few(pairs):
+        vertical = self._vertical(observation)
+        size = SAMPLE_SIZE - 1 if vertical[6] > 0.0 else SAMPLE_SIZE
+        if _distinct(pairs) < size:
             return Relocalization(
-                False, f'{len(bboxes)} detections give fewer than three different '
+                False, f'{len(bboxes)} detections give fewer than {size} different '
                 'correspondence candidates', stamp_ns=observation.stamp_ns)
         scene = make_scene(np.where(sound[:, None], bboxes, 1.0), self._map.centers, self._shapes,
                            potential, pairs, self._options.iou_threshold)
         leaders = Leaders.none_yet(_REFINED if self._options.refine else MAX_DISTINCT)
-        progress, samples = self._search(scene, leaders, start)
-        return self._conclude(observation, scene, leaders, progress, samples, start)
+        progress, samples = self._search(scene, vertical, leaders, start)
+        return self._conclude(observation, scene, vertical, leaders, progress, samples, start)
+
+    def _vertical(self, observation: Observation) -> NDArray[np.float64]:
+        """Return the vertical as refine takes it; the paper's algorithms know of none."""
+        up = observation.up_in_camera
+        if up is None or self._options.algorithm != 'auto':
+            return VERTICAL_UNKNOWN
+        if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
+            raise OptionsError(f'up_in_camera: {up} is no unit vector')
+        return np.array([*up, *_UP_IN_MAP, np.radians(self._options.vertical_deviation_deg)])
+
+    def _prior(self, vertical: NDArray[np.float64]) -> Prior:
+        """Return what the search may take for granted."""
+        up_in_camera = tuple(vertical[:3]) if vertical[6] > 0.0 else _UPRIGHT
+        low, high = self._options.height_range_m
+        return Prior(up_in_camera, _UP_IN_MAP, low, high,
+                     np.radians(self._options.max_tilt_deg))
 
     def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
         """Return the candidates in the sampler's order, and the verification mask (n, L)."""
@@ -217,24 +240,25 @@ class Relocalizer:
             candidates = association.joined(candidates, of_class, shape)
         return candidates, potential
 
-    def _search(self, scene: Scene, leaders: Leaders, start: float
-                ) -> tuple[Progress, NDArray[np.int64] | None]:
+    def _search(self, scene: Scene, vertical: NDArray[np.float64], leaders: Leaders,
+                start: float) -> tuple[Progress, NDArray[np.int64] | None]:
         """Run the algorithm that the options name, as far as time allows.
 
         Returns how far it came, and the samples (t, 3) where these were drawn.
         """
         options = self._options
-        limit, samples = math.inf, None
+        prior, limit, samples = self._prior(vertical), math.inf, None
         if options.algorithm == 'auto':
             limit = options.iterations
-            search = search_progressively(scene, compatible_pairs(scene), leaders)
+            try_all = search_vertically if vertical[6] > 0.0 else search_progressively
+            search = try_all(scene, compatible_pairs(scene), leaders, prior)
         elif options.algorithm == 'bf':
-            search = search_exhaustively(scene, leaders)
+            search = search_exhaustively(scene, leaders, prior)
         else:
             draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
             seed = options.random_seed if options.random_seed >= 0 else None
             samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-            search = search_samples(scene, samples, leaders)
+            search = search_samples(scene, samples, leaders, prior)
         progress = Progress(0, 1.0)
         for step in search:
             progress = step
@@ -242,112 +266,36 @@ class Relocalizer:
                 break
         return progress, samples
 
-    def _conclude(self, observation: Observation, scene: Scene, leaders: Leaders,
-                  progress: Progress, samples: NDArray[np.int64] | None, start: float
-                  ) -> Relocalization:
+    def _conclude(self, observation: Observation, scene: Scene, vertical: NDArray[np.float64],
+                  leaders: Leaders, progress: Progress, samples: NDArray[np.int64] | None,
+                  start: float) -> Relocalization:
         """Turn the leaders into a result, and decide whether to believe the first."""
-        finalists = _refined(scene, leaders) if self._options.refine else _as_found(leaders)
+        finalists = refined(scene, leaders, vertical) if self._options.refine \
+            else as_found(leaders)
         if not finalists:
             return Relocalization(False, 'no pose explains any three detections',
                                   tried=progress.tried, coverage=progress.coverage,
                                   search_ms=_elapsed_ms(start), stamp_ns=observation.stamp_ns)
-        hypotheses = tuple(Hypothesis(one.map_from_camera, one.score) for one in finalists)
-        explained = [_matches(scene, one) for one in finalists]
-        covariance = _covariance(scene, finalists[0], explained[0])
+        best, hypotheses = finalists[0], tuple(Hypothesis(one.map_from_camera, one.score)
+                                               for one in finalists)
+        explained = [matches_of(scene, one) for one in finalists]
+        covariance = covariance_of(scene, best, explained[0], vertical)
         bboxes = observation.detections.bboxes_xyxy
         supports = [support(matches, bboxes) for matches in explained]
         evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
             coverage=progress.coverage, tried=progress.tried,
-            meetings=_meetings(scene, explained[0], progress, samples))
+            meetings=meetings_of(scene, best, explained[0], progress, samples))
         reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
-                              progress.tried, finalists[0].iteration,
-                              progress.coverage, _elapsed_ms(start), observation.stamp_ns,
-                              evidence.strength)
+                              progress.tried, best.iteration, progress.coverage,
+                              _elapsed_ms(start), observation.stamp_ns, evidence.strength)
 
 
-class _Finalist(NamedTuple):
-    """One of the best hypotheses at places that differ."""
-
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    score: float
-    iteration: int
-    sample: NDArray[np.int64]
-    information: NDArray[np.float64] | None = None
-
-    @property
-    def map_from_camera(self) -> NDArray[np.float64]:
-        """Return the pose (4, 4)."""
-        return invert_transform(make_transform(self.rotation, self.translation))
-
-
-def _as_found(leaders: Leaders) -> list[_Finalist]:
-    """Return the leaders, best first."""
-    return [_Finalist(leaders.rotations[row], leaders.translations[row],
-                      float(leaders.scores[row]), int(leaders.iterations[row]),
-                      leaders.samples[row]) for row in leaders.ranked()]
-
-
-def _refined(scene: Scene, leaders: Leaders) -> list[_Finalist]:
-    """Return the best after refinement, best first; what went to the same place is one."""
-    workspace = Workspace.allocate(len(scene.bearings))
-    refined = []
-    for one in _as_found(leaders):
-        rotation, translation = one.rotation.copy(), one.translation.copy()
-        score, information = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
-        refined.append(one._replace(rotation=rotation, translation=translation,
-                                    score=float(score), information=information))
-    distinct: list[_Finalist] = []
-    for one in sorted(refined, key=lambda one: -one.score):
-        if not any(same_place(one.rotation, one.translation, better.rotation, better.translation)
-                   for better in distinct):
-            distinct.append(one)
-    return distinct[:MAX_DISTINCT]
-
-
-def _matches(scene: Scene, pose: _Finalist) -> tuple[Match, ...]:
-    """Return the inliers of a pose."""
-    workspace = Workspace.allocate(len(scene.bearings))
-    verify(scene, pose.rotation, pose.translation, workspace)
-    return tuple(Match(int(row), int(workspace.landmarks[row]), float(workspace.ious[row]))
-                 for row in np.nonzero(workspace.landmarks >= 0)[0])
-
-
-def _meetings(scene: Scene, matches: tuple[Match, ...], progress: Progress,
-              samples: NDArray[np.int64] | None) -> int:
-    """Return how many of the samples tried hold nothing but inliers."""
-    landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
-    for match in matches:
-        landmark_of[match.detection] = match.landmark
-    is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
-    if samples is None:  # all samples of the first candidates were tried
-        return math.comb(int(is_inlier[:progress.reach].sum()), SAMPLE_SIZE)
-    tried = samples[:round(progress.coverage * len(samples))]
-    return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
-
-
-def _covariance(scene: Scene, pose: _Finalist, matches: tuple[Match, ...]
-                ) -> NDArray[np.float64]:
-    """Return the covariance of a pose: of its refinement, or of the sample it was made from."""
-    detections = [match.detection for match in matches]
-    landmarks = [match.landmark for match in matches]
-    map_from_camera = pose.map_from_camera
-    outlines = project_ellipsoids(invert_transform(map_from_camera), scene.centers[landmarks],
-                                  scene.shapes[landmarks])
-    scatter = box_scatter(outlines, scene.box_ellipses[detections])
-    if pose.information is not None:
-        return refined_covariance(pose.information, scatter)
-    sampled = scene.pairs[pose.sample]
-    return pose_covariance(map_from_camera, scene.centers[sampled[:, 1]],
-                           2.0 * scene.box_ellipses[sampled[:, 0], 2:], scatter)
-
-
-def _too_few(pairs: NDArray[np.int64]) -> bool:
-    """Tell whether no three candidates can differ in detection and in landmark."""
-    return min(len(np.unique(pairs[:, 0])), len(np.unique(pairs[:, 1]))) < SAMPLE_SIZE
+def _distinct(pairs: NDArray[np.int64]) -> int:
+    """Return of how many candidates, at most, both detections and landmarks can differ."""
+    return min(len(np.unique(pairs[:, 0])), len(np.unique(pairs[:, 1])))
 
 
 def _elapsed_ms(start: float) -> float:

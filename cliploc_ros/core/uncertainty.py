@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.refinement import RELATIVE_DEVIATION
+from cliploc_ros.core.refinement import RELATIVE_DEVIATION, VERTICAL_UNKNOWN
 from cliploc_ros.core.transforms import invert_transform
 
 # The scatter of box centres, as a share of the box, before anything is seen, and how many
@@ -48,22 +48,25 @@ def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64]
 
 
 def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.float64],
-                    box_sizes: NDArray[np.float64], scatter: float) -> NDArray[np.float64]:
-    """Return the covariance of a camera pose that three box centres fix.
+                    box_sizes: NDArray[np.float64], scatter: float,
+                    vertical: NDArray[np.float64] = VERTICAL_UNKNOWN) -> NDArray[np.float64]:
+    """Return the covariance of a pose that three box centres fix, or two and the vertical.
 
-    The pose of P3P has no error but that of its three bearings. These scatter with the size of
-    their boxes, by as much as the inliers' boxes miss the projected landmarks; the linearized
-    projection carries the scatter to the pose.
+    A minimal pose has no error but that of its bearings, and of the vertical. Bearings scatter
+    with the size of their boxes, by as much as the inliers' boxes miss the projected landmarks;
+    the linearized projection carries the scatter to the pose.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
-    centers : ndarray (3, 3)
+    centers : ndarray (m, 3)
         The sampled landmarks' centres in the map [m].
-    box_sizes : ndarray (3, 2)
+    box_sizes : ndarray (m, 2)
         Width and height of the sampled boxes on the plane z = 1.
     scatter : float
         See box_scatter.
+    vertical : ndarray (7,), optional
+        See refine.
 
     Returns
     -------
@@ -81,6 +84,9 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
     variances = _VARIANCE_INFLATION * np.maximum(box_sizes.ravel() * scatter, _MIN_DEVIATION)**2
     information = (jacobian.T @ (jacobian / variances[:, None])
                    + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
+    if vertical[6] > 0.0:  # it tells of turns about level axes
+        up = vertical[3:6]
+        information[3:, 3:] += (np.eye(3) - np.outer(up, up)) / vertical[6] ** 2
     covariance = np.linalg.inv(information)
     return (covariance + covariance.T) / 2
 

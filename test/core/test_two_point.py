@@ -6,12 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core import association
-from cliploc_ros.core.compatibility import compatible_pairs
-from cliploc_ros.core.scoring import make_scene
-from cliploc_ros.core.screening import Prior
-from cliploc_ros.core.search import Leaders, search_vertically
-from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.two_point import solve_two_point
 
 coordinates = st.floats(-5.0, 5.0)
@@ -90,44 +84,3 @@ def test_two_points_level_with_the_camera_have_no_pose():
     bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0, 1]]))
     points = np.array([[0.0, 3, 1], [1, 3, 1]])
     assert len(solve_two_point(bearings, points, *UP)[0]) == 0
-
-
-def vertical_with_error(up_in_camera, error_deg, rng):
-    """The vertical, turned by a normally distributed angle about a level axis."""
-    axis = rng.normal(size=3)
-    axis -= axis @ up_in_camera * up_in_camera
-    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(error_deg)
-                                * rng.normal())
-    return turn.apply(up_in_camera)
-
-
-@pytest.mark.parametrize(('error_deg', 'least'), [(0, (0.75, 0.81, 0.83)),
-                                                  (1, (0.75, 0.80, 0.82)),
-                                                  (3, (0.68, 0.80, 0.82))])
-def test_queries_are_solved_with_a_known_vertical(error_deg, least, office_map, queries, observe):
-    """Without refinement; candidates of CLIP and of equal class, the camera at 0.8 to 2.2 m."""
-    rng, errors_m = np.random.default_rng(error_deg), []
-    for frame in queries.main_frames():
-        observation = observe(frame)
-        of_class = association.same_class(frame.class_ids, office_map.class_ids)
-        nearest = association.balanced_order(association.nearest_candidates(
-            frame.similarities, 3))
-        pairs = association.joined(nearest, association.class_candidates(of_class),
-                                   of_class.shape).pairs
-        potential = of_class | association.candidate_mask(nearest, of_class.shape)
-        scene = make_scene(observation.camera.normalize_bboxes(frame.bboxes_xyxy),
-                           office_map.centers, office_map.shapes, potential, pairs, 0.2)
-        up = vertical_with_error(frame.map_from_camera[2, :3], error_deg, rng)
-        leaders = Leaders.none_yet()
-        list(search_vertically(scene, compatible_pairs(scene), leaders,
-                               Prior(tuple(up), (0.0, 0.0, 1.0), 0.8, 2.2)))
-        ranked = leaders.ranked()
-        errors_m.append(np.inf if len(frame) < 3 or not len(ranked) else pose_error(
-            invert_transform(make_transform(leaders.rotations[ranked[0]],
-                                            leaders.translations[ranked[0]])),
-            frame.map_from_camera)[0])
-    rates = [np.mean(np.array(errors_m) < limit) for limit in (0.25, 0.5, 1.0)]
-    print(f'\nvertical off by {error_deg} deg: success '
-          f'{" / ".join(f"{rate:.2f}" for rate in rates)} at 0.25 / 0.5 / 1 m, median '
-          f'{np.median(errors_m):.3f} m')
-    assert (np.array(rates) >= least).all()
