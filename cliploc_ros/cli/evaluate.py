@@ -4,6 +4,7 @@
 
 import argparse
 import logging
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods all --trials 5
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
   evaluate --queries office.npz --map office.yaml --methods hybrid_b-prosac --tune
+  evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
 """
 
 
@@ -68,6 +70,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='choose k, IoU threshold, iterations and min_evidence of one method '
                         'on half of the queries, and report on the other half')
     _add_paper_options(parser)
+    _add_sensor_options(parser)
     _add_recording_options(parser)
     return parser
 
@@ -82,6 +85,18 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--sweep', type=_positive_int, nargs='*', metavar='N',
                        default=[50, 100, 200, 1000],
                        help='numbers of iterations to compare (50 100 200 1000)')
+
+
+def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what is known besides the image')
+    group.add_argument('--gravity', action='store_true',
+                       help=f"'{AUTO}' knows the vertical, of the true poses; the paper's methods "
+                       'do not ask for it')
+    group.add_argument('--gravity-noise-deg', type=_angle, default=0.0, metavar='DEG',
+                       help='and it is off by so much (standard deviation; 0)')
+    group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+                       default=(-math.inf, math.inf),
+                       help='heights in the map that a camera may have [m]')
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
@@ -111,6 +126,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.options import RelocalizerOptions
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.sensors import with_vertical
     from cliploc_ros.evaluation.session import Session
     from cliploc_ros.evaluation.trials import make_queries
 
@@ -118,13 +134,17 @@ def evaluate(options: argparse.Namespace) -> int:
     landmark_map = LandmarkMap.from_file(options.map)
     paper = RelocalizerOptions(
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
-        random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3)
+        random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
+        height_range_m=tuple(options.height_range),
+        vertical_deviation_deg=max(1.0, options.gravity_noise_deg))
     methods = parse_methods(options.methods, paper, len(landmark_map))
     if options.tune and len(methods) != 1:
         raise OptionsError(f'--tune is for one method, not {len(methods)}: name it by --methods')
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)
     queries = make_queries(recorded, landmark_map, options.frames == 'all')
+    if options.gravity:
+        queries = with_vertical(queries, options.gravity_noise_deg, options.seed)
     session = Session(landmark_map, queries, options.out, options.trials, options.workers)
     if options.tune:
         session.tune(methods[0], options.seed)
@@ -183,6 +203,13 @@ def _frames(options: argparse.Namespace) -> 'Frames':
     return bag_frames(options.bag, BagTopics(options.image, options.camera_info,
                                              options.ground_truth, options.rectified),
                       None if mount is None else mount_from_numbers(mount))
+
+
+def _angle(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value <= 45.0:
+        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 45 degrees')
+    return value
 
 
 def _positive_int(text: str) -> int:

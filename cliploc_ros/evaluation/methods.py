@@ -45,7 +45,8 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         Names of the paper's methods, 'all' of these, 'auto', or files in YAML: a mapping of
         names to options, each of which may build on another method by 'base'.
     paper : RelocalizerOptions
-        What holds for the paper's methods besides matching and algorithm.
+        What holds for the paper's methods besides matching and algorithm; of auto, its seed and
+        what is known of vertical and height.
     landmarks : int
         Size of the map: k is at most that.
 
@@ -74,7 +75,9 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
 
 def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
     if name == AUTO:
-        options = RelocalizerOptions(random_seed=paper.random_seed)
+        options = RelocalizerOptions(
+            random_seed=paper.random_seed, height_range_m=paper.height_range_m,
+            vertical_deviation_deg=paper.vertical_deviation_deg)
     elif name in PAPER_METHODS:
         matching, algorithm = name.split('_')
         options = replace(paper, matching=matching, algorithm=algorithm, refine=False)
@@ -108,11 +111,21 @@ def _made(path: Path, name: str, values: Any, paper: RelocalizerOptions, landmar
     for option, value in changes.items():
         if option not in _FIELDS:
             raise OptionsError(f"{where}: '{option}' is none of base, {', '.join(_FIELDS)}")
-        kind = type(_FIELDS[option].default)
-        fits = isinstance(value, int | float if kind is float else kind)
-        if not fits or (isinstance(value, bool) and kind is not bool):
-            raise OptionsError(f'{where}: {option}: {value!r} is no {kind.__name__}')
+        changes[option] = _converted(f'{where}: {option}', value, _FIELDS[option].default)
     try:
         return Method(name, replace(base, **changes))
     except OptionsError as error:
         raise OptionsError(f'{where}: {error}') from error
+
+
+def _converted(where: str, value: Any, default: Any) -> Any:
+    """Return an option's value from YAML, where it is of the default's type."""
+    if isinstance(default, tuple):
+        if not isinstance(value, list) or len(value) != len(default):
+            raise OptionsError(f'{where}: {value!r} is no list of {len(default)}')
+        return tuple(_converted(where, *pair) for pair in zip(value, default, strict=True))
+    kind = type(default)
+    fits = isinstance(value, int | float if kind is float else kind)
+    if not fits or (isinstance(value, bool) and kind is not bool):
+        raise OptionsError(f'{where}: {value!r} is no {kind.__name__}')
+    return value

@@ -137,7 +137,8 @@ class Session:
             for part in (query.observation.similarities, detections.bboxes_xyxy,
                          query.map_from_camera):
                 digest.update(np.ascontiguousarray(part).tobytes())
-            digest.update(repr((query.number, detections.class_ids)).encode())
+            digest.update(repr((query.number, detections.class_ids,
+                                query.observation.up_in_camera)).encode())
         world = hashlib.sha256(repr((self.landmark_map.landmark_ids, self.landmark_map.class_ids,
                                      self.landmark_map.centers.tolist(),
                                      self.landmark_map.shapes.tolist())).encode())
