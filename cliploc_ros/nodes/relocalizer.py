@@ -8,7 +8,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from numpy.typing import NDArray
 from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 
@@ -24,6 +26,7 @@ from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
@@ -44,6 +47,7 @@ class RelocalizerNode(ManagedNode):
         super().__init__('relocalizer', RELOCALIZER, relocalizer_options)
         self._localizer: Localizer | None = None
         self._base = BaseFrame(self)
+        self._vertical = VerticalSource(self, self._base)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._initial_pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose',
                                                    qos.POSE)
@@ -75,6 +79,7 @@ class RelocalizerNode(ManagedNode):
         """Be ready for requests; in continuous mode listen to frames."""
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
         if self.settings['mode'] == 'continuous':
+            self._listening.enter_context(self._vertical.listening(self.settings['gravity']))
             self._listening.enter_context(self._frames.listening())
 
     def close(self) -> None:
@@ -108,10 +113,11 @@ class RelocalizerNode(ManagedNode):
             # A map or weights that were missing may have been mended since.
             self.bring_up()
             assert self._frames is not None  # an active node has them
-            with self._frames.listening():
-                frame = self._frames.wait_for_fresh(self.settings['timeout_s'])
-            depart()
-            answer = self.worker.run(lambda: self._localize(frame))
+            with self._vertical.listening(self.settings['gravity']):
+                with self._frames.listening():
+                    frame = self._frames.wait_for_fresh(self.settings['timeout_s'])
+                depart()
+                answer = self.worker.run(lambda: self._localize(frame))
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
@@ -139,11 +145,12 @@ class RelocalizerNode(ManagedNode):
         self.check_active()
         localizer = self._localizer
         assert localizer is not None  # an active node has one
-        found, times = localizer.localize(frame, values)
         header = Header(stamp=frame.image.header.stamp, frame_id=localizer.map_frame)
         camera_from_base = self._base.camera_from_base(
             values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
             header.stamp, values['tf_timeout_s'])
+        found, times = localizer.localize(
+            frame, values, self._up_in_camera(frame, values, camera_from_base))
         self.check_active()
         bases = [hypothesis.map_from_camera @ camera_from_base
                  for hypothesis in found.hypotheses]
@@ -158,6 +165,19 @@ class RelocalizerNode(ManagedNode):
         x, y, z = bases[0][:3, 3]
         return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {localizer.map_frame} '
                             f'[{_summary(found)}; {times}]')
+
+
+    def _up_in_camera(self, frame: Frame, values: Mapping[str, Any],
+                      camera_from_base: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the vertical; without one the search goes on as if nobody had asked for it."""
+        header = frame.image.header
+        try:
+            return self._vertical.up_in_camera(values, camera_from_base, header.frame_id,
+                                               header.stamp)
+        except NoVerticalError as error:
+            self.get_logger().warning(f'localizing without a vertical: {error}',
+                                      throttle_duration_sec=_LOG_PERIOD_S)
+            return None
 
 
 def _summary(found: Relocalization) -> str:

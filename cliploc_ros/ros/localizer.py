@@ -4,8 +4,11 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -72,7 +75,8 @@ class Localizer:
         return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', "
                 f'{self._options.matching}_{self._options.algorithm}')
 
-    def localize(self, frame: Frame, values: Mapping[str, Any]
+    def localize(self, frame: Frame, values: Mapping[str, Any],
+                 up_in_camera: NDArray[np.float64] | None = None
                  ) -> tuple[Relocalization, StageTimes]:
         """Find where the camera was when it took a frame.
 
@@ -81,6 +85,8 @@ class Localizer:
         frame : Frame
         values : mapping
             Of the relocalizer's parameters, as they are now.
+        up_in_camera : ndarray (3,) or None
+            The vertical, where it is known.
 
         Raises
         ------
@@ -98,7 +104,8 @@ class Localizer:
         observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
             else self._observer.observe(image, camera, detections, stamp)
         times.mark('CLIP')
-        found = self._with_options(values).relocalize([observation])
+        found = self._with_options(values).relocalize(
+            [replace(observation, up_in_camera=up_in_camera)])
         times.mark('search')
         return found, times
 

@@ -14,6 +14,9 @@ IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
 CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                          reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_IN = CAMERA_INFO
+# A burst of the fastest usual IMU while something else is called back.
+IMU = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
+                 reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                             reliability=ReliabilityPolicy.RELIABLE)
 POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,

@@ -4,11 +4,13 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from cliploc_ros.core.association import MATCHINGS
 from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.parameters import ParameterRow, Value
+from cliploc_ros.ros.vertical import SOURCES
 
 TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
@@ -63,6 +65,15 @@ RELOCALIZER = (
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
     ParameterRow('time_budget_s', 10.0, 'The search stops after this long, and what it found '
                  'is then refused, but for auto.', unit='s', low=0.0, high=3600.0),
+    ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
+                 'base_frame, or the topic imu. auto then needs two objects in place of three.',
+                 choices=SOURCES, read_only=True),
+    ParameterRow('vertical_deviation_deg', 1.0, 'Standard deviation of that vertical.',
+                 unit='deg', low=0.01, high=45.0),
+    ParameterRow('height_range_m', [0.0, 0.0], 'Least and greatest height of the camera in the '
+                 'map; equal: any.', unit='m'),
+    ParameterRow('max_tilt_deg', 180.0, 'How far the camera may be tipped off upright; 180: any '
+                 'way.', unit='deg', low=0.0, high=180.0),
     ParameterRow('refine', True, 'Improve the best poses on all of their inliers; the paper does '
                  'not.'),
     ParameterRow('min_inliers', 4, 'A pose that explains fewer objects is refused.', low=3,
@@ -102,7 +113,17 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     """
     names = RelocalizerOptions.__dataclass_fields__.keys()
     _check_mount(values['base_from_camera'])
-    return RelocalizerOptions(**{name: values[name] for name in names})  # type: ignore[arg-type]
+    if values['gravity'] == 'base_frame' and not values['base_frame']:
+        raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
+    given: dict[str, Any] = {name: values[name] for name in names}
+    given['height_range_m'] = _height_range(values['height_range_m'])
+    return RelocalizerOptions(**given)
+
+
+def _height_range(heights: Value) -> tuple[float, float]:
+    assert isinstance(heights, list)
+    low, high = heights
+    return (low, high) if low != high else (-math.inf, math.inf)
 
 
 def _check_mount(mount: Value) -> None:

@@ -98,3 +98,24 @@ def test_stages_are_told_in_whole_milliseconds():
     assert str(times) == ''
     times.mark('decoding')
     assert str(times) == 'decoding 0 ms'
+
+
+def test_heights_and_verticals_reach_the_search(localizer, values):
+    values = values | {'algorithm': 'auto'}
+    height = MAP_FROM_CAMERA[2, 3]
+    blind, _ = localizer.localize(make_frame(), values)
+    upright, _ = localizer.localize(make_frame(), values, MAP_FROM_CAMERA[2, :3])
+    assert blind.accepted and upright.accepted
+    assert upright.tried < blind.tried  # pairs, not triples
+    values['height_range_m'] = [height + 5.0, height + 6.0]
+    outside, _ = localizer.localize(make_frame(), values)
+    assert not outside.accepted
+
+
+@pytest.mark.parametrize(('changes', 'named'), [
+    ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
+    ({'gravity': 'base_frame'}, 'needs the parameter base_frame'),
+])
+def test_values_that_do_not_fit_together_are_named(localizer, values, changes, named):
+    with pytest.raises(OptionsError, match=named):
+        localizer.localize(make_frame(), values | changes)
