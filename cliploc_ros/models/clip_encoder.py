@@ -60,6 +60,19 @@ def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
     """
     started = time.monotonic()
     weights = resolve_clip_weights(options)
+    embeddings = _embed_labels(weights, options, labels)
+    encoder = ClipEncoder(weights, options)
+    logger.info('CLIP %s is ready after %.1f s', weights.model, time.monotonic() - started)
+    return LoadedEncoder(encoder, embeddings)
+
+
+def embed_labels(options: ClipOptions, labels: Sequence[str]) -> LabelEmbeddings:
+    """Return the embeddings of other labels for an encoder that stays, see `load_encoder`."""
+    return _embed_labels(resolve_clip_weights(options), options, labels)
+
+
+def _embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
+                  ) -> LabelEmbeddings:
     # Once each, in one order: neither moving nor reordering landmarks asks for new embeddings.
     unique = sorted(set(labels))
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
@@ -69,12 +82,10 @@ def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
         source = 'encoded'
         embeddings = encode_labels(weights, unique, resolve_device(options.device))
         cache.store(weights.key, unique, embeddings)
-    encoder = ClipEncoder(weights, options)
-    logger.info('CLIP %s is ready after %.1f s, %d labels %s', weights.model,
-                time.monotonic() - started, len(unique), source)
+    logger.info('CLIP %s: %d labels %s', weights.model, len(unique), source)
     rows = {label: row for row, label in enumerate(unique)}
     of_landmarks = np.array([rows[label] for label in labels], dtype=np.int64)
-    return LoadedEncoder(encoder, LabelEmbeddings(embeddings, of_landmarks))
+    return LabelEmbeddings(embeddings, of_landmarks)
 
 
 class ClipEncoder:

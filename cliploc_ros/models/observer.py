@@ -26,6 +26,10 @@ class Observer:
         self._encoder = encoder
         self._labels = LabelEmbeddings.of(label_embeddings)
 
+    def with_labels(self, label_embeddings: LabelEmbeddings) -> 'Observer':
+        """Return an observer with the same encoder for the labels of another map."""
+        return Observer(self._encoder, label_embeddings)
+
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:
         """Return what the camera saw, each detection with its similarity to every label.

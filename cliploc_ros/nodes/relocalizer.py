@@ -21,7 +21,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
 from cliploc_ros.ros.frame_source import Frame, FrameSource
 from cliploc_ros.ros.frames import BaseFrame
-from cliploc_ros.ros.lifecycle import ManagedNode
+from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
@@ -59,6 +59,8 @@ class RelocalizerNode(ManagedNode):
         requests = BoundedCallbackGroup(MAX_REQUESTS)
         self.create_service(Trigger, '~/relocalize', self._on_relocalize,
                             qos_profile=qos.SERVICE, callback_group=requests)
+        self.create_service(Trigger, '~/reload_map', self._on_reload_map,
+                            qos_profile=qos.SERVICE, callback_group=requests)
         self.create_service(Empty, 'reinitialize_global_localization', self._on_reinitialize,
                             qos_profile=qos.SERVICE, callback_group=requests)
 
@@ -92,6 +94,22 @@ class RelocalizerNode(ManagedNode):
         """Let go the request that waits for frames: the process ends."""
         if self._frames is not None:
             self._frames.stop('the node is shutting down')
+
+    def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Read the map anew; in the worker's thread, and so never in the middle of a search."""
+        try:
+            response.message = f'loaded: {self.worker.run(self._reload_map)}'
+            response.success = True
+        except CliplocError as error:
+            response.message = f'not loaded: {error}'
+        self.get_logger().info(f'map {response.message}')
+        return response
+
+    def _reload_map(self) -> str:
+        if self._localizer is None:
+            raise NotActiveError(f'the node is {self.state}')
+        self._localizer = self._localizer.reloaded(self, self.settings.snapshot())
+        return self._localizer.description
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._flights.board()

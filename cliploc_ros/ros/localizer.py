@@ -16,6 +16,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.ros.conversions import (
     detections_from_msg,
@@ -75,6 +76,24 @@ class Localizer:
         return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', "
                 f'{self._options.matching}_{self._options.algorithm}')
 
+    def reloaded(self, node: Node, values: Mapping[str, Any]) -> 'Localizer':
+        """Return a localizer for the map as it is now; the encoder stays the same.
+
+        Raises
+        ------
+        CliplocError
+            Names what in the map is to be mended; this localizer is as it was.
+        """
+        options = relocalizer_options(values)
+        landmark_map = load_map(node, values['map_file'])
+        relocalizer = Relocalizer(landmark_map, options)
+        observer = self._observer
+        if observer is not None:
+            from cliploc_ros.models.clip_encoder import embed_labels
+            observer = observer.with_labels(embed_labels(_clip_options(values),
+                                                         landmark_map.labels))
+        return Localizer(landmark_map, observer, relocalizer, options)
+
     def localize(self, frame: Frame, values: Mapping[str, Any],
                  up_in_camera: NDArray[np.float64] | None = None
                  ) -> tuple[Relocalization, StageTimes]:
@@ -131,10 +150,11 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     observer = None
     if options.needs_similarities:
         from cliploc_ros.models.clip_encoder import load_encoder
-        from cliploc_ros.models.clip_weights import ClipOptions
-        observer = Observer(*load_encoder(
-            ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
-                        checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
-                        cache_dir=values['cache_dir']),
-            landmark_map.labels))
+        observer = Observer(*load_encoder(_clip_options(values), landmark_map.labels))
     return Localizer(landmark_map, observer, relocalizer, options)
+
+
+def _clip_options(values: Mapping[str, Any]) -> ClipOptions:
+    return ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
+                       checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
+                       cache_dir=values['cache_dir'])

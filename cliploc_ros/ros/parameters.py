@@ -8,7 +8,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -63,6 +68,21 @@ class ParameterRow:
         if math.isinf(self.high):
             return f'>= {self.low:g}'
         return f'{self.low:g} to {self.high:g}'
+
+    @property
+    def descriptor(self) -> ParameterDescriptor:
+        """Return what ROS's tools show of the parameter."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        descriptor = ParameterDescriptor(
+            description=self.description + unit, additional_constraints=self.allowed,
+            read_only=self.read_only)
+        if isinstance(self.default, float) and math.isfinite(self.high - self.low):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(self.low), to_value=float(self.high))]
+        elif type(self.default) is int and math.isfinite(self.high - self.low):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)]
+        return descriptor
 
     def validated(self, value: Any) -> Value:
         """Return a value as the parameter's type, integers as floats where floats are meant.
@@ -121,11 +141,15 @@ class NodeParameters:
         self._report_unknown()
         for problem in self._problems.values():
             node.get_logger().error(f'parameter {problem}')
+        # Replaced as a whole, so that who reads them sees all of a change or nothing of it.
+        self._values: dict[str, Value] = {
+            name: node.get_parameter(name).value for name in self._rows}
         node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._take)
 
     def __getitem__(self, name: str) -> Any:
         """Return a parameter's value."""
-        return self._node.get_parameter(name).value
+        return self._values[name]
 
     def snapshot(self) -> dict[str, Value]:
         """Return all values, by name.
@@ -137,9 +161,9 @@ class NodeParameters:
         """
         if self._problems:
             raise OptionsError('parameter ' + '; '.join(self._problems.values()))
-        values = {name: self[name] for name in self._rows}
+        values = self._values
         self._check(values)
-        return values
+        return dict(values)
 
     def _declare(self, row: ParameterRow) -> None:
         """Declare one parameter with the value given at start-up, else with its default."""
@@ -153,11 +177,7 @@ class NodeParameters:
                 remedy = 'mend it and start again' if row.read_only else \
                     f'mend it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
                 self._problems[row.name] = f'{error}; {remedy}'
-        unit = f' [{row.unit}]' if row.unit else ''
-        descriptor = ParameterDescriptor(
-            description=row.description + unit, additional_constraints=row.allowed,
-            read_only=row.read_only)
-        self._node.declare_parameter(row.name, value, descriptor, ignore_override=True)
+        self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
 
     def _report_unknown(self) -> None:
         """Warn of names that no row declares: most are typing mistakes."""
@@ -181,11 +201,17 @@ class NodeParameters:
             remaining = {name: text for name, text in self._problems.items()
                          if name not in changed}
             if not remaining:
-                self._check({name: self[name] for name in self._rows} | changed)
+                self._check(self._values | changed)
         except OptionsError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._problems = remaining
         return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        """Use a change that was allowed."""
+        self._values = self._values | {
+            parameter.name: self._rows[parameter.name].validated(parameter.value)
+            for parameter in parameters if parameter.name in self._rows}
 
 
 def markdown_table(table: Iterable[ParameterRow]) -> str:

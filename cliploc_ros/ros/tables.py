@@ -45,8 +45,8 @@ DETECTOR = (
 )
 
 RELOCALIZER = (
-    ParameterRow('map_file', '', "A map to load; empty: the map stands in the parameters "
-                 "below 'map'.", read_only=True),
+    ParameterRow('map_file', '', "A map to load when the node is configured and by reload_map; "
+                 "empty: the map stands in the parameters below 'map'."),
     ParameterRow('mode', 'on_request', 'When to localize: when a service is called, or '
                  'continuously.', choices=MODES, read_only=True),
     ParameterRow('timeout_s', 10.0, 'How long a request waits for fresh frames.', unit='s',

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters over the wire: what was dumped starts the same node, and the map is read anew."""
+
+import pytest
+import yaml
+from conftest import class_matching, make_frame
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
+from std_srvs.srv import Trigger
+
+
+def dump(tester, name):
+    """Return the parameters of a node by name."""
+    names = tester.call(ListParameters, f'/{name}/list_parameters',
+                        ListParameters.Request()).result.names
+    values = tester.call(GetParameters, f'/{name}/get_parameters',
+                         GetParameters.Request(names=names)).values
+    return dict(zip(names, map(parameter_value_to_python, values), strict=True))
+
+
+def write_dump(values, name, path):
+    """Write parameters as `ros2 param dump` does, a level for each part of a name."""
+    tree = {}
+    for parameter, value in values.items():
+        *folders, leaf = parameter.split('.')
+        branch = tree
+        for folder in folders:
+            branch = branch.setdefault(folder, {})
+        branch[leaf] = value
+    path.write_text(yaml.safe_dump({f'/{name}': {'ros__parameters': tree}}))
+
+
+def test_a_dump_starts_the_same_relocalizer(start, tester, room_map, tmp_path):
+    first = start('nodes.relocalizer', '--ros-args', '--params-file', room_map, parameters={
+        **class_matching("''"), 'timeout_s': 3, 'random_seed': -1,
+        'base_from_camera': '[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]'})
+    first.wait_for_output('12 landmarks')
+    tester.connect()
+    assert tester.relocalize(make_frame()).success  # declares what subscriptions declare
+    assert tester.set_parameter('k', 5).successful
+    dumped = dump(tester, 'relocalizer')
+    assert first.stop()[0] == 0
+    tester.wait(lambda: tester.count_publishers('/relocalizer/pose') == 0, 'its end')
+
+    path = tmp_path / 'dump.yaml'
+    write_dump(dumped, 'relocalizer', path)
+    second = start('nodes.relocalizer', '--ros-args', '--params-file', path)
+    second.wait_for_output('12 landmarks')
+    tester.connect()
+    again = dump(tester, 'relocalizer')
+    assert {name: again[name] for name in dumped} == dumped
+    assert again['k'] == 5
+    assert tester.relocalize(make_frame()).success
+    assert 'WARN' not in second.output()
+
+
+def test_a_dump_starts_the_same_detector(start, tester, tmp_path):
+    first = start('nodes.detector', parameters={'conf': 0.25, 'autostart': 'false'})
+    dumped = dump(tester, 'detector')
+    assert first.stop()[0] == 0
+    tester.wait(lambda: tester.count_publishers('/detections') == 1, 'its end')
+    path = tmp_path / 'dump.yaml'
+    write_dump(dumped, 'detector', path)
+    start('nodes.detector', '--ros-args', '--params-file', path)
+    assert dump(tester, 'detector') == dumped
+    assert dumped['conf'] == 0.25
+
+
+def test_tools_see_what_a_parameter_allows(own_relocalizer, tester):
+    own_relocalizer()
+    described = tester.call(
+        DescribeParameters, '/relocalizer/describe_parameters',
+        DescribeParameters.Request(names=['timeout_s', 'k', 'matching'])).descriptors
+    timeout, k, matching = described
+    assert timeout.description == 'How long a request waits for fresh frames. [s]'
+    assert timeout.floating_point_range[0].to_value == 3600.0
+    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (1, 1000)
+    assert (timeout.read_only, k.read_only, matching.read_only) == (False, False, True)
+
+
+def reload_map(tester):
+    return tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request())
+
+
+@pytest.fixture
+def own_map(room_map, tmp_path):
+    path = tmp_path / 'map.yaml'
+    path.write_text(room_map.read_text())
+    return path
+
+
+def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tester, own_map):
+    own_relocalizer(map_file=own_map)
+    text = own_map.read_text()
+    own_map.write_text(text.replace('frame_id: map', 'frame_id: hall'))
+    answer = reload_map(tester)
+    assert answer.success
+    assert answer.message == "loaded: 12 landmarks in frame 'hall', class_bf"
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: tester.poses, 'a pose')
+    assert tester.poses[-1].header.frame_id == 'hall'
+    for bad, reason in ((text.replace('semi_axes', 'half_axes'), 'missing field: semi_axes'),
+                        ('', 'YAML'), (text[:len(text) // 2], str(own_map))):
+        own_map.write_text(bad)
+        answer = reload_map(tester)
+        assert not answer.success
+        assert reason in answer.message
+        assert tester.relocalize(make_frame()).message.count(' in hall ') == 1
+
+
+def test_another_map_file_at_run_time(own_relocalizer, tester, own_map, room_map):
+    own_relocalizer()
+    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: attic'))
+    assert tester.set_parameter('map_file', str(own_map)).successful
+    assert "in frame 'attic'" in reload_map(tester).message
+    assert tester.set_parameter('map_file', '/nowhere.yaml').successful
+    assert not reload_map(tester).success
+    assert ' in attic ' in tester.relocalize(make_frame()).message
+
+
+def test_a_map_reload_while_a_request_waits(own_relocalizer, tester, own_map):
+    own_relocalizer(map_file=own_map)
+    future = tester.ask()
+    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
+    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: hall'))
+    assert reload_map(tester).success
+    tester.feed_until(future.done, make_frame())
+    assert future.result().success
+    assert ' in hall ' in future.result().message
