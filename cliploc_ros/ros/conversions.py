@@ -38,7 +38,8 @@ def detections_from_msg(msg: Detection2DArray) -> Detections:
               box.size_y) for box in (detection.bbox for detection in msg.detections)]
     x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
     # a turned box stands as the upright one around it; with theta 0 the sizes stay to the bit
-    cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    with np.errstate(invalid='ignore'):  # an infinite angle makes a box of NaN, left out later
+        cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
     return Detections(
         np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),

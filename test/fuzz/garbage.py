@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages that a broken or hostile publisher may send: every field, every value of its type."""
+
+import os
+
+from builtin_interfaces.msg import Time
+from hypothesis import settings
+from hypothesis import strategies as st
+from scene import CAMERA
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
+from vision_msgs.msg import (
+    BoundingBox2D,
+    Detection2D,
+    Detection2DArray,
+    ObjectHypothesis,
+    ObjectHypothesisWithPose,
+    Point2D,
+    Pose2D,
+)
+
+from cliploc_ros.messages import _CHANNELS
+
+#: So many cases a property by default; CLIPLOC_FUZZ_CASES=10000 asks for more.
+CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '500')), deadline=None,
+                 derandomize=True)
+
+uint32 = st.integers(0, 2**32 - 1)
+small = st.integers(0, 700)
+number = st.one_of(st.floats(), st.floats(-1000.0, 1000.0), st.integers(-10, 10).map(float))
+name = st.one_of(st.sampled_from(['a', 'b', 'c', '']), st.text(max_size=20))
+SIZE = CAMERA.width * CAMERA.height
+INFO = {'width': CAMERA.width, 'height': CAMERA.height, 'k': CAMERA.matrix.ravel().tolist(),
+        'p': [*CAMERA.matrix[0], 0.0, *CAMERA.matrix[1], 0.0, *CAMERA.matrix[2], 0.0]}
+
+
+def or_sound(sound, strategy):
+    """Mostly what is right, so that what lies behind the first check is reached too."""
+    return st.one_of(st.just(sound), st.just(sound), strategy)
+
+
+def sound_image():
+    return Image(width=CAMERA.width, height=CAMERA.height, step=CAMERA.width, encoding='mono8',
+                 data=bytes(SIZE))
+
+
+def images():
+    return st.builds(
+        Image, width=or_sound(CAMERA.width, st.one_of(small, uint32)),
+        height=or_sound(CAMERA.height, st.one_of(small, uint32)),
+        step=or_sound(CAMERA.width, st.one_of(small, uint32)),
+        encoding=or_sound('mono8', st.one_of(st.sampled_from(sorted(_CHANNELS)),
+                                             st.text(max_size=10))),
+        is_bigendian=st.integers(0, 255),
+        data=or_sound(bytes(SIZE), st.one_of(st.binary(max_size=100), st.just(bytes(3 * SIZE)))))
+
+
+def compressed_images():
+    starts = st.sampled_from([b'', b'\xff\xd8\xff\xc0\x00\x11\x08', b'\x89PNG\r\n\x1a\n',
+                              b'\xff\xd8\xff\xe0\x00\x02', b'GIF89a'])
+    return st.builds(CompressedImage, format=st.text(max_size=10),
+                     data=st.builds(bytes.__add__, starts, st.binary(max_size=200)))
+
+
+def infos():
+    numbers = {field: or_sound(INFO[field], st.lists(number, min_size=size, max_size=size))
+               for field, size in (('k', 9), ('p', 12))}
+    return st.builds(
+        CameraInfo, width=or_sound(CAMERA.width, uint32), height=or_sound(CAMERA.height, uint32),
+        d=or_sound([], st.lists(number, max_size=14)),
+        distortion_model=st.one_of(st.sampled_from(['', 'plumb_bob', 'rational_polynomial',
+                                                    'equidistant']), st.text(max_size=10)),
+        binning_x=uint32, binning_y=uint32, **numbers)
+
+
+def boxes(coordinate=number):
+    center = st.builds(Pose2D, position=st.builds(Point2D, x=coordinate, y=coordinate),
+                       theta=or_sound(0.0, coordinate))
+    return st.builds(BoundingBox2D, center=center, size_x=coordinate, size_y=coordinate)
+
+
+def detections(box=None, most=40):
+    hypothesis = st.builds(ObjectHypothesis, class_id=name, score=number)
+    result = st.builds(ObjectHypothesisWithPose, hypothesis=hypothesis)
+    detection = st.builds(Detection2D, bbox=boxes() if box is None else box,
+                          results=st.lists(result, max_size=3), id=name)
+    return st.builds(Detection2DArray, detections=st.lists(detection, max_size=most))
+
+
+def likely_detections():
+    """Boxes of the right classes and sizes within the image, which mean nothing."""
+    hypothesis = st.builds(ObjectHypothesis, class_id=st.sampled_from('abc'),
+                           score=st.floats(0.1, 1.0))
+    box = st.builds(
+        BoundingBox2D,
+        center=st.builds(Pose2D, position=st.builds(Point2D, x=st.floats(0, CAMERA.width),
+                                                    y=st.floats(0, CAMERA.height))),
+        size_x=st.floats(3, 200), size_y=st.floats(3, 200))
+    detection = st.builds(Detection2D, bbox=box, results=st.builds(
+        lambda one: [ObjectHypothesisWithPose(hypothesis=one)], hypothesis))
+    return st.builds(Detection2DArray, detections=st.lists(detection, min_size=3, max_size=20))
+
+
+def stamped(msg, nanoseconds):
+    """The message, with a stamp; pairing takes nothing without one."""
+    msg.header = Header(frame_id='camera', stamp=Time(sec=nanoseconds // 10**9,
+                                                      nanosec=nanoseconds % 10**9))
+    return msg
+
+

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Garbage in every field of every message: an error that is named, and no pose."""
+
+import pytest
+from garbage import (
+    CASES,
+    compressed_images,
+    detections,
+    images,
+    infos,
+    stamped,
+)
+from hypothesis import given
+from scene import make_room, write_map
+
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.localizer import load_localizer
+from cliploc_ros.ros.tables import RELOCALIZER
+
+
+@pytest.fixture(scope='module')
+def values(tmp_path_factory):
+    path = tmp_path_factory.mktemp('fuzz') / 'room.yaml'
+    write_map(make_room(), path)
+    return {row.name: row.default for row in RELOCALIZER} | {
+        'map_file': str(path), 'matching': 'class'}
+
+
+@pytest.fixture(scope='module')
+def localizer(values):
+    return load_localizer(None, values)  # a map from a file asks no node
+
+
+def localize(localizer, values, image, info, found):
+    frame = Frame(*(stamped(msg, 100) for msg in (image, info, found)), 0.0)
+    try:
+        return localizer.localize(frame, values)[0]
+    except CliplocError as error:
+        assert str(error).strip()
+        return None
+
+
+@given(images(), infos(), detections())
+@CASES
+def test_raw_images(localizer, values, image, info, found):
+    result = localize(localizer, values, image, info, found)
+    assert result is None or not result.accepted
+
+
+@given(compressed_images(), infos(), detections(most=5))
+@CASES
+def test_compressed_images(localizer, values, image, info, found):
+    result = localize(localizer, values, image, info, found)
+    assert result is None or not result.accepted
