@@ -126,6 +126,11 @@ class ClipEncoder:
         return self._weights.key
 
     @property
+    def device(self) -> str:
+        """Return where the network runs."""
+        return str(self._device)
+
+    @property
     def embed_dim(self) -> int:
         """Return the length d of an embedding."""
         return self._weights.embed_dim

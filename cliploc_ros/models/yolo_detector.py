@@ -133,6 +133,11 @@ class YoloDetector:
             self._settings |= _half_precision()
 
     @property
+    def device(self) -> str:
+        """Return where the network runs."""
+        return str(self._device)
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """Return the names of all classes that the model knows."""
         return tuple(self._model.names.values())

@@ -3,8 +3,9 @@
 """The detector node: images in, detections out, and only while something listens."""
 
 import threading
+import time
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import CompressedImage, Image
@@ -15,6 +16,7 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import Value
 from cliploc_ros.ros.process import run_node
@@ -25,13 +27,24 @@ from cliploc_ros.ros.worker import LatestOnly
 _LOG_PERIOD_S = 5.0
 
 
+class TimedImage(NamedTuple):
+    """An image, and when it arrived (monotonic clock) [s]."""
+
+    msg: Image | CompressedImage
+    received_at: float
+
+
 class DetectorNode(ManagedNode):
     """Publishes what a YOLO network sees in the newest image."""
 
     def __init__(self) -> None:
         super().__init__('detector', DETECTOR, detector_options)
         self._detector: YoloDetector | None = None
-        self._images: LatestOnly[Image | CompressedImage] = LatestOnly(self.worker, self._detect)
+        self._images: LatestOnly[TimedImage] = LatestOnly(self.worker, self._detect)
+        self._received, self._heard_at = 0, 0.0
+        self._published = 0
+        self._last_error = ''
+        self._rates = Rates()
         # matched in one thread, activated in another
         self._lock = threading.Lock()
         self._open = False
@@ -65,26 +78,55 @@ class DetectorNode(ManagedNode):
         with self._lock:
             wanted = self._open and self._publisher.get_subscription_count() > 0
             if wanted and self._subscription is None:
+                self._heard_at = time.monotonic()  # from now on images are missed
                 raw = self.settings['image_transport'] == 'raw'
                 self._subscription = AdaptiveSubscription(
                     self, Image if raw else CompressedImage, 'image' if raw else
-                    'image/compressed', self._images.offer, qos.IMAGE)
+                    'image/compressed', self._on_image, qos.IMAGE)
             elif not wanted and self._subscription is not None:
                 self._subscription.destroy()
                 self._subscription = None
 
-    def _detect(self, msg: Image | CompressedImage) -> None:
+    def _on_image(self, msg: Image | CompressedImage) -> None:
+        self._received += 1
+        self._heard_at = time.monotonic()
+        self._images.offer(TimedImage(msg, self._heard_at))
+
+    def _detect(self, image: TimedImage) -> None:
         """Detect in one image and publish; in the worker's thread."""
         if not self.active or self._detector is None:
             return  # deactivated while the image waited
+        times = StageTimes(image.received_at)
+        times.mark('waiting')
         try:
             self._detector.configure(detector_options(self.settings.snapshot()))
-            detections = self._detector.detect(image_from_msg(msg))
+            pixels = image_from_msg(image.msg)
+            times.mark('decoding')
+            detections = self._detector.detect(pixels)
         except CliplocError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=_LOG_PERIOD_S)
+            self._last_error = str(error)
+            self.get_logger().error(self._last_error, throttle_duration_sec=_LOG_PERIOD_S)
             return
+        times.mark('detection')
+        self._last_error = ''
+        self.stages.add(times.ms)
         if self.active:
-            self._publisher.publish(detections_to_msg(detections, msg.header))
+            self._published += 1
+            self._publisher.publish(detections_to_msg(detections, image.msg.header))
+
+    def examine(self, health: Health) -> None:
+        """Say whether images come, how many are worked on, and where."""
+        silent_s = time.monotonic() - self._heard_at
+        if self._subscription is not None and silent_s > self.settings['stale_after_s']:
+            health.warn(f'no image for {silent_s:.1f} s')
+        if self._last_error:
+            health.warn(self._last_error)
+        rates = self._rates.update({'image': self._received, 'detections': self._published})
+        health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
+        health.values |= {'listened to': self._subscription is not None,
+                          'images dropped': self._images.dropped}
+        if self._detector is not None:
+            health.values['device'] = self._detector.device
 
 
 def detector_options(values: Mapping[str, Value]) -> YoloOptions:

@@ -19,6 +19,7 @@ from cliploc_ros.core.transforms import move_covariance
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
+from cliploc_ros.ros.diagnostics import Health
 from cliploc_ros.ros.frame_source import Frame, FrameSource
 from cliploc_ros.ros.frames import BaseFrame
 from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
@@ -30,6 +31,7 @@ from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
+_VERDICTS = ('accepted', 'refused')
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class RelocalizerNode(ManagedNode):
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
         self._listening = ExitStack()
+        self._verdict = 'none yet'
+        self._verdicts = dict.fromkeys((*_VERDICTS, 'failed'), 0)
         self._flights: Flights[Answer] = Flights(self._wake_up)
         requests = BoundedCallbackGroup(MAX_REQUESTS)
         self.create_service(Trigger, '~/relocalize', self._on_relocalize,
@@ -143,8 +147,25 @@ class RelocalizerNode(ManagedNode):
             answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
         if answer.pose is not None:
             self._initial_pose.publish(answer.pose)
+        self._conclude(answer.message)
         self.get_logger().info(answer.message)
         return answer
+
+    def _conclude(self, verdict: str) -> None:
+        """Keep the verdict for the diagnostics, and publish these."""
+        self._verdict = verdict
+        self._verdicts[verdict.split(':')[0] if verdict.startswith(_VERDICTS) else 'failed'] += 1
+        self.diagnostics.publish()
+
+    def examine(self, health: Health) -> None:
+        """Say whether the input comes, what was found last, and where."""
+        if self._frames is not None:
+            self._frames.examine(health, self.settings['stale_after_s'])
+        health.values |= {'frames skipped while busy': self._continuous.dropped,
+                          'last verdict': self._verdict, **self._verdicts}
+        if self._localizer is not None:
+            health.values |= {'map': self._localizer.description,
+                              'device': self._localizer.device}
 
     def _on_frame(self, frame: Frame) -> None:
         if self.settings['mode'] == 'continuous':
@@ -155,6 +176,7 @@ class RelocalizerNode(ManagedNode):
             message = self._localize(frame).message
         except CliplocError as error:
             message = str(error)
+        self._conclude(message)
         self.get_logger().info(message, throttle_duration_sec=_LOG_PERIOD_S)
 
     def _localize(self, frame: Frame) -> Answer:
@@ -169,6 +191,7 @@ class RelocalizerNode(ManagedNode):
             header.stamp, values['tf_timeout_s'])
         found, times = localizer.localize(
             frame, values, self._up_in_camera(frame, values, camera_from_base))
+        self.stages.add(times.ms)
         self.check_active()
         bases = [hypothesis.map_from_camera @ camera_from_base
                  for hypothesis in found.hypotheses]

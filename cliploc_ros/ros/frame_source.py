@@ -18,6 +18,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.diagnostics import Health, Rates
 from cliploc_ros.ros.pairing import ExactPairing
 from cliploc_ros.ros.subscription import AdaptiveSubscription
 
@@ -68,6 +69,8 @@ class FrameSource:
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
         self._listeners = 0
+        self._listening_since = 0.0
+        self._rates = Rates()
         self._newest: Frame | None = None
         self._stopped = ''
 
@@ -75,6 +78,7 @@ class FrameSource:
         """Listen until closed as often as opened."""
         with self._changed:
             if self._listeners == 0:
+                self._listening_since = time.monotonic()
                 self._subscribe()
             self._listeners += 1
 
@@ -126,6 +130,25 @@ class FrameSource:
         with self._changed:
             self._stopped = reason
             self._changed.notify_all()
+
+    def examine(self, health: Health, stale_after_s: float) -> None:
+        """Say what is missing of the input, how often it comes, and what waits or was lost."""
+        now = time.monotonic()
+        with self._changed:
+            for name in self._topics:
+                silent_s = now - max(self._heard_at.get(name, 0.0), self._listening_since)
+                nobody = self._node.count_publishers(self._resolved(name)) == 0
+                if nobody or (self._listeners and silent_s > stale_after_s):
+                    # without intrinsics there is never a pose; images and detections may pause
+                    tell = health.fail if name == 'camera_info' else health.warn
+                    tell(self._silence(name) if nobody else
+                         f'no {name} on {self._resolved(name)} for {silent_s:.1f} s')
+            rates = self._rates.update(self._pairing.received)
+            oldest = self._pairing.oldest('image')
+            health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
+            health.values |= {
+                'images dropped unpaired': self._pairing.dropped['image'],
+                'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
     def _newest_since(self, moment: float) -> Frame | None:
         newest = self._newest

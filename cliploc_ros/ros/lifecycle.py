@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.models.devices import free_memory
+from cliploc_ros.ros.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.parameters import NodeParameters, ParameterRow, Value
 from cliploc_ros.ros.requests import BoundedCallbackGroup
 from cliploc_ros.ros.worker import Worker
@@ -79,6 +80,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._transition = threading.Lock()
         self._failure = ''
         self._answer_impossible_transitions()
+        self.stages = Stages()
+        self.diagnostics = Diagnostics(self, self._health, lambda: self.state)
         self._self_managed: bool = self.settings['autostart']
         self._pause_s = _FIRST_PAUSE_S
         # simulated time may stand still
@@ -100,6 +103,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def close(self) -> None:
         """Stop to listen, and let go whoever waits. The worker may still be busy."""
+
+    def examine(self, health: Health) -> None:
+        """Say how the active node is."""
 
     def release(self) -> None:
         """Let go whoever waits in this node: the process ends."""
@@ -132,6 +138,15 @@ class ManagedNode(LifecycleNodeMixin, Node):
             raise NotActiveError(
                 f'the node is {self.state}: ' + (self._failure or 'its manager has to configure '
                                                  'and activate it'))
+
+    def _health(self) -> Health:
+        health = Health()
+        if self._failure:
+            health.fail(self._failure)
+        if self.active:
+            self.examine(health)
+            health.values |= self.stages.values()
+        return health
 
     def _start_by_itself(self) -> None:
         """Bring the node up if nobody else will, else try again later."""

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame of messages to a relocalization: what the node keeps loaded between requests."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,27 +21,10 @@ from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
 )
+from cliploc_ros.ros.diagnostics import StageTimes
 from cliploc_ros.ros.frame_source import Frame
 from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.tables import relocalizer_options
-
-
-class StageTimes:
-    """How long each stage of one localization took [ms]."""
-
-    def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self._stages: dict[str, float] = {}
-
-    def mark(self, stage: str) -> None:
-        """End a stage that began where the last one ended."""
-        now = time.perf_counter()
-        self._stages[stage] = (now - self._start) * 1e3
-        self._start = now
-
-    def __str__(self) -> str:
-        """Return the stages for people."""
-        return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in self._stages.items())
 
 
 class Localizer:
@@ -55,10 +37,13 @@ class Localizer:
     relocalizer : Relocalizer
         Of the map, with these options.
     options : RelocalizerOptions
+    device : str
+        Where the observer's network runs.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
-                 relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
+                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str) -> None:
+        self.device = device
         self._map = landmark_map
         self._observer = observer
         self._relocalizer = relocalizer
@@ -92,7 +77,7 @@ class Localizer:
             from cliploc_ros.models.clip_encoder import embed_labels
             observer = observer.with_labels(embed_labels(_clip_options(values),
                                                          landmark_map.labels))
-        return Localizer(landmark_map, observer, relocalizer, options)
+        return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
     def localize(self, frame: Frame, values: Mapping[str, Any],
                  up_in_camera: NDArray[np.float64] | None = None
@@ -112,7 +97,8 @@ class Localizer:
         CliplocError
             Names what in the frame or in the parameters is to be mended.
         """
-        times = StageTimes()
+        times = StageTimes(frame.received_at)
+        times.mark('waiting')
         image = image_from_msg(frame.image)
         height, width = image.shape[:2]
         camera = camera_from_msg(frame.camera_info, (width, height), values['rectified'])
@@ -147,11 +133,12 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     options = relocalizer_options(values)
     landmark_map = load_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
-    observer = None
+    observer, device = None, 'cpu'
     if options.needs_similarities:
         from cliploc_ros.models.clip_encoder import load_encoder
-        observer = Observer(*load_encoder(_clip_options(values), landmark_map.labels))
-    return Localizer(landmark_map, observer, relocalizer, options)
+        encoder, embeddings = load_encoder(_clip_options(values), landmark_map.labels)
+        observer, device = Observer(encoder, embeddings), encoder.device
+    return Localizer(landmark_map, observer, relocalizer, options, device)
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:

@@ -28,6 +28,7 @@ class ExactPairing:
             topic: OrderedDict() for topic in max_bytes}
         self._bytes = dict.fromkeys(max_bytes, 0)
         self.received = dict.fromkeys(max_bytes, 0)
+        self.dropped = dict.fromkeys(max_bytes, 0)
         self.last_stamp_ns: dict[str, int] = {}
 
     def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
@@ -56,23 +57,30 @@ class ExactPairing:
             return None
         complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
         for name, other in self._waiting.items():
+            self.dropped[name] -= 1  # the completed one is none
             # what came before the completed one is late for good
             while stamp_ns in other:
                 self._forget(name, next(iter(other)))
         return complete
+
+    def oldest(self, topic: str) -> Any:
+        """Return what waits longest of a topic; None if nothing does."""
+        return next((item for item, _ in self._waiting[topic].values()), None)
 
     def waiting_bytes(self) -> int:
         """Return how much memory the waiting messages hold [bytes]."""
         return sum(self._bytes.values())
 
     def clear(self) -> None:
-        """Forget all that waits, and what was received."""
+        """Forget all that waits, and what was received and dropped."""
         for waiting in self._waiting.values():
             waiting.clear()
         self._bytes = dict.fromkeys(self._bytes, 0)
         self.received = dict.fromkeys(self.received, 0)
+        self.dropped = dict.fromkeys(self.dropped, 0)
         self.last_stamp_ns.clear()
 
     def _forget(self, topic: str, stamp_ns: int) -> None:
         _, size = self._waiting[topic].pop(stamp_ns)
         self._bytes[topic] -= size
+        self.dropped[topic] += 1

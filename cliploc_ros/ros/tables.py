@@ -18,6 +18,9 @@ MODES = ('on_request', 'continuous')
 _AUTOSTART = ParameterRow(
     'autostart', True, 'Configure and activate by itself; false: a lifecycle manager does.',
     read_only=True)
+_STALE_AFTER = ParameterRow(
+    'stale_after_s', 2.0, 'An input that is silent for longer is warned of in the diagnostics.',
+    unit='s', low=0.1, high=3600.0)
 _IMAGE_TRANSPORT = ParameterRow(
     'image_transport', 'raw', "Listen to 'image' or to 'image/compressed'.",
     choices=TRANSPORTS, read_only=True)
@@ -42,6 +45,7 @@ DETECTOR = (
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
     _AUTOSTART,
+    _STALE_AFTER,
 )
 
 RELOCALIZER = (
@@ -93,6 +97,7 @@ RELOCALIZER = (
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
     _AUTOSTART,
+    _STALE_AFTER,
     ParameterRow('rectified', False, 'The image is rectified: take P of camera_info and no '
                  'distortion.'),
     ParameterRow('base_frame', '', "Publish the pose of this frame; empty: the camera's."),

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a node says of itself on /diagnostics: once a second, and with each result."""
+
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+_PERIOD_S = 1.0
+# Over a shorter time a rate would jump about.
+_MIN_RATE_PERIOD_S = 0.5
+# So many of the last results make means and percentiles.
+_WINDOW = 200
+
+
+@dataclass
+class Health:
+    """What is wrong, each with its level, and figures for those who look closer.
+
+    Parameters
+    ----------
+    problems : list of (bytes, str)
+        Levels of diagnostic_msgs/DiagnosticStatus, and one line each.
+    values : dict of str to object
+    """
+
+    problems: list[tuple[bytes, str]] = field(default_factory=list)
+    values: dict[str, object] = field(default_factory=dict)
+
+    def warn(self, problem: str) -> None:
+        """Add what may pass by itself."""
+        self.problems.append((DiagnosticStatus.WARN, problem))
+
+    def fail(self, problem: str) -> None:
+        """Add what somebody has to mend."""
+        self.problems.append((DiagnosticStatus.ERROR, problem))
+
+    @property
+    def level(self) -> bytes:
+        """Return the worst level."""
+        return max((level for level, _ in self.problems), default=DiagnosticStatus.OK)
+
+    @property
+    def message(self) -> str:
+        """Return the problems in a line, the worst first; empty if there are none."""
+        worst_first = sorted(self.problems, key=lambda problem: problem[0], reverse=True)
+        return '; '.join(text for _, text in worst_first)
+
+
+class StageTimes:
+    """How long each stage of one result took [ms].
+
+    Parameters
+    ----------
+    start : float
+        When the first stage began (monotonic clock) [s].
+    """
+
+    def __init__(self, start: float) -> None:
+        self._start = start
+        self._stages: dict[str, float] = {}
+
+    def mark(self, stage: str) -> None:
+        """End a stage that began where the last one ended."""
+        now = time.monotonic()
+        self._stages[stage] = (now - self._start) * 1e3
+        self._start = now
+
+    @property
+    def ms(self) -> dict[str, float]:
+        """Return how long each stage took [ms], in their order."""
+        return dict(self._stages)
+
+    def __str__(self) -> str:
+        """Return the stages for people."""
+        return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in self._stages.items())
+
+
+class Stages:
+    """How long the stages of the work took lately; filled in one thread, read in another."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._ms: dict[str, deque[float]] = {}
+
+    def add(self, stages_ms: Mapping[str, float]) -> None:
+        """Take in the times of one result [ms], by stage."""
+        with self._lock:
+            for stage, ms in stages_ms.items():
+                self._ms.setdefault(stage, deque(maxlen=_WINDOW)).append(ms)
+
+    def values(self) -> dict[str, object]:
+        """Return last, mean and 99th percentile of each stage [ms]."""
+        with self._lock:
+            times = {stage: np.array(ms) for stage, ms in self._ms.items()}
+        return {f'{stage} {name} [ms]': f'{value:.1f}' for stage, ms in times.items()
+                for name, value in (('last', ms[-1]), ('mean', ms.mean()),
+                                    ('p99', np.percentile(ms, 99)))}
+
+
+class Rates:
+    """How often things that are counted happen."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, int] = {}
+        self._at = time.monotonic()
+        self._rates: dict[str, float] = {}
+
+    def update(self, counts: Mapping[str, int]) -> dict[str, float]:
+        """Return the rates since the last but one update [Hz]; counts may begin again at 0."""
+        now = time.monotonic()
+        period_s = now - self._at
+        if period_s >= _MIN_RATE_PERIOD_S:
+            self._rates = {name: max(0, count - self._counts.get(name, 0)) / period_s
+                           for name, count in counts.items()}
+            self._counts, self._at = dict(counts), now
+        return {name: self._rates.get(name, 0.0) for name in counts}
+
+
+class Diagnostics:
+    """Publishes a node's health.
+
+    Parameters
+    ----------
+    node : Node
+    health : callable
+        Says how the node is.
+    state : callable
+        Names the state it is in.
+    """
+
+    def __init__(self, node: Node, health: Callable[[], Health], state: Callable[[], str]
+                 ) -> None:
+        self._node = node
+        self._health = health
+        self._state = state
+        self._lock = threading.Lock()
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        node.create_timer(_PERIOD_S, self.publish, MutuallyExclusiveCallbackGroup(),
+                          Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self) -> None:
+        """Say now how the node is."""
+        with self._lock:
+            state, health = self._state(), self._health()
+        values = {'state': state, **health.values, 'memory [MiB]': f'{_resident_mib():.0f}',
+                  **_gpu_memory()}
+        name = self._node.get_fully_qualified_name().lstrip('/')
+        status = DiagnosticStatus(
+            level=health.level, name=f'{name}: status', hardware_id=name,
+            message=health.message or state,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        msg = DiagnosticArray(status=[status])
+        msg.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(msg)
+
+
+def _resident_mib() -> float:
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+
+def _gpu_memory() -> dict[str, object]:
+    """Return what PyTorch holds of the GPU; nothing where it is not used."""
+    torch = sys.modules.get('torch')
+    cuda = getattr(torch, 'cuda', None)  # while it is being imported it has none
+    if cuda is None or not cuda.is_initialized():
+        return {}
+    return {'GPU memory [MiB]': f'{cuda.memory_allocated() / 2**20:.0f}'}

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes say of themselves on /diagnostics while their input comes, stops and fails."""
+
+import pytest
+from conftest import PROJECT, make_frame
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+@pytest.fixture
+def status(tester):
+    """The last report of the one node that runs: level, message and values."""
+    heard = []
+    subscription = tester.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+
+    class Status:
+        def wait(self, level, text='', work=tester.spin, **values):
+            """Wait for a new report of a level, with a text and values in it."""
+            heard.clear()
+
+            def fits():
+                return any(self.fits(msg.status[0], level, text, values) for msg in heard)
+            tester.feed_until(fits, work, 'the report') if isinstance(work, tuple) else \
+                tester.wait(fits, f'{level} {text} {values}, last: {heard[-1:]}', 20.0)
+            return {value.key: value.value for value in heard[-1].status[0].values}
+
+        @staticmethod
+        def fits(status, level, text, values):
+            given = {value.key: value.value for value in status.values}
+            return (status.level == level and text in status.message
+                    and all(value in given.get(key, '') for key, value in values.items()))
+    yield Status()
+    tester.destroy_subscription(subscription)
+
+
+def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, tester, status):
+    own_relocalizer(mode='continuous', stale_after_s=1.0)
+    frame = make_frame()
+    values = status.wait(OK, 'active', frame, **{'last verdict': 'accepted: x 0.3'})
+    assert values['state'] == 'active'
+    assert values['device'] == 'cpu'
+    assert int(values['accepted']) > 0
+    assert float(values['search p99 [ms]']) >= float(values['search mean [ms]']) > 0.0
+    assert {'waiting last [ms]', 'queue age [s]', 'images dropped unpaired',
+            'frames skipped while busy', 'memory [MiB]'} <= set(values)
+    values = status.wait(OK, 'active', frame)
+    assert float(values['image rate [Hz]']) > 1.0
+    status.wait(WARN, 'no image on /image for', (frame[1], frame[2]))
+    status.wait(ERROR, 'no camera_info on /camera_info for', (frame[0], frame[2]))
+    tester.destroy_publisher(tester.infos)
+    status.wait(ERROR, 'nobody publishes /camera_info')
+    tester.infos = tester.create_publisher(type(frame[1]), 'camera_info', 10)
+    status.wait(OK, 'active', frame)
+
+
+def test_between_requests_silence_is_no_problem(own_relocalizer, tester, status):
+    own_relocalizer(stale_after_s=0.1)
+    status.wait(OK, 'active', **{'last verdict': 'none yet'})
+    assert tester.relocalize(make_frame()).success
+    assert status.wait(OK, 'active', **{'last verdict': 'accepted'})['accepted'] == '1'
+
+
+def test_a_configure_that_fails_is_an_error_with_its_reason(own_relocalizer, status):
+    own_relocalizer(expect='[ERROR]', map_file='/nowhere/map.yaml')
+    values = status.wait(ERROR, '/nowhere/map.yaml: No such file')
+    assert values['state'] == 'unconfigured'
+
+
+def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
+    detector = start('nodes.detector', parameters={
+        'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'stale_after_s': 1.0})
+    detector.wait_for_output('ready after')
+    values = status.wait(OK, 'active')
+    assert values['listened to'] == 'False'
+    image = make_frame()[0]
+    with tester.hearing_detections() as detected:
+        values = status.wait(OK, 'active', (image,), **{'listened to': 'True',
+                                                       'detection mean [ms]': '.'})
+        assert detected
+        assert values['device'] in ('cpu', 'cuda:0')
+        status.wait(WARN, 'no image for')
+        bad = make_frame()[0]
+        bad.encoding = 'yuv422'
+        status.wait(WARN, "encoding 'yuv422' is none of", (bad,))
+        status.wait(OK, 'active', (image,))

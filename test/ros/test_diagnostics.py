@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import time
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+from cliploc_ros.ros.diagnostics import Diagnostics, Health, Rates, Stages, StageTimes
+
+
+def test_the_worst_problem_gives_the_level_and_comes_first():
+    health = Health()
+    assert (health.level, health.message) == (DiagnosticStatus.OK, '')
+    health.warn('late')
+    health.fail('broken')
+    health.warn('slow')
+    assert (health.level, health.message) == (DiagnosticStatus.ERROR, 'broken; late; slow')
+
+
+def test_stages_in_numbers():
+    stages = Stages()
+    for ms in range(1, 101):
+        stages.add({'search': float(ms)})
+    assert stages.values() == {'search last [ms]': '100.0', 'search mean [ms]': '50.5',
+                               'search p99 [ms]': '99.0'}
+    for _ in range(1000):
+        stages.add({'search': 7.0})
+    assert stages.values()['search p99 [ms]'] == '7.0', 'what is long ago counts no more'
+
+
+def test_stages_of_one_result_follow_each_other():
+    times = StageTimes(time.monotonic() - 2.0)
+    times.mark('waiting')
+    times.mark('search')
+    assert list(times.ms) == ['waiting', 'search']
+    assert times.ms['waiting'] == pytest.approx(2000.0, abs=500.0)
+    assert 0.0 <= times.ms['search'] < 500.0
+
+
+def test_stages_are_told_in_whole_milliseconds():
+    times = StageTimes(time.monotonic())
+    assert str(times) == ''
+    times.mark('decoding')
+    assert str(times) == 'decoding 0 ms'
+
+
+def test_rates_survive_a_new_beginning(wait):
+    rates = Rates()
+    start = time.monotonic()
+    wait(lambda: time.monotonic() - start > 0.6, 'half a second')
+    rate = rates.update({'image': 30})['image']
+    assert rate == pytest.approx(30 / (time.monotonic() - start), rel=0.2)
+    assert rates.update({'image': 1000})['image'] == rate, 'too soon to say anything new'
+    start = time.monotonic()
+    wait(lambda: time.monotonic() - start > 0.6, 'half a second')
+    assert rates.update({'image': 0})['image'] == 0.0
+
+
+def test_a_node_says_how_it_is_once_a_second(make_node, spin_until):
+    health, heard = Health(values={'device': 'cpu'}), []
+    node, listener = make_node('patient', namespace='robot_1'), make_node('doctor')
+    Diagnostics(node, lambda: health, lambda: 'active')
+    listener.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda msg: heard.append((time.monotonic(), msg)), 10)
+    spin_until([node, listener], lambda: len(heard) >= 3, 'three reports')
+    times, messages = zip(*heard, strict=True)
+    assert times[2] - times[0] == pytest.approx(2.0, abs=0.5)
+    status, = messages[0].status
+    assert (status.level, status.name, status.message) == (
+        DiagnosticStatus.OK, 'robot_1/patient: status', 'active')
+    values = {value.key: value.value for value in status.values}
+    assert (values['state'], values['device']) == ('active', 'cpu')
+    assert 10 < float(values['memory [MiB]']) < 1e5
+    health.fail('broken')
+    heard.clear()
+    spin_until([node, listener], lambda: heard, 'a report')
+    assert heard[0][1].status[0].message == 'broken'
