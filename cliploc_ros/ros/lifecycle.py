@@ -252,4 +252,5 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def _report(self, traceback_text: str) -> None:
         """Log a defect; one that comes with every frame must not fill the disk."""
-        self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
+        if self.context.ok():  # else rclpy stumbles over the end of the process
+            self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
