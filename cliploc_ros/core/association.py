@@ -7,6 +7,7 @@ each detection with the k landmarks whose labels match its crop best, *hybrid* s
 and verifies with both.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,11 +47,14 @@ class Candidates:
         """Return (detection, landmark) of each candidate (c, 2)."""
         return np.stack([self.detections, self.landmarks], axis=1)
 
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> 'Candidates':
+        """Return some of the candidates."""
+        return Candidates(self.detections[rows], self.landmarks[rows], self.ranks[rows],
+                          self.similarities[rows])
+
     def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
         """Return the candidates sorted by keys, the first key first; ties keep their order."""
-        order = np.lexsort(keys[::-1])
-        return Candidates(self.detections[order], self.landmarks[order], self.ranks[order],
-                          self.similarities[order])
+        return self.select(np.lexsort(keys[::-1]))
 
 
 def same_class(detection_classes: tuple[str, ...], landmark_classes: tuple[str, ...]
@@ -70,18 +74,66 @@ def class_candidates(mask: NDArray[np.bool_]) -> Candidates:
     return Candidates(detections, landmarks, zeros.astype(np.int64), zeros)
 
 
-def rarest_first(candidates: Candidates, mask: NDArray[np.bool_]) -> Candidates:
-    """Return candidates of equal class, those of few landmarks before those of many.
-
-    Where a class has few landmarks, a pair is the likelier to be right.
+@dataclass(frozen=True)
+class ClassIndex:
+    """The landmarks of each class of a map: L landmarks, C classes.
 
     Parameters
     ----------
-    candidates : Candidates
-    mask : ndarray (n, L) of bool
-        See same_class.
+    numbers : mapping
+        Number of each class name, 0 to C - 1.
+    of_landmarks : ndarray (L,) of int
+        Class number of each landmark.
+    landmarks : ndarray (L,) of int
+        Those of one class together, in the map's order.
+    starts : ndarray (C + 1,) of int
+        Where each class begins in landmarks.
     """
-    return candidates.ordered(mask.sum(axis=1)[candidates.detections])
+
+    numbers: Mapping[str, int]
+    of_landmarks: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    starts: NDArray[np.int64]
+
+    @staticmethod
+    def of(landmark_classes: Sequence[str]) -> 'ClassIndex':
+        """Return the index of a map's classes."""
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(landmark_classes))}
+        of_landmarks = np.array([numbers[name] for name in landmark_classes], dtype=np.int64)
+        return ClassIndex(numbers, of_landmarks, np.argsort(of_landmarks, kind='stable'),
+                          np.append(0, np.cumsum(np.bincount(of_landmarks))).astype(np.int64))
+
+    def classes_of(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """Return the number of each name (n,); -1 for classes that the map does not have."""
+        return np.array([self.numbers.get(name, -1) for name in names], dtype=np.int64)
+
+    def sizes_of(self, classes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many landmarks each class (n,) has."""
+        return np.where(classes >= 0, np.diff(self.starts)[classes], 0)
+
+    def candidates(self, classes: NDArray[np.int64], *, rarest_first: bool = False,
+                   limit: int | None = None) -> Candidates:
+        """Return pairs of equal class, detection by detection, no more than a limit.
+
+        Parameters
+        ----------
+        classes : ndarray (n,) of int
+            Of each detection, see classes_of.
+        rarest_first : bool
+            Begin with detections whose class has few landmarks: there a pair is the likelier to
+            be right.
+        limit : int, optional
+        """
+        sizes = self.sizes_of(classes)
+        order = np.argsort(sizes, kind='stable') if rarest_first else np.arange(len(classes))
+        taken = sizes[order]
+        if limit is not None:
+            taken = np.clip(limit - (np.cumsum(taken) - taken), 0, taken)
+        detections = np.repeat(order, taken)
+        within = np.arange(len(detections)) - np.repeat(np.cumsum(taken) - taken, taken)
+        landmarks = self.landmarks[self.starts[classes[detections]] + within]
+        zeros = np.zeros(len(detections))
+        return Candidates(detections, landmarks, zeros.astype(np.int64), zeros)
 
 
 def check_k(k: int, landmark_count: int) -> None:
@@ -134,16 +186,17 @@ def balanced_order(candidates: Candidates) -> Candidates:
     return candidates.ordered(candidates.ranks, -candidates.similarities)
 
 
-def joined(first: Candidates, second: Candidates, shape: tuple[int, int]) -> Candidates:
+def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
     """Return the candidates of both, those of the first before what the second adds.
 
     Parameters
     ----------
     first, second : Candidates
-    shape : tuple of int
-        Number of detections and of landmarks.
+    landmark_count : int
+        Of the map.
     """
-    new = np.nonzero(~candidate_mask(first, shape)[second.detections, second.landmarks])[0]
+    known = first.detections * landmark_count + first.landmarks
+    new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return Candidates(np.concatenate([first.detections, second.detections[new]]),
                       np.concatenate([first.landmarks, second.landmarks[new]]),
                       np.concatenate([first.ranks, second.ranks[new]]),

@@ -6,11 +6,14 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.association import ClassIndex
+from cliploc_ros.core.culling import Forest, make_forest
 from cliploc_ros.core.ellipsoid import shape_matrices
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
@@ -53,10 +56,24 @@ class LandmarkMap:
         """Return the number of landmarks."""
         return len(self.landmark_ids)
 
-    @property
+    def prepare(self) -> None:
+        """Make now what the first request would have to wait for."""
+        _ = self.shapes, self.classes, self.forest
+
+    @cached_property
     def shapes(self) -> NDArray[np.float64]:
         """Return the shape matrices (L, 6), see cliploc_ros.core.ellipsoid."""
         return shape_matrices(self.semi_axes, self.quats_xyzw)
+
+    @cached_property
+    def classes(self) -> ClassIndex:
+        """Return which landmarks are of which class."""
+        return ClassIndex.of(self.class_ids)
+
+    @cached_property
+    def forest(self) -> Forest:
+        """Return what tells which landmarks a pose can see."""
+        return make_forest(self.centers, self.shapes, self.classes.of_landmarks)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':

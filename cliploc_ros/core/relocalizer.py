@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core import association
 from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
-from cliploc_ros.core.association import Candidates
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.finalists import as_found, covariance_of, matches_of, meetings_of, refined
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, refine
@@ -129,7 +129,7 @@ class Relocalizer:
         if options.needs_similarities:
             association.check_k(options.k, len(landmark_map))
         self._map = landmark_map
-        self._shapes = landmark_map.shapes
+        landmark_map.prepare()
         self._options = options
 
     def warm_up(self) -> None:
@@ -177,22 +177,16 @@ class Relocalizer:
             raise OptionsError(f'one observation at a time, not {len(observations)}')
         observation = observations[0]
         start = time.perf_counter()
-        bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
-        candidates, potential = self._associate(observation)
-        # NaN where the lens model has no inverse; and a box turned inside out has no ellipse
-        sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1)
-        potential &= sound[:, None]
-        pairs = candidates.pairs[sound[candidates.detections]]
+        scene, share = match_frame(self._map, observation, self._options)
         vertical = self._vertical(observation)
-        size = SAMPLE_SIZE - 1 if vertical[6] > 0.0 else SAMPLE_SIZE
-        if _distinct(pairs) < size:
+        size = _sample_size(vertical)
+        if _distinct(scene.pairs) < size:
             return Relocalization(
-                False, f'{len(bboxes)} detections give fewer than {size} different '
-                'correspondence candidates', stamp_ns=observation.stamp_ns)
-        scene = make_scene(np.where(sound[:, None], bboxes, 1.0), self._map.centers, self._shapes,
-                           potential, pairs, self._options.iou_threshold)
+                False, f'{len(observation.detections)} detections give fewer than {size} '
+                'different correspondence candidates', stamp_ns=observation.stamp_ns)
         leaders = Leaders.none_yet(_REFINED if self._options.refine else MAX_DISTINCT)
         progress, samples = self._search(scene, vertical, leaders, start)
+        progress = progress._replace(coverage=progress.coverage * share)
         return self._conclude(observation, scene, vertical, leaders, progress, samples, start)
 
     def _vertical(self, observation: Observation) -> NDArray[np.float64]:
@@ -211,35 +205,6 @@ class Relocalizer:
         return Prior(up_in_camera, _UP_IN_MAP, low, high,
                      np.radians(self._options.max_tilt_deg))
 
-    def _associate(self, observation: Observation) -> tuple[Candidates, NDArray[np.bool_]]:
-        """Return the candidates in the sampler's order, and the verification mask (n, L)."""
-        options = self._options
-        shape = (len(observation.detections), len(self._map))
-        by_class = association.same_class(observation.detections.class_ids, self._map.class_ids)
-        of_class = association.class_candidates(by_class)
-        if options.algorithm == 'auto':
-            of_class = association.rarest_first(of_class, by_class)
-        if not options.needs_similarities:
-            return of_class, by_class
-        similarities = observation.similarities
-        if similarities is None or similarities.shape != shape:
-            found = 'none' if similarities is None else f'{similarities.shape}'
-            raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
-                               f'{shape}, found {found}')
-        if not np.isfinite(similarities).all():
-            raise OptionsError('similarities hold values that are not finite')
-        candidates = association.nearest_candidates(similarities, options.k)
-        potential = association.candidate_mask(candidates, shape)
-        if options.matching == 'hybrid':
-            potential |= by_class
-        if options.algorithm == 'prosac':
-            candidates = association.prosac_order(candidates)
-        elif options.algorithm in ('b-prosac', 'auto'):
-            candidates = association.balanced_order(candidates)
-        if options.matching == 'hybrid' and options.algorithm == 'auto':
-            candidates = association.joined(candidates, of_class, shape)
-        return candidates, potential
-
     def _search(self, scene: Scene, vertical: NDArray[np.float64], leaders: Leaders,
                 start: float) -> tuple[Progress, NDArray[np.int64] | None]:
         """Run the algorithm that the options name, as far as time allows.
@@ -247,11 +212,11 @@ class Relocalizer:
         Returns how far it came, and the samples (t, 3) where these were drawn.
         """
         options = self._options
-        prior, limit, samples = self._prior(vertical), math.inf, None
+        prior, samples = self._prior(vertical), None
         if options.algorithm == 'auto':
-            limit = options.iterations
             try_all = search_vertically if vertical[6] > 0.0 else search_progressively
-            search = try_all(scene, compatible_pairs(scene), leaders, prior)
+            search = try_all(scene, compatible_pairs(scene), leaders, prior,
+                             options.iterations)
         elif options.algorithm == 'bf':
             search = search_exhaustively(scene, leaders, prior)
         else:
@@ -262,7 +227,7 @@ class Relocalizer:
         progress = Progress(0, 1.0)
         for step in search:
             progress = step
-            if progress.tried >= limit or time.perf_counter() - start > options.time_budget_s:
+            if time.perf_counter() - start > options.time_budget_s:
                 break
         return progress, samples
 
@@ -285,12 +250,19 @@ class Relocalizer:
         evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
-            coverage=progress.coverage, tried=progress.tried,
+            # those that boxes contradict were looked at too
+            coverage=progress.coverage,
+            tried=max(progress.tried, math.comb(progress.reach, _sample_size(vertical))),
             meetings=meetings_of(scene, best, explained[0], progress, samples))
         reason = refusal(evidence, self._options)
         return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
                               progress.tried, best.iteration, progress.coverage,
                               _elapsed_ms(start), observation.stamp_ns, evidence.strength)
+
+
+def _sample_size(vertical: NDArray[np.float64]) -> int:
+    """Return how many candidates make a pose."""
+    return SAMPLE_SIZE - 1 if vertical[6] > 0.0 else SAMPLE_SIZE
 
 
 def _distinct(pairs: NDArray[np.int64]) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.culling import Forest, Groups, make_groups, no_forest, visible_ranges
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.ellipsoid import project_ellipsoid
 from cliploc_ros.core.p3p import MAX_SOLUTIONS, p3p
@@ -30,7 +31,7 @@ class Scene(NamedTuple):
     centers, shapes : ndarray (L, 3), (L, 6)
         Of the landmarks, see cliploc_ros.core.ellipsoid.
     potential_landmarks : ndarray (u,)
-        Landmarks that any detection may show, each once.
+        Landmarks that any detection may show, beside those of the groups, each once.
     potential_starts : ndarray (u + 1,)
         Where each one's detections begin in potential_detections.
     potential_detections : ndarray (v,)
@@ -39,6 +40,8 @@ class Scene(NamedTuple):
         Detection and landmark of each correspondence candidate, in order of preference.
     iou_threshold : float
         A detection whose best IoU is not above it has no landmark.
+    forest, groups : Forest, Groups
+        Of a large map the landmarks that detections may show by their class.
     """
 
     box_ellipses: NDArray[np.float64]
@@ -50,6 +53,8 @@ class Scene(NamedTuple):
     potential_detections: NDArray[np.int64]
     pairs: NDArray[np.int64]
     iou_threshold: float
+    forest: Forest
+    groups: Groups
 
 
 class Workspace(NamedTuple):
@@ -71,8 +76,9 @@ class Workspace(NamedTuple):
 
 
 def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
-               shapes: NDArray[np.float64], potential: NDArray[np.bool_],
-               pairs: NDArray[np.int64], iou_threshold: float) -> Scene:
+               shapes: NDArray[np.float64], potential: NDArray[np.bool_] | NDArray[np.int64],
+               pairs: NDArray[np.int64], iou_threshold: float, forest: Forest | None = None,
+               classes: NDArray[np.int64] | None = None) -> Scene:
     """Return the scene of one frame.
 
     Parameters
@@ -81,22 +87,30 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
         Boxes x, y, x, y on the plane z = 1 (undistorted).
     centers, shapes : ndarray (L, 3), (L, 6)
         Of the landmarks.
-    potential : ndarray (n, L) of bool
-        Which landmark each detection may show.
+    potential : ndarray (n, L) of bool, or (p, 2) of int
+        Which landmark each detection may show: a mask, or pairs of detection and landmark.
     pairs : ndarray (c, 2)
         Correspondence candidates, in order of preference.
     iou_threshold : float
         0 to 1.
+    forest : Forest, optional
+        Of the map, with classes: a detection may show every landmark of its class as well.
+    classes : ndarray (n,) of int, optional
+        Of each detection in the forest; below 0 for none.
     """
     middle, half = (bboxes[:, :2] + bboxes[:, 2:]) / 2, (bboxes[:, 2:] - bboxes[:, :2]) / 2
     bearings = np.concatenate([middle, np.ones((len(bboxes), 1))], axis=1)
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-    landmarks, detections = np.nonzero(potential.T)
-    unique, starts = np.unique(landmarks, return_index=True)
-    return Scene(np.ascontiguousarray(np.concatenate([middle, half], axis=1)), bearings,
-                 np.ascontiguousarray(centers), np.ascontiguousarray(shapes), unique,
-                 np.append(starts, len(landmarks)), detections, np.ascontiguousarray(pairs),
-                 float(iou_threshold))
+    boxes = np.ascontiguousarray(np.concatenate([middle, half], axis=1))
+    single = np.argwhere(potential) if potential.dtype == np.bool_ else potential
+    single = single[np.lexsort(single.T)].astype(np.int64)  # by landmark
+    unique, starts = np.unique(single[:, 1], return_index=True)
+    if forest is None or classes is None:
+        forest, classes = no_forest(), np.empty(0, dtype=np.int64)
+    return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
+                 unique, np.append(starts, len(single)), np.ascontiguousarray(single[:, 0]),
+                 np.ascontiguousarray(pairs), float(iou_threshold), forest,
+                 make_groups(forest, classes, boxes, iou_threshold))
 
 
 @compiled
@@ -148,25 +162,35 @@ def verify(scene, rotation, translation, workspace):
     landmarks[:] = -1
     for u in range(scene.potential_landmarks.shape[0]):
         landmark = scene.potential_landmarks[u]
-        visible, cx, cy, exx, exy, eyy = project_ellipsoid(
-            rotation, translation, scene.centers[landmark], scene.shapes[landmark])
-        if not visible:
-            continue
-        for v in range(scene.potential_starts[u], scene.potential_starts[u + 1]):
-            detection = scene.potential_detections[v]
-            box = scene.box_ellipses[detection]
-            if _iou_bound(box, cx, cy, exx, eyy) <= ious[detection]:
-                continue
-            iou = ellipse_iou(box[0], box[1], box[2], box[3], cx, cy, exx, exy, eyy)
-            if iou > ious[detection]:
-                ious[detection] = iou
-                landmarks[detection] = landmark
+        _compare(scene.box_ellipses, scene.potential_detections, scene.potential_starts[u],
+                 scene.potential_starts[u + 1], rotation, translation, scene.centers[landmark],
+                 scene.shapes[landmark], landmark, ious, landmarks)
+    if scene.groups.nodes.shape[0] > 0:
+        _verify_groups(scene, rotation, translation, ious, landmarks)
     score = 0.0
     for detection in range(ious.shape[0]):
         if landmarks[detection] < 0:
             ious[detection] = 0.0
         score += ious[detection]
     return score
+
+
+@compiled
+def _compare(boxes, detections, first, last, rotation, translation, center, shape, landmark, ious,
+             landmarks):
+    """Let detections first to last take a landmark if it overlaps them more than what they had."""
+    visible, cx, cy, exx, exy, eyy = project_ellipsoid(rotation, translation, center, shape)
+    if not visible:
+        return
+    for v in range(first, last):
+        detection = detections[v]
+        box = boxes[detection]
+        if _iou_bound(box, cx, cy, exx, eyy) <= ious[detection]:
+            continue
+        iou = ellipse_iou(box[0], box[1], box[2], box[3], cx, cy, exx, exy, eyy)
+        if iou > ious[detection]:
+            ious[detection] = iou
+            landmarks[detection] = landmark
 
 
 @compiled
@@ -180,3 +204,27 @@ def _iou_bound(box, cx, cy, exx, eyy):
     # The shared area lies in the shared box and in the box's own ellipse; the union holds the
     # latter.
     return width * height / (np.pi * box[2] * box[3])
+
+
+@compiled
+def _verify_groups(scene, rotation, translation, ious, landmarks):
+    """Compare detections with what a pose may see of their groups."""
+    near, numbers, spheres, rows, leaves, _ = scene.forest
+    nodes, _, starts, detections, reaches, frusta = scene.groups
+    rotations, translations = rotation.reshape(1, 3, 3), translation.reshape(1, 3)
+    center = -(rotation.T @ translation)
+    for group in range(nodes.shape[0]):
+        reach = reaches[group] * reaches[group]
+        ranges = np.empty((nodes[group, 1] - nodes[group, 0], 2), dtype=np.int64)
+        runs = visible_ranges(spheres, rows, leaves, nodes, reaches, frusta, group, rotations,
+                              translations, 0, ranges)
+        for run in range(runs):
+            for row in range(ranges[run, 0], ranges[run, 1]):
+                x, y = near[row, 0] - center[0], near[row, 1] - center[1]
+                z = near[row, 2] - center[2]
+                if x * x + y * y + z * z > near[row, 9] * reach:
+                    continue
+                landmark = numbers[row]
+                _compare(scene.box_ellipses, detections, starts[group], starts[group + 1],
+                         rotation, translation, scene.centers[landmark],
+                         scene.shapes[landmark], landmark, ious, landmarks)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import Tree, make_tree, morton_order, visible_ranges
+from cliploc_ros.core.culling import Forest, Groups, visible_ranges
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.p3p import MAX_SOLUTIONS
 from cliploc_ros.core.scoring import Scene
@@ -59,14 +59,15 @@ class Bench(NamedTuple):
     candidates : ndarray (c, 16)
         Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
         landmark of each correspondence candidate.
-    tree : Tree
-        Of the landmarks that any detection may show.
+    forest, groups : Forest, Groups
+        See Scene.
     landmarks : ndarray (u, 10)
-        Their centres, shapes and squared reaches, neighbours together.
+        Centres, shapes and squared radii of the landmarks that single detections may show. The
+        radii are infinite: these are looked at from anywhere.
     boxes : ndarray (n, 4)
         Box ellipses of the detections.
     starts, detections : ndarray (u + 1,), (v,)
-        Where each landmark's detections begin in detections.
+        Where each of these landmarks' detections begin in detections.
     prior : ndarray (9,)
         See Prior.as_array.
     iou_threshold : float
@@ -82,17 +83,19 @@ class Bench(NamedTuple):
     uppers : ndarray (4,)
         Upper bounds of the sums of their IoUs; -1 where a pose is out of the question.
     ranges : ndarray (l, 2)
-        Runs of landmarks that one pose may see.
-    outlines : ndarray (u, 6)
-        Of these: centre, half extents, exy, the semi-axes' product.
-    entries, bounds : ndarray (v, 2), (v,)
+        Runs of a group's landmarks that one pose may see.
+    outlines : ndarray (w, 6)
+        Of all that it may see: centre, half extents, exy, the semi-axes' product. Room for all,
+        of which the system gives only what is written to; so too the next two.
+    entries, bounds : ndarray (x, 2), (x,)
         Pairs of detection and outline that may overlap enough, and upper bounds of their IoUs.
     best_bounds : ndarray (n,)
         The greatest of each detection.
     """
 
     candidates: NDArray[np.float64]
-    tree: Tree
+    forest: Forest
+    groups: Groups
     landmarks: NDArray[np.float64]
     boxes: NDArray[np.float64]
     starts: NDArray[np.int64]
@@ -124,35 +127,22 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
         Poses that it rules out are not verified.
     """
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
-    rows = scene.potential_landmarks
-    table = np.concatenate([scene.centers[rows], scene.shapes[rows]], axis=1)
-    numbers = np.diff(scene.potential_starts)
-    box_axes = scene.box_ellipses[:, 2:].prod(axis=1)
-    if len(rows):
-        least_axes = np.minimum.reduceat(box_axes[scene.potential_detections],
-                                         scene.potential_starts[:-1])
-        order = morton_order(table[:, :3])
-    else:
-        table, least_axes, order = np.zeros((1, 9)), np.zeros(1), np.zeros(1, dtype=np.int64)
-        numbers = np.zeros(1, dtype=np.int64)
-    table, numbers = table[order], numbers[order]
-    starts = np.concatenate([[0], np.cumsum(numbers)]).astype(np.int64)
-    begins = np.repeat(np.append(scene.potential_starts[:-1], 0)[order], numbers)
-    pairs = begins + np.arange(starts[-1]) - np.repeat(starts[:-1], numbers)
-    tree, reaches = make_tree(table, least_axes[order], scene.box_ellipses,
-                              scene.iou_threshold)
+    rows, groups = scene.potential_landmarks, scene.groups
+    table = np.column_stack([scene.centers[rows], scene.shapes[rows], np.full(len(rows), inf)])
+    in_groups = int(groups.sizes.sum())
+    pairs = len(scene.potential_detections) + int(groups.sizes @ np.diff(groups.starts))
+    leaves = int((groups.nodes[:, 1] - groups.nodes[:, 0]).max(initial=0))
     return Bench(
         np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                         scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
-        tree, np.column_stack([table, reaches * reaches]), scene.box_ellipses, starts,
-        scene.potential_detections[pairs].astype(np.int64), (prior or Prior()).as_array(),
+        scene.forest, groups, table, scene.box_ellipses, scene.potential_starts,
+        scene.potential_detections, (prior or Prior()).as_array(),
         scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
         np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
         np.empty((3, 4)), np.full((3, 10), inf),
         np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS),
-        np.empty((int(tree.leaves.sum()), 2), dtype=np.int64), np.empty((len(table), 6)),
-        np.empty((len(pairs), 2), dtype=np.int64), np.empty(len(pairs)),
-        np.empty(len(scene.bearings)))
+        np.empty((leaves, 2), dtype=np.int64), np.empty((len(rows) + in_groups, 6)),
+        np.empty((pairs, 2), dtype=np.int64), np.empty(pairs), np.empty(len(scene.bearings)))
 
 
 @compiled
@@ -183,12 +173,14 @@ def allowed(prior, rotations, translations, which):
 
 
 @compiled
-def project(rotations, translations, which, landmarks, first, last, outlines, out):
+def project(rotations, translations, which, landmarks, first, last, reach, outlines, out):
     """Write the outlines of landmarks first to last at one pose into rows from out on.
 
     As project_ellipsoid, in one loop without calls, which is several times faster; of ellipsoids
-    that are not wholly in front, or beyond their reach, the half extents are minus infinity.
+    that are not wholly in front, or farther off than reach times their radius, the half extents
+    are minus infinity.
     """
+    square = reach * reach
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
     r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
     r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
@@ -201,7 +193,7 @@ def project(rotations, translations, which, landmarks, first, last, outlines, ou
         y = r10 * px + r11 * py + r12 * pz + t1
         z = r20 * px + r21 * py + r22 * pz + t2
         outlines[out, 2] = outlines[out, 3] = -inf
-        if not (z > 0.0 and x * x + y * y + z * z <= landmarks[row, 9]):
+        if not (z > 0.0 and x * x + y * y + z * z <= landmarks[row, 9] * square):
             out += 1
             continue
         x0 = sxx * r00 + sxy * r01 + sxz * r02
@@ -265,7 +257,8 @@ def choose_pose(prior, rotations, translations, size, count, boxes, landmarks, o
     for which in range(count):
         uppers[which] = -1.0
         if allowed(prior, rotations, translations, which):
-            project(rotations, translations, which, landmarks, 0, size, outlines, 3 * which)
+            project(rotations, translations, which, landmarks, 0, size, 1.0,
+                    outlines, 3 * which)
             uppers[which] = _sampled_upper(boxes, size, outlines, 3 * which)
         if uppers[which] >= least_iou:
             visible += 1
@@ -315,19 +308,17 @@ def _sampled_total(boxes, size, outlines, first):
 
 
 @compiled
-def verify_beyond(tree, landmarks, boxes, starts, detections, iou_threshold, rotations,
+def verify_beyond(forest, groups, landmarks, boxes, starts, detections, iou_threshold, rotations,
                   translations, which, ranges, outlines, entries, bounds, best_bounds, floor):
     """Return the score of a pose if it is above a floor; if not, the floor."""
-    spheres, rows, leaves, frustum = tree
-    runs = visible_ranges(spheres, rows, leaves, frustum, rotations, translations, which, ranges)
     best_bounds[:] = iou_threshold
-    count, out = 0, 0
-    for run in range(runs):
-        first, last = ranges[run, 0], ranges[run, 1]
-        project(rotations, translations, which, landmarks, first, last, outlines, out)
-        count = _bound(boxes, starts, detections, iou_threshold, first, last, outlines, out,
-                       entries, bounds, best_bounds, count)
-        out += last - first
+    out = landmarks.shape[0]
+    project(rotations, translations, which, landmarks, 0, out, 1.0, outlines, 0)
+    count = _bound(boxes, starts, 0, 1, detections, iou_threshold, 0, out, outlines, entries,
+                   bounds, best_bounds, 0)
+    if groups[0].shape[0] > 0:
+        count = _look_around(forest, groups, boxes, iou_threshold, rotations, translations,
+                             which, ranges, outlines, out, entries, bounds, best_bounds, count)
     upper = 0.0
     for detection in range(boxes.shape[0]):
         if best_bounds[detection] > iou_threshold:
@@ -357,17 +348,40 @@ def verify_beyond(tree, landmarks, boxes, starts, detections, iou_threshold, rot
 
 
 @compiled
-def _bound(boxes, starts, detections, iou_threshold, first, last, outlines, out, entries, bounds,
-           best_bounds, count):
-    """Add the pairs of some landmarks that may overlap enough; return how many there are now."""
-    for row in range(first, last):
-        outline = out + row - first
+def _look_around(forest, groups, boxes, iou_threshold, rotations, translations, which, ranges,
+                 outlines, out, entries, bounds, best_bounds, count):
+    """Project what a pose may see of each group from row out on; go on as _bound does."""
+    landmarks, _, spheres, rows, leaves, _ = forest
+    nodes, _, starts, detections, reaches, frusta = groups
+    for group in range(nodes.shape[0]):
+        runs = visible_ranges(spheres, rows, leaves, nodes, reaches, frusta, group, rotations,
+                              translations, which, ranges)
+        first = out
+        for run in range(runs):
+            project(rotations, translations, which, landmarks, ranges[run, 0], ranges[run, 1],
+                    reaches[group], outlines, out)
+            out += ranges[run, 1] - ranges[run, 0]
+        count = _bound(boxes, starts, group, 0, detections, iou_threshold, first, out, outlines,
+                       entries, bounds, best_bounds, count)
+    return count
+
+
+@compiled
+def _bound(boxes, starts, start, step, detections, iou_threshold, first, last, outlines, entries,
+           bounds, best_bounds, count):
+    """Add the pairs of some outlines that may overlap enough; return how many there are now.
+
+    The detections of the first outline are those from starts[start] on; each further outline's
+    are the next step's.
+    """
+    for outline in range(first, last):
+        place = start + step * (outline - first)
         half_x = outlines[outline, 2]
         if not half_x > 0.0:
             continue
         cx, cy, half_y = outlines[outline, 0], outlines[outline, 1], outlines[outline, 3]
         axes = outlines[outline, 5]
-        for pair in range(starts[row], starts[row + 1]):
+        for pair in range(starts[place], starts[place + 1]):
             detection = detections[pair]
             bound = iou_bound(boxes[detection, 0], boxes[detection, 1], boxes[detection, 2],
                               boxes[detection, 3], cx, cy, half_x, half_y, axes)

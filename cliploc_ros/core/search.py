@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: hypotheses from minimal samples, and the best of them at distinct places."""
 
+import time
 from collections.abc import Iterator
-from math import comb
+from math import comb, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -36,10 +37,9 @@ MIN_SAMPLED_IOU = 0.9
 MIN_SAMPLED_PAIR_IOU = 0.2
 # Scores nearer than this are equal, but for rounding: the hypothesis found first stays.
 _TIE = 1e-9
-# A block of a search takes a millisecond or so, so that time limits hold: so many samples, and
-# fewer where each is verified against many landmarks and pairs.
-_SAMPLES_A_BLOCK = 500
-_WORK_A_BLOCK = 200_000
+# A block of a search takes about so long, so that time limits hold: this many samples at first.
+_BLOCK_S = 1e-3
+_FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 class Progress(NamedTuple):
@@ -114,12 +114,15 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     """
     bench = set_up(scene, prior)
     tried = 0
-    size = len(_new_block(scene))
-    for start in range(0, len(samples), size):
-        block = np.ascontiguousarray(samples[start:start + size])
+    pace, start = _Pace(len(samples)), 0
+    while not pace.at_end:
+        block = pace.begin()
+        block[:] = samples[start:start + len(block)]
         _try_samples(bench, block, len(block), start, 0.0, leaders)
+        start += len(block)
         tried += int((block[:, 0] >= 0).sum())
-        yield Progress(tried, (start + len(block)) / len(samples))
+        pace.end(len(block))
+        yield Progress(tried, start / len(samples))
 
 
 def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
@@ -142,12 +145,13 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
-    block = _new_block(scene)
-    tried = 0
+    pace, tried = _Pace(), 0
     while cursor[0] < count - 2:
+        block = pace.begin()
         found = enumerate_triples(scene.pairs, cursor, block)
         _try_samples(bench, block, found, tried, 0.0, leaders)
         tried += found
+        pace.end(found)
         first, second, third = (int(row) for row in cursor)
         left = (comb(max(0, count - first - 1), 3) + comb(max(0, count - second - 1), 2)
                 + max(0, count - third)) if first < count - 2 else 0
@@ -155,7 +159,7 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
 
 
 def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
-                         prior: Prior | None = None) -> Iterator[Progress]:
+                         prior: Prior | None = None, limit: float = inf) -> Iterator[Progress]:
     """Try every sample of compatible candidates, those of the first candidates first.
 
     All samples among the first n candidates are tried before one with the next: what PROSAC draws
@@ -170,6 +174,8 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         Changed in place.
     prior : Prior, optional
         Poses that it rules out are left.
+    limit : float, optional
+        The most samples to try.
 
     Yields
     ------
@@ -179,18 +185,19 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([2, 0, 1], dtype=np.int64)  # newest, first, second
-    block = _new_block(scene)
-    tried = 0
-    while cursor[0] < count:
+    pace, tried = _Pace(limit), 0
+    while cursor[0] < count and not pace.at_end:
+        block = pace.begin()
         found = enumerate_compatible_triples(compatible, cursor, block)
         _try_samples(bench, block, found, tried, MIN_SAMPLED_IOU, leaders)
         tried += found
+        pace.end(found)
         done = comb(int(cursor[0]), 3) if cursor[0] < count else comb(count, 3)
         yield Progress(tried, done / max(comb(count, 3), 1), min(int(cursor[0]), count))
 
 
 def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
-                      prior: Prior) -> Iterator[Progress]:
+                      prior: Prior, limit: float = inf) -> Iterator[Progress]:
     """Try every pair of compatible candidates with a known vertical, the first candidates first.
 
     Two correspondences and the vertical fix a pose (see cliploc_ros.core.two_point). Of the
@@ -206,6 +213,8 @@ def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Lead
         Changed in place.
     prior : Prior
         Its verticals are held equal; poses outside of its heights are left.
+    limit : float, optional
+        The most samples to try.
 
     Yields
     ------
@@ -215,21 +224,46 @@ def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Lead
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([1, 0], dtype=np.int64)  # newest, first
-    block = _new_block(scene)
-    tried = 0
-    while cursor[0] < count:
+    pace, tried = _Pace(limit), 0
+    while cursor[0] < count and not pace.at_end:
+        block = pace.begin()
         found = enumerate_compatible_pairs(compatible, cursor, block)
         _try_samples(bench, block, found, tried, MIN_SAMPLED_PAIR_IOU, leaders)
         tried += found
+        pace.end(found)
         done = comb(int(cursor[0]), 2) if cursor[0] < count else comb(count, 2)
         yield Progress(tried, done / max(comb(count, 2), 1), min(int(cursor[0]), count))
 
 
-def _new_block(scene: Scene) -> NDArray[np.int64]:
-    """Return memory (b, 3) for a block of samples, filled with -1."""
-    work = len(scene.potential_landmarks) + len(scene.potential_detections)
-    size = min(_SAMPLES_A_BLOCK, max(1, _WORK_A_BLOCK // (work + 1)))
-    return np.full((size, SAMPLE_SIZE), -1, dtype=np.int64)
+class _Pace:
+    """Cuts a search into blocks of about equal time; what is found does not depend on it.
+
+    Parameters
+    ----------
+    limit : float
+        How many samples to try in all.
+    """
+
+    def __init__(self, limit: float = inf) -> None:
+        self._memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
+        self._left, self._size, self._start = limit, _FIRST_BLOCK, 0.0
+
+    @property
+    def at_end(self) -> bool:
+        """Return whether all samples were tried."""
+        return self._left <= 0
+
+    def begin(self) -> NDArray[np.int64]:
+        """Return memory (b, 3) for the samples of the next block."""
+        self._start = time.perf_counter()
+        return self._memory[:int(min(self._size, self._left))]
+
+    def end(self, tried: int) -> None:
+        """Take note that a block is done, and how many samples it had."""
+        self._left -= tried
+        elapsed = max(time.perf_counter() - self._start, 1e-9)
+        wanted = int(self._size * min(_BLOCK_S / elapsed, 4.0))
+        self._size = min(max(wanted, 1), _LARGEST_BLOCK)
 
 
 @compiled
@@ -254,8 +288,8 @@ def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
                             bench.sampled_outlines, bench.uppers, least_iou)
         if which < 0:
             continue
-        score = verify_beyond(bench.tree, bench.landmarks, bench.boxes, bench.starts,
-                              bench.detections, bench.iou_threshold, bench.rotations,
+        score = verify_beyond(bench.forest, bench.groups, bench.landmarks, bench.boxes,
+                              bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
                               bench.translations, which, bench.ranges, bench.outlines,
                               bench.entries, bench.bounds, bench.best_bounds, floor)
         if score > floor:

@@ -65,8 +65,8 @@ def poses_of(scene, samples, prior=None, least_iou=0.0):
 
 
 def score_beyond(bench, which, floor):
-    return verify_beyond(bench.tree, bench.landmarks, bench.boxes, bench.starts,
-                         bench.detections, bench.iou_threshold, bench.rotations,
+    return verify_beyond(bench.forest, bench.groups, bench.landmarks, bench.boxes,
+                         bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
                          bench.translations, which, bench.ranges, bench.outlines,
                          bench.entries, bench.bounds, bench.best_bounds, floor)
 
