@@ -8,16 +8,17 @@ of a detection's landmarks only those are compared exactly whose bound beats wha
 are those of scoring, to rounding.
 """
 
-from math import cos, inf, pi, sqrt
+from math import cos, inf, pi
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import Forest, Groups, visible_ranges
+from cliploc_ros.core.culling import Groups, Tree
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.p3p import MAX_SOLUTIONS
+from cliploc_ros.core.projection import project, project_groups
 from cliploc_ros.core.scoring import Scene
 
 # A bound is raised by this, more than rounding can make an IoU or a sum of them greater.
@@ -59,7 +60,7 @@ class Bench(NamedTuple):
     candidates : ndarray (c, 16)
         Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
         landmark of each correspondence candidate.
-    forest, groups : Forest, Groups
+    tree, groups : Tree, Groups
         See Scene.
     landmarks : ndarray (u, 10)
         Centres, shapes and squared radii of the landmarks that single detections may show. The
@@ -83,10 +84,12 @@ class Bench(NamedTuple):
     uppers : ndarray (4,)
         Upper bounds of the sums of their IoUs; -1 where a pose is out of the question.
     ranges : ndarray (l, 2)
-        Runs of a group's landmarks that one pose may see.
+        Runs of the tree's landmarks that one pose may see.
     outlines : ndarray (w, 6)
         Of all that it may see: centre, half extents, exy, the semi-axes' product. Room for all,
-        of which the system gives only what is written to; so too the next two.
+        of which the system gives only what is written to; so too the next three.
+    owners : ndarray (w,)
+        The place in starts of each outline's detections.
     entries, bounds : ndarray (x, 2), (x,)
         Pairs of detection and outline that may overlap enough, and upper bounds of their IoUs.
     best_bounds : ndarray (n,)
@@ -94,7 +97,7 @@ class Bench(NamedTuple):
     """
 
     candidates: NDArray[np.float64]
-    forest: Forest
+    tree: Tree
     groups: Groups
     landmarks: NDArray[np.float64]
     boxes: NDArray[np.float64]
@@ -112,6 +115,7 @@ class Bench(NamedTuple):
     uppers: NDArray[np.float64]
     ranges: NDArray[np.int64]
     outlines: NDArray[np.float64]
+    owners: NDArray[np.int64]
     entries: NDArray[np.int64]
     bounds: NDArray[np.float64]
     best_bounds: NDArray[np.float64]
@@ -129,20 +133,25 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     rows, groups = scene.potential_landmarks, scene.groups
     table = np.column_stack([scene.centers[rows], scene.shapes[rows], np.full(len(rows), inf)])
-    in_groups = int(groups.sizes.sum())
-    pairs = len(scene.potential_detections) + int(groups.sizes @ np.diff(groups.starts))
-    leaves = int((groups.nodes[:, 1] - groups.nodes[:, 0]).max(initial=0))
+    shown = groups.of_classes >= 0
+    group_sizes = np.zeros(len(groups.reaches), dtype=np.int64)
+    group_sizes[groups.of_classes[shown]] = scene.tree.counts[shown]
+    pairs = len(scene.potential_detections) + int(group_sizes @ np.diff(groups.starts))
+    count = len(rows) + int(group_sizes.sum())
+    owners = np.empty(count, dtype=np.int64)
+    owners[:len(rows)] = np.arange(len(rows))
     return Bench(
         np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                         scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
-        scene.forest, groups, table, scene.box_ellipses, scene.potential_starts,
+        scene.tree, groups, table, scene.box_ellipses, scene.potential_starts,
         scene.potential_detections, (prior or Prior()).as_array(),
         scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
         np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
         np.empty((3, 4)), np.full((3, 10), inf),
         np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS),
-        np.empty((leaves, 2), dtype=np.int64), np.empty((len(rows) + in_groups, 6)),
-        np.empty((pairs, 2), dtype=np.int64), np.empty(pairs), np.empty(len(scene.bearings)))
+        np.empty((len(scene.tree.rows), 2), dtype=np.int64), np.empty((count, 6)),
+        owners, np.empty((pairs, 2), dtype=np.int64), np.empty(pairs),
+        np.empty(len(scene.bearings)))
 
 
 @compiled
@@ -170,57 +179,6 @@ def allowed(prior, rotations, translations, which):
         cosine += up * prior[axis]
         height -= up * translations[which, axis]
     return prior[6] <= height <= prior[7] and cosine >= prior[8]
-
-
-@compiled
-def project(rotations, translations, which, landmarks, first, last, reach, outlines, out):
-    """Write the outlines of landmarks first to last at one pose into rows from out on.
-
-    As project_ellipsoid, in one loop without calls, which is several times faster; of ellipsoids
-    that are not wholly in front, or farther off than reach times their radius, the half extents
-    are minus infinity.
-    """
-    square = reach * reach
-    r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
-    r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
-    r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
-    t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
-    for row in range(first, last):
-        px, py, pz = landmarks[row, 0], landmarks[row, 1], landmarks[row, 2]
-        sxx, sxy, sxz = landmarks[row, 3], landmarks[row, 4], landmarks[row, 5]
-        syy, syz, szz = landmarks[row, 6], landmarks[row, 7], landmarks[row, 8]
-        x = r00 * px + r01 * py + r02 * pz + t0
-        y = r10 * px + r11 * py + r12 * pz + t1
-        z = r20 * px + r21 * py + r22 * pz + t2
-        outlines[out, 2] = outlines[out, 3] = -inf
-        if not (z > 0.0 and x * x + y * y + z * z <= landmarks[row, 9] * square):
-            out += 1
-            continue
-        x0 = sxx * r00 + sxy * r01 + sxz * r02
-        x1 = sxy * r00 + syy * r01 + syz * r02
-        x2 = sxz * r00 + syz * r01 + szz * r02
-        y0 = sxx * r10 + sxy * r11 + sxz * r12
-        y1 = sxy * r10 + syy * r11 + syz * r12
-        y2 = sxz * r10 + syz * r11 + szz * r12
-        z0 = sxx * r20 + sxy * r21 + sxz * r22
-        z1 = sxy * r20 + syy * r21 + syz * r22
-        z2 = sxz * r20 + syz * r21 + szz * r22
-        weight = z * z - (r20 * z0 + r21 * z1 + r22 * z2)
-        if not weight > 0.0:
-            out += 1
-            continue
-        inverse = 1.0 / weight
-        cx = (x * z - (r00 * z0 + r01 * z1 + r02 * z2)) * inverse
-        cy = (y * z - (r10 * z0 + r11 * z1 + r12 * z2)) * inverse
-        exx = cx * cx + (r00 * x0 + r01 * x1 + r02 * x2 - x * x) * inverse
-        exy = cx * cy + (r00 * y0 + r01 * y1 + r02 * y2 - x * y) * inverse
-        eyy = cy * cy + (r10 * y0 + r11 * y1 + r12 * y2 - y * y) * inverse
-        if exx > 0.0 and eyy > 0.0:
-            outlines[out, 0], outlines[out, 1] = cx, cy
-            outlines[out, 2], outlines[out, 3] = sqrt(exx), sqrt(eyy)
-            outlines[out, 4] = exy
-            outlines[out, 5] = sqrt(max(0.0, exx * eyy - exy * exy))
-        out += 1
 
 
 @compiled
@@ -308,17 +266,21 @@ def _sampled_total(boxes, size, outlines, first):
 
 
 @compiled
-def verify_beyond(forest, groups, landmarks, boxes, starts, detections, iou_threshold, rotations,
-                  translations, which, ranges, outlines, entries, bounds, best_bounds, floor):
+def verify_beyond(tree, groups, landmarks, boxes, starts, detections, iou_threshold, rotations,
+                  translations, which, ranges, outlines, owners, entries, bounds, best_bounds,
+                  floor):
     """Return the score of a pose if it is above a floor; if not, the floor."""
     best_bounds[:] = iou_threshold
-    out = landmarks.shape[0]
-    project(rotations, translations, which, landmarks, 0, out, 1.0, outlines, 0)
-    count = _bound(boxes, starts, 0, 1, detections, iou_threshold, 0, out, outlines, entries,
+    count = landmarks.shape[0]
+    project(rotations, translations, which, landmarks, 0, count, 1.0, outlines, 0)
+    count = _bound(boxes, starts, owners, detections, iou_threshold, 0, count, outlines, entries,
                    bounds, best_bounds, 0)
-    if groups[0].shape[0] > 0:
-        count = _look_around(forest, groups, boxes, iou_threshold, rotations, translations,
-                             which, ranges, outlines, out, entries, bounds, best_bounds, count)
+    if groups[3].shape[0] > 0:
+        first = landmarks.shape[0]
+        last = project_groups(tree, groups, rotations, translations, which, ranges, outlines,
+                              owners, first)
+        count = _bound(boxes, groups[1], owners, groups[2], iou_threshold, first, last, outlines,
+                       entries, bounds, best_bounds, count)
     upper = 0.0
     for detection in range(boxes.shape[0]):
         if best_bounds[detection] > iou_threshold:
@@ -348,34 +310,11 @@ def verify_beyond(forest, groups, landmarks, boxes, starts, detections, iou_thre
 
 
 @compiled
-def _look_around(forest, groups, boxes, iou_threshold, rotations, translations, which, ranges,
-                 outlines, out, entries, bounds, best_bounds, count):
-    """Project what a pose may see of each group from row out on; go on as _bound does."""
-    landmarks, _, spheres, rows, leaves, _ = forest
-    nodes, _, starts, detections, reaches, frusta = groups
-    for group in range(nodes.shape[0]):
-        runs = visible_ranges(spheres, rows, leaves, nodes, reaches, frusta, group, rotations,
-                              translations, which, ranges)
-        first = out
-        for run in range(runs):
-            project(rotations, translations, which, landmarks, ranges[run, 0], ranges[run, 1],
-                    reaches[group], outlines, out)
-            out += ranges[run, 1] - ranges[run, 0]
-        count = _bound(boxes, starts, group, 0, detections, iou_threshold, first, out, outlines,
-                       entries, bounds, best_bounds, count)
-    return count
-
-
-@compiled
-def _bound(boxes, starts, start, step, detections, iou_threshold, first, last, outlines, entries,
+def _bound(boxes, starts, owners, detections, iou_threshold, first, last, outlines, entries,
            bounds, best_bounds, count):
-    """Add the pairs of some outlines that may overlap enough; return how many there are now.
-
-    The detections of the first outline are those from starts[start] on; each further outline's
-    are the next step's.
-    """
+    """Add the pairs of some outlines that may overlap enough; return how many there are now."""
     for outline in range(first, last):
-        place = start + step * (outline - first)
+        place = owners[outline]
         half_x = outlines[outline, 2]
         if not half_x > 0.0:
             continue

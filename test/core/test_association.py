@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.core.association import (
+    ClassIndex,
     balanced_order,
     candidate_mask,
     class_candidates,
     joined,
     nearest_candidates,
     prosac_order,
-    rarest_first,
     same_class,
 )
 from cliploc_ros.errors import OptionsError
@@ -71,9 +71,21 @@ def test_mask_of_candidates():
 
 
 def test_rare_classes_come_first_and_nothing_twice():
-    mask = same_class(('a', 'b', 'a'), ('a', 'a', 'a', 'b'))
-    rare = rarest_first(class_candidates(mask), mask)
+    index = ClassIndex.of(('a', 'a', 'a', 'b'))
+    rare = index.candidates(index.classes_of(('a', 'b', 'a')), rarest_first=True)
     assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
-    both = joined(nearest_candidates(similarities, 1), rare, mask.shape)
+    both = joined(nearest_candidates(similarities, 1), rare, 4)
     assert both.pairs.tolist() == [[0, 1], [1, 1], [2, 1], [1, 3], [0, 0], [0, 2], [2, 0], [2, 2]]
+
+
+@given(st.lists(st.sampled_from('abc'), min_size=1, max_size=9),
+       st.lists(st.sampled_from('abcd'), max_size=6), st.integers(0, 20))
+def test_the_index_of_classes_agrees_with_their_mask(landmarks, detections, limit):
+    index = ClassIndex.of(landmarks)
+    mask = same_class(tuple(detections), tuple(landmarks))
+    classes = index.classes_of(detections)
+    assert (index.sizes_of(classes) == mask.sum(axis=1)).all()
+    wanted = class_candidates(mask).pairs
+    assert (index.candidates(classes).pairs == wanted).all()
+    assert (index.candidates(classes, limit=limit).pairs == wanted[:limit]).all()

@@ -7,16 +7,15 @@ import time
 import numpy as np
 import pytest
 
-from cliploc_ros.core.culling import make_tree, morton_order, visible_ranges
+from cliploc_ros.core.culling import make_groups, make_tree, visible_ranges
 from cliploc_ros.core.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.sampling import draw_ransac
 from cliploc_ros.core.scoring import Scene, Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.screening import set_up
 from cliploc_ros.core.search import Leaders, search_samples
 from cliploc_ros.core.transforms import invert_transform, make_transform
 
 
-def make_storey(count, seed=0, classes=40) -> Scene:
+def make_storey(count, seed=0, classes=40, with_tree=True) -> Scene:
     """A landmark a four square metres; up to twelve boxes, each with all of its class."""
     rng, side = np.random.default_rng(seed), np.sqrt(4.0 * count)
     centers = np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0, 2, count)]
@@ -33,18 +32,28 @@ def make_storey(count, seed=0, classes=40) -> Scene:
     pairs = np.array([(row, landmark) for row, truth in enumerate(seen)
                       for landmark in (truth, *rng.choice(np.nonzero(potential[row])[0], 2))])
     noisy = boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))
-    return make_scene(noisy, centers, shapes, potential, pairs, 0.2)
+    if not with_tree:
+        return make_scene(noisy, centers, shapes, potential, pairs, 0.2)
+    single = pairs[~potential[tuple(pairs.T)]]  # none
+    return make_scene(noisy, centers, shapes, single, pairs, 0.2,
+                      make_tree(centers, shapes, class_ids), class_ids[seen])
 
 
 @pytest.mark.parametrize('seed', range(3))
 def test_nothing_that_counts_is_left_out(seed):
-    scene = make_storey(5_000, seed)
+    scene, plain = make_storey(5_000, seed), make_storey(5_000, seed, with_tree=False)
     samples = draw_ransac(scene.pairs, 300, np.random.default_rng(seed))
     workspace, scores = Workspace.allocate(len(scene.bearings)), []
     for sample in samples:
-        which, _ = sample_pose(scene, sample, workspace)
-        scores.append(-1.0 if which < 0 else verify(
-            scene, workspace.rotations[which], workspace.translations[which], workspace))
+        which, _ = sample_pose(plain, sample, workspace)
+        if which < 0:
+            scores.append(-1.0)
+            continue
+        pose = workspace.rotations[which].copy(), workspace.translations[which].copy()
+        scores.append(verify(plain, *pose, workspace))
+        landmarks = workspace.landmarks.copy()
+        assert verify(scene, *pose, workspace) == scores[-1]
+        assert (workspace.landmarks == landmarks).all()
     leaders = Leaders.none_yet(len(samples))
     list(search_samples(scene, samples, leaders))
     ranked = leaders.ranked()
@@ -54,46 +63,49 @@ def test_nothing_that_counts_is_left_out(seed):
                                                     abs=1e-9)
 
 
-def test_every_landmark_has_one_leaf_and_neighbours_stand_together(rng):
-    landmarks = np.zeros((1_000, 9))
-    landmarks[:, :3] = rng.uniform(-50, 50, (1_000, 3))
-    landmarks[:, [3, 6, 8]] = 0.01
-    order = morton_order(landmarks[:, :3])
-    assert (np.sort(order) == np.arange(1_000)).all()
-    landmarks = landmarks[order]
-    steps = np.linalg.norm(np.diff(landmarks[:, :3], axis=0), axis=1)
-    assert np.median(steps) < 20
-    boxes = np.array([[0.0, 0.0, 0.3, 0.2]])
-    tree, reaches = make_tree(landmarks, np.full(1_000, 0.01), boxes, 0.2)
+@pytest.mark.parametrize('classes', [1, 7, 1_000])
+def test_every_landmark_has_one_leaf_and_neighbours_stand_together(rng, classes):
+    centers = rng.uniform(-50, 50, (1_000, 3))
+    shapes = np.zeros((1_000, 6))
+    shapes[:, [0, 3, 5]] = 0.01
+    class_ids = rng.permutation(np.arange(1_000) % classes)
+    tree = make_tree(centers, shapes, class_ids)
+    assert (np.sort(tree.numbers) == np.arange(1_000)).all()
+    assert (tree.landmarks[:, :3] == centers[tree.numbers]).all()
     rows = tree.rows[tree.leaves]
     assert (rows[:, 1] > rows[:, 0]).all()
     assert (np.concatenate([np.arange(*row[:2]) for row in rows]) == np.arange(1_000)).all()
+    if classes == 1:
+        steps = np.linalg.norm(np.diff(tree.landmarks[:, :3], axis=0), axis=1)
+        assert np.median(steps) < 20
+    groups = make_groups(classes, np.array([-1, 0]), np.array([[5.0, 5, 1, 1], [0, 0, 0.3, 0.2]]),
+                         0.2)
+    assert groups.detections.tolist() == [1]
     ranges = np.empty((len(rows), 2), dtype=np.int64)
-    runs = visible_ranges(*tree, np.eye(3)[None], np.zeros((1, 3)), 0, ranges)
-    visible = np.concatenate([np.arange(*run) for run in ranges[:runs]])
-    seen = project_ellipsoids(np.eye(4), landmarks[:, :3], landmarks[:, 3:])
-    overlap = ((np.abs(seen[:, 0]) < 0.3) & (np.abs(seen[:, 1]) < 0.2)
-               & (np.linalg.norm(landmarks[:, :3], axis=1) < reaches))
-    assert set(np.nonzero(overlap)[0]) <= set(visible)
+    runs = visible_ranges(tree.spheres, tree.rows, tree.leaves, groups.reaches,
+                          groups.frustum, np.eye(3)[None], np.zeros((1, 3)), 0, ranges)
+    visible = {int(tree.numbers[row]) for run in ranges[:runs] for row in range(*run)}
+    seen = project_ellipsoids(np.eye(4), centers, shapes)
+    overlap = ((np.abs(seen[:, 0]) < 0.3) & (np.abs(seen[:, 1]) < 0.2) & (class_ids == 0)
+               & (centers[:, 2] < groups.reaches[0] * 0.1))
+    assert set(np.nonzero(overlap)[0]) <= visible
     assert len(visible) < 500
 
 
 def test_far_landmarks_appear_too_small():
     """The reach against the outlines of spheres."""
-    radius, box_axes, iou_threshold = 0.3, 0.02, 0.2
-    landmark = np.zeros((100, 9))
-    landmark[:, [3, 6, 8]] = radius**2 / 3  # whose trace bounds the greatest semi-axis
-    _, reaches = make_tree(landmark, np.full(100, box_axes), np.array([[0.0, 0, 0.4, 0.3]]),
-                           iou_threshold)
+    radius, box, iou_threshold = 0.3, np.array([[0.0, 0, 0.4, 0.3]]), 0.2
+    shape = np.array([[radius**2, 0, 0, radius**2, 0, radius**2]])
+    reach = float(make_groups(1, np.zeros(1, dtype=np.int64), box, iou_threshold).reaches[0])
     for x in (-0.5, 0.0, 0.5):
         direction = np.array([x, 0.2, 1.0])
-        center = direction / np.linalg.norm(direction) * reaches[0] * 1.001
-        shape = np.array([radius**2, 0, 0, radius**2, 0, radius**2])
-        exx, exy, eyy = project_ellipsoids(np.eye(4), center[None], shape[None])[0, 2:]
-        assert np.sqrt(exx * eyy - exy * exy) < iou_threshold * box_axes
+        center = direction * reach * radius * 1.001
+        exx, exy, eyy = project_ellipsoids(np.eye(4), center[None], shape)[0, 2:]
+        assert np.sqrt(exx * eyy - exy * exy) < iou_threshold * 0.4 * 0.3
 
 
 def test_a_hypothesis_costs_little_more_in_a_large_map():
+    """With what a frame sets up; 2 on an idle core, and here others work beside it."""
     times_us = {}
     for count in (100, 100_000):
         scene = make_storey(count)
@@ -102,11 +114,8 @@ def test_a_hypothesis_costs_little_more_in_a_large_map():
         for _ in range(5):
             start = time.perf_counter()
             list(search_samples(scene, samples, Leaders.none_yet()))
-            whole = time.perf_counter() - start
-            start = time.perf_counter()
-            set_up(scene)
-            least = min(least, whole - (time.perf_counter() - start))
+            least = min(least, time.perf_counter() - start)
         times_us[count] = 1e6 * least / len(samples)
     print(f'\na sample among 100 landmarks {times_us[100]:.1f} us, among 100,000 '
           f'{times_us[100_000]:.1f} us')
-    assert times_us[100_000] < 5 * times_us[100]
+    assert times_us[100_000] < 4 * times_us[100]

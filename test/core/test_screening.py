@@ -65,10 +65,10 @@ def poses_of(scene, samples, prior=None, least_iou=0.0):
 
 
 def score_beyond(bench, which, floor):
-    return verify_beyond(bench.forest, bench.groups, bench.landmarks, bench.boxes,
+    return verify_beyond(bench.tree, bench.groups, bench.landmarks, bench.boxes,
                          bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
                          bench.translations, which, bench.ranges, bench.outlines,
-                         bench.entries, bench.bounds, bench.best_bounds, floor)
+                         bench.owners, bench.entries, bench.bounds, bench.best_bounds, floor)
 
 
 def test_it_chooses_and_scores_as_the_plain_way(scene, rng):

@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A frame's scene, in maps small and large, against masks of what each detection may show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core import matching
+from cliploc_ros.core.association import candidate_mask, nearest_candidates, same_class
+from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.matching import match_frame
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.scoring import Workspace, make_scene, verify
+from cliploc_ros.core.transforms import make_transform
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+
+def make_world(count, seed=0, classes=12):
+    """A map around a camera at its origin, and what this sees of it."""
+    rng = np.random.default_rng(seed)
+    centers = np.c_[rng.uniform(-4, 4, (count, 2)), rng.uniform(-8, 8, count)]
+    names = tuple(f'class {number}' for number in rng.integers(0, classes, count))
+    landmark_map = LandmarkMap('map', tuple(map(str, range(count))), names, names, centers,
+                               rng.uniform(0.1, 0.4, (count, 3)),
+                               Rotation.random(count, rng=seed).as_quat())
+    boxes = ellipse_bboxes(project_ellipsoids(np.eye(4), centers, landmark_map.shapes))
+    seen = np.nonzero((np.abs(boxes) < 0.6).all(axis=1))[0][:10]
+    pixels = 500 * (boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))) + [320, 240, 320, 240]
+    similarities = rng.normal(0.2, 0.02, (len(seen), count)).astype(np.float32)
+    similarities[np.arange(len(seen)), seen] += 0.05
+    detections = Detections(pixels, tuple(names[row] for row in seen), np.ones(len(seen)))
+    return landmark_map, Observation(CAMERA, detections, similarities)
+
+
+@pytest.mark.parametrize('kind', ['class', 'clip', 'hybrid'])
+@pytest.mark.parametrize('count', [50, 400])
+def test_verification_is_that_of_masks(count, kind, rng):
+    landmark_map, observation = make_world(count)
+    options = RelocalizerOptions(matching=kind)
+    scene, share = match_frame(landmark_map, observation, options)
+    assert share == 1.0
+    classes = same_class(observation.detections.class_ids, landmark_map.class_ids)
+    nearest = candidate_mask(nearest_candidates(observation.similarities, options.k),
+                             classes.shape)
+    mask = {'class': classes, 'clip': nearest, 'hybrid': classes | nearest}[kind]
+    assert (candidate_mask_of(scene, classes.shape) == mask).all()
+    plain = make_scene(CAMERA.normalize_bboxes(observation.detections.bboxes_xyxy),
+                       landmark_map.centers, landmark_map.shapes, mask, scene.pairs, 0.2)
+    workspace, scored = Workspace.allocate(len(mask)), 0
+    for _ in range(200):
+        pose = make_transform(Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix(),
+                              rng.normal(0, 0.3, 3))
+        rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
+        wanted = verify(plain, rotation, translation, workspace)
+        landmarks = workspace.landmarks.copy()
+        assert verify(scene, rotation, translation, workspace) == wanted
+        assert (workspace.landmarks == landmarks).all()
+        scored += wanted > 0
+    assert scored > 20
+
+
+def candidate_mask_of(scene, shape):
+    mask = np.zeros(shape, dtype=bool)
+    mask[scene.pairs[:, 0], scene.pairs[:, 1]] = True
+    return mask
+
+
+def test_too_many_candidates_are_cut_and_said(monkeypatch):
+    landmark_map, observation = make_world(400)
+    whole, _ = match_frame(landmark_map, observation, RelocalizerOptions())
+    monkeypatch.setattr(matching, 'MAX_CANDIDATES', 60)
+    cut, share = match_frame(landmark_map, observation, RelocalizerOptions())
+    assert len(cut.pairs) < len(whole.pairs)
+    assert (cut.pairs == whole.pairs[:len(cut.pairs)]).all()
+    assert share == pytest.approx((len(cut.pairs) / len(whole.pairs)) ** 3, rel=0.1)
+    found = Relocalizer(landmark_map, RelocalizerOptions(iterations=1_000_000)).relocalize(
+        [observation])
+    assert 0 < found.coverage <= share
+
+
+@pytest.mark.parametrize('limit', [1, 77, 2_000])
+def test_no_more_are_tried_than_asked_for(limit):
+    """Whatever the time a block takes, so that equal options give equal results."""
+    landmark_map, observation = make_world(400)
+    options = RelocalizerOptions(iterations=limit)
+    first = Relocalizer(landmark_map, options).relocalize([observation])
+    again = Relocalizer(landmark_map, replace(options)).relocalize([observation])
+    assert first.tried == again.tried == limit
+    assert (first.map_from_camera == again.map_from_camera).all() if first.solved \
+        else not again.solved
