@@ -3,6 +3,7 @@
 """Messages to values and back. Nothing here trusts a message."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -26,11 +27,19 @@ def stamp_ns(stamp: Time) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def detections_from_msg(msg: Detection2DArray) -> Detections:
+def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | None = None
+                        ) -> Detections:
     """Return the detections of a message, each with its most confident class.
 
     A detection without any class keeps the empty name, which no landmark has.
+
+    Parameters
+    ----------
+    msg : vision_msgs/Detection2DArray
+    class_map : mapping, optional
+        The map's names for some of the detector's classes.
     """
+    names = class_map or {}
     best = [max((result.hypothesis for result in detection.results),
                 key=_confidence, default=ObjectHypothesis())
             for detection in msg.detections]
@@ -43,7 +52,7 @@ def detections_from_msg(msg: Detection2DArray) -> Detections:
     width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
     return Detections(
         np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
-        tuple(hypothesis.class_id for hypothesis in best),
+        tuple(names.get(hypothesis.class_id, hypothesis.class_id) for hypothesis in best),
         np.array([hypothesis.score for hypothesis in best], dtype=np.float64))
 
 

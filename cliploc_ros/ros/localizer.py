@@ -24,7 +24,7 @@ from cliploc_ros.ros.conversions import (
 from cliploc_ros.ros.diagnostics import StageTimes
 from cliploc_ros.ros.frame_source import Frame
 from cliploc_ros.ros.map_parameters import load_map
-from cliploc_ros.ros.tables import relocalizer_options
+from cliploc_ros.ros.tables import parse_class_map, relocalizer_options
 
 
 class Localizer:
@@ -102,8 +102,9 @@ class Localizer:
         image = image_from_msg(frame.image)
         height, width = image.shape[:2]
         camera = camera_from_msg(frame.camera_info, (width, height), values['rectified'])
-        detections = detections_from_msg(frame.detections).usable(
-            width, height, values['max_detections'])
+        detections = detections_from_msg(
+            frame.detections, parse_class_map(values['class_map'])).usable(
+                width, height, values['max_detections'])
         times.mark('decoding')
         stamp = stamp_ns(frame.image.header.stamp)
         observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \

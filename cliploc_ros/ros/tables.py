@@ -86,6 +86,8 @@ RELOCALIZER = (
                  'over the best elsewhere) is refused.', low=0.0, high=1e6),
     ParameterRow('max_rival', 0.9, 'A pose is refused if one elsewhere scores more than this '
                  'share of it.', low=0.0, high=1.0),
+    ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
+                 "'tvmonitor=tv, pottedplant=potted plant'."),
     ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),
     ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config '
                  '(.json).', read_only=True),
@@ -118,11 +120,31 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     """
     names = RelocalizerOptions.__dataclass_fields__.keys()
     _check_mount(values['base_from_camera'])
+    parse_class_map(str(values['class_map']))
     if values['gravity'] == 'base_frame' and not values['base_frame']:
         raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
     given: dict[str, Any] = {name: values[name] for name in names}
     given['height_range_m'] = _height_range(values['height_range_m'])
     return RelocalizerOptions(**given)
+
+
+def parse_class_map(text: str) -> dict[str, str]:
+    """Return the map's class name for each of the detector's that has another.
+
+    Raises
+    ------
+    OptionsError
+        A pair is none, or a name stands twice.
+    """
+    found: dict[str, str] = {}
+    for pair in filter(None, map(str.strip, text.split(','))):
+        theirs, sign, ours = (part.strip() for part in pair.partition('='))
+        if not (theirs and sign and ours):
+            raise OptionsError(f"class_map: '{pair}' is not of the form theirs=ours")
+        if theirs in found:
+            raise OptionsError(f"class_map: '{theirs}' stands twice")
+        found[theirs] = ours
+    return found
 
 
 def _height_range(heights: Value) -> tuple[float, float]:

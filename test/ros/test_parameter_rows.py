@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.parameters import ParameterRow, markdown_table, yaml_defaults
-from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, parse_class_map, relocalizer_options
 
 TEXT = ParameterRow('text', 'a', 'Some text.')
 CHOICE = ParameterRow('choice', 'raw', 'One of two.', choices=('raw', 'compressed'))
@@ -190,3 +190,15 @@ def test_values_that_do_not_fit_together(changes, message):
                                    [0.0] * 6 + [0.995]])
 def test_mounts_that_fit(mount):
     relocalizer_options(RELOCALIZER_DEFAULTS | {'base_from_camera': mount})
+
+
+def test_classes_get_the_maps_names():
+    assert parse_class_map(' tvmonitor=tv , potted plant = plant,') == {
+        'tvmonitor': 'tv', 'potted plant': 'plant'}
+    assert parse_class_map('') == {}
+
+
+@pytest.mark.parametrize('text', ['tv', 'tv=', '=tv', 'a=b, a=c'])
+def test_a_class_map_that_is_none_is_refused(text):
+    with pytest.raises(OptionsError, match='class_map'):
+        relocalizer_options(RELOCALIZER_DEFAULTS | {'class_map': text})
