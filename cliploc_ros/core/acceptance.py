@@ -70,18 +70,30 @@ class Evidence:
         return self.score + 2.0 * (self.score - self.rival_score)
 
 
-def support(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> Support:
+def support(matches: Sequence[Sequence[Match]], bboxes_xyxy: Sequence[NDArray[np.float64]]
+            ) -> Support:
     """Return what speaks for a pose, each object once.
 
     Several boxes on one landmark, and several landmarks behind one box, say no more than the
-    best of them.
+    best of them. Frames that show one object share the errors of its shape in the map, so that
+    their agreement is no more evidence than one of them: it counts with its mean IoU.
 
     Parameters
     ----------
-    matches : sequence of Match
-    bboxes_xyxy : ndarray (n, 4)
-        The boxes that the matches count [px].
+    matches : sequence of sequence of Match
+        Of each frame.
+    bboxes_xyxy : sequence of ndarray (n, 4)
+        The boxes that the matches count, of each frame [px].
     """
+    ious: dict[int, list[float]] = {}
+    for matches_here, boxes_here in zip(matches, bboxes_xyxy, strict=True):
+        for match in _one_to_one(matches_here, boxes_here):
+            ious.setdefault(match.landmark, []).append(match.iou)
+    return Support(len(ious), sum(sum(some) / len(some) for some in ious.values()))
+
+
+def _one_to_one(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> list[Match]:
+    """Return the best matches of one frame, each landmark and each object once."""
     taken: list[Match] = []
     for match in sorted(matches, key=lambda match: -match.iou):
         boxes = bboxes_xyxy[[other.detection for other in taken]]
@@ -90,7 +102,7 @@ def support(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> Suppo
         if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
             continue
         taken.append(match)
-    return Support(len(taken), sum(match.iou for match in taken))
+    return taken
 
 
 def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A pose made better by all of its inliers, where the search used three box centres.
+"""What moves a pose to where all of its inliers fit, where the search used three box centres.
 
 The outline of each matched landmark shall touch the edges of its box: four residuals a match, in
 shares of the box's size, since both a detector's and a mapper's errors grow with the object.
-Levenberg-Marquardt with Cauchy's weights minimizes them (Triggs et al., "Bundle Adjustment",
-1999); matching and minimizing alternate until neither changes.
+Here are one frame's residuals with Cauchy's weights, and the system they make (Triggs et al.,
+"Bundle Adjustment", 1999); cliploc_ros.core.fusion minimizes them over one frame or several.
 
 Over all 258 recorded frames edges solved most and most exactly, against Wasserstein's distance of
 ellipses, the level sets of Zins et al. ("Level Set-Based Camera Pose Estimation From Multiple
@@ -20,84 +20,20 @@ import numpy as np
 
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.ellipsoid import project_ellipsoid
-from cliploc_ros.core.scoring import verify
 
 # Of an edge, as a share of its box's mean side, and on the plane z = 1: boxes of detectors and of
 # fitted maps are off by so much, in the median, and by a pixel or so at least.
 RELATIVE_DEVIATION = 0.06
 LEAST_DEVIATION = 0.003
-#: What refine takes for a vertical that is not known.
+#: What residuals_of takes for a vertical that is not known.
 VERTICAL_UNKNOWN = np.zeros(7)
 
 # Residuals beyond this many deviations lose their say: maps and boxes hold edges that are far off.
 _CAUCHY = 1.0
-# A round may lose so much of the best score so far: many edges that fit well are nearer to the
-# truth than the greatest overlap, but a pose that loses its landmarks is none.
-_LEAST_SHARE = 0.9
-_ROUNDS = 4
-_STEPS = 5
-_TRIALS = 4
-_FIRST_DAMPING = 1e-3
-_SETTLED = 1e-5
-# A step that is longer, in metres and in radians, has left where the residuals are nearly linear.
-_LONGEST_STEP = 1.0
 
 
 @compiled
-def refine(scene, rotation, translation, vertical, workspace):
-    """Refine a pose in place; return its score, and the information of its last system.
-
-    Parameters
-    ----------
-    scene : Scene
-    rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map; changed in place, unless the score would fall by a tenth.
-    vertical : ndarray (7,)
-        Up in the camera (3,) and in the map (3,), unit vectors, and the standard deviation of the
-        angle between them [rad]; 0 where it is not known.
-    workspace : Workspace
-        Holds the matches of the refined pose afterwards.
-
-    Returns
-    -------
-    score : float
-        See verify.
-    information : ndarray (6, 6)
-        Of the camera's position [m] and its rotation about the map's axes [rad].
-    """
-    # so many boxes fix a pose
-    least = 2 if vertical[6] > 0.0 else 3
-    score = verify(scene, rotation, translation, workspace)
-    best_score = score
-    information = np.zeros((6, 6))
-    new_rotation, new_translation = rotation.copy(), translation.copy()
-    detections = np.empty(len(workspace.landmarks), dtype=np.int64)
-    landmarks = np.empty(len(workspace.landmarks), dtype=np.int64)
-    for _ in range(_ROUNDS):
-        count = _one_to_one(workspace, detections, landmarks)
-        if count < least:
-            break
-        _minimize(scene, detections[:count], landmarks[:count], vertical, new_rotation,
-                  new_translation)
-        new_score = verify(scene, new_rotation, new_translation, workspace)
-        if new_score < _LEAST_SHARE * best_score:
-            break
-        settled = abs(new_score - score) <= _SETTLED * score
-        score, best_score = new_score, max(best_score, new_score)
-        rotation[:] = new_rotation
-        translation[:] = new_translation
-        if settled:
-            break
-    score = verify(scene, rotation, translation, workspace)
-    count = _one_to_one(workspace, detections, landmarks)
-    if count >= least:
-        _inform(scene, detections[:count], landmarks[:count], vertical, rotation, translation,
-                information)
-    return score, information
-
-
-@compiled
-def _one_to_one(workspace, detections, landmarks):
+def one_to_one(workspace, detections, landmarks):
     """Write the matches, of several boxes on one landmark the best; return their number."""
     count = 0
     for detection in range(workspace.landmarks.shape[0]):
@@ -116,75 +52,17 @@ def _one_to_one(workspace, detections, landmarks):
 
 
 @compiled
-def _inform(scene, detections, landmarks, vertical, rotation, translation, information):
-    """Write the information of a pose; leave it if a landmark is not in front."""
-    count = 4 * len(detections) + 3
-    residuals, jacobian = np.empty(count), np.empty((count, 6))
-    if _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
-        _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
-                   jacobian, information, np.empty(6))
-
-
-@compiled
-def _minimize(scene, detections, landmarks, vertical, rotation, translation):
-    """Move a pose to where the robust sum of squares is least."""
-    count = 4 * len(detections) + 3
-    residuals, moved = np.empty(count), np.empty(count)
-    jacobian = np.empty((count, 6))
-    gradient, step = np.empty(6), np.zeros(6)
-    information, damped = np.empty((6, 6)), np.empty((6, 6))
-    trial_rotation, trial_translation = rotation.copy(), translation.copy()
-    damping = _FIRST_DAMPING
-    if not _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
-        return
-    cost = _robust_cost(residuals)
-    for _ in range(_STEPS):
-        _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
-                   jacobian, information, gradient)
-        accepted = False
-        for _ in range(_TRIALS):
-            damped[:] = information
-            for axis in range(6):
-                damped[axis, axis] += damping * information[axis, axis] + 1e-9
-            if not _solve(damped, gradient, step):
-                return
-            if _dot6(step, step) > _LONGEST_STEP * _LONGEST_STEP:
-                damping = 10.0 * damping
-                continue
-            _move(rotation, translation, step, trial_rotation, trial_translation)
-            if _residuals(scene, detections, landmarks, vertical, trial_rotation,
-                          trial_translation, moved):
-                new_cost = _robust_cost(moved)
-                if new_cost < cost:
-                    accepted = True
-                    break
-            damping = 10.0 * damping
-        if not accepted:
-            return
-        settled = cost - new_cost < _SETTLED * cost
-        cost = new_cost
-        residuals[:] = moved
-        rotation[:] = trial_rotation
-        translation[:] = trial_translation
-        damping = 0.1 * damping
-        if settled:
-            return
-
-
-@compiled
-def _linearize(scene, detections, landmarks, vertical, rotation, translation, residuals,
-               jacobian, information, gradient):
-    """Write the normal equations at a pose of known residuals."""
+def linearize(pairs, vertical, rotation, translation, residuals, jacobian, information, gradient):
+    """Write the normal equations at a pose of known residuals, see residuals_of."""
     weights = np.empty(len(residuals))
     for row in range(len(residuals)):
         weights[row] = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
-    for row in range(len(detections)):
-        box, landmark = scene.box_ellipses[detections[row]], landmarks[row]
-        _differentiate(scene.centers[landmark], scene.shapes[landmark], rotation, translation,
-                       _deviation(box), jacobian[4 * row:4 * row + 4])
-    jacobian[4 * len(detections):] = 0.0
+    for row in range(len(pairs)):
+        _differentiate(pairs[row, 4:7], pairs[row, 7:], rotation, translation,
+                       _deviation(pairs[row]), jacobian[4 * row:4 * row + 4])
+    jacobian[4 * len(pairs):] = 0.0
     if vertical[6] > 0.0:
-        _differentiate_vertical(vertical, rotation, jacobian[4 * len(detections):])
+        _differentiate_vertical(vertical, rotation, jacobian[4 * len(pairs):])
     _normal_equations(jacobian, residuals, weights, information, gradient)
 
 
@@ -243,12 +121,25 @@ def _differentiate_vertical(vertical, rotation, jacobian):
 
 
 @compiled
-def _residuals(scene, detections, landmarks, vertical, rotation, translation, residuals):
-    """Write by how many deviations outlines miss the edges; False if one is not in front."""
-    for row in range(len(detections)):
-        box, landmark = scene.box_ellipses[detections[row]], landmarks[row]
+def residuals_of(pairs, vertical, rotation, translation, residuals):
+    """Write by how many deviations outlines miss the edges; False if one is not in front.
+
+    Parameters
+    ----------
+    pairs : ndarray (m, 13)
+        Box ellipse (4,), centre (3,) and shape (6,) of the landmark of each match.
+    vertical : ndarray (7,)
+        Up in the camera (3,) and in the map (3,), unit vectors, and the standard deviation of the
+        angle between them [rad]; VERTICAL_UNKNOWN where it is not known.
+    rotation, translation : ndarray (3, 3), (3,)
+        Of camera_from_map.
+    residuals : ndarray (4 * m + 3,)
+        Of left, right, upper and lower edge of each match; of the vertical.
+    """
+    for row in range(len(pairs)):
+        box = pairs[row]
         visible, cx, cy, exx, _, eyy = project_ellipsoid(
-            rotation, translation, scene.centers[landmark], scene.shapes[landmark])
+            rotation, translation, pairs[row, 4:7], pairs[row, 7:])
         if not visible:
             return False
         deviation = _deviation(box)
@@ -257,7 +148,7 @@ def _residuals(scene, detections, landmarks, vertical, rotation, translation, re
         residuals[4 * row + 1] = ((cx + half_x) - (box[0] + box[2])) / deviation
         residuals[4 * row + 2] = ((cy - half_y) - (box[1] - box[3])) / deviation
         residuals[4 * row + 3] = ((cy + half_y) - (box[1] + box[3])) / deviation
-    first = 4 * len(detections)
+    first = 4 * len(pairs)
     for axis in range(3):
         residuals[first + axis] = 0.0
         if vertical[6] > 0.0:
@@ -274,7 +165,7 @@ def _deviation(box):
 
 
 @compiled
-def _robust_cost(residuals):
+def robust_cost(residuals):
     """Return Cauchy's sum."""
     total = 0.0
     for residual in residuals:
@@ -297,7 +188,7 @@ def _normal_equations(jacobian, residuals, weights, information, gradient):
 
 
 @compiled
-def _move(rotation, translation, step, new_rotation, new_translation):
+def move(rotation, translation, step, new_rotation, new_translation):
     """Write a camera_from_map whose camera is moved by step[:3] and turned by step[3:]."""
     angle = sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
     sine = sin(angle) / angle if angle > 1e-12 else 1.0
@@ -321,7 +212,7 @@ def _move(rotation, translation, step, new_rotation, new_translation):
 
 
 @compiled
-def _solve(matrix, right, solution):
+def solve(matrix, right, solution):
     """Solve a symmetric positive definite system of six; its matrix is overwritten."""
     for i in range(6):
         for j in range(i + 1):
@@ -345,11 +236,3 @@ def _solve(matrix, right, solution):
             total -= matrix[k, i] * solution[k]
         solution[i] = total / matrix[i, i]
     return True
-
-
-@compiled
-def _dot6(a, b):
-    total = 0.0
-    for i in range(6):
-        total += a[i] * b[i]
-    return total

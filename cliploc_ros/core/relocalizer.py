@@ -16,12 +16,19 @@ from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.ellipsoid import project_ellipsoids
-from cliploc_ros.core.finalists import as_found, covariance_of, matches_of, meetings_of, refined
+from cliploc_ros.core.finalists import (
+    Searched,
+    covariance_of,
+    find_finalists,
+    matches_of,
+    meetings_of,
+)
+from cliploc_ros.core.fusion import choose_distinct, make_rig, refine_all
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, refine
+from cliploc_ros.core.refinement import VERTICAL_UNKNOWN
 from cliploc_ros.core.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
 from cliploc_ros.core.scoring import Scene, Workspace, make_scene
 from cliploc_ros.core.screening import Prior
@@ -35,8 +42,12 @@ from cliploc_ros.core.search import (
     search_samples,
     search_vertically,
 )
+from cliploc_ros.core.transforms import invert_transform, is_rigid
 from cliploc_ros.errors import OptionsError
 
+#: The most frames that are fused. Each frame's leaders are verified on every frame, so that time
+#: grows with the square; and the tenth view of the same objects says little that is new.
+MAX_FRAMES = 10
 # The map's third axis is up (REP 103), and the optical frame's second is down.
 _UP_IN_MAP = (0.0, 0.0, 1.0)
 _UPRIGHT = (0.0, -1.0, 0.0)
@@ -66,7 +77,7 @@ class Relocalization:
     hypotheses : tuple of Hypothesis
         The distinct best, best first; empty when nothing was found.
     matches : tuple of Match
-        The inliers of the best.
+        The inliers of the best, in the frame that was asked about.
     covariance : ndarray (6, 6) or None
         Of the best, see cliploc_ros.core.uncertainty; None when nothing was found.
     tried : int
@@ -150,17 +161,23 @@ class Relocalizer:
         list(search_exhaustively(scene, Leaders.none_yet()))
         list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
         list(search_vertically(scene, compatible_pairs(scene), Leaders.none_yet(), Prior()))
-        refine(scene, np.eye(3), np.zeros(3), VERTICAL_UNKNOWN, Workspace.allocate(3))
+        rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+        choose_distinct(rig, np.eye(3)[None], np.zeros((1, 3)), 1, Workspace.allocate(3))
+        refine_all(rig, np.eye(3)[None], np.zeros((1, 3)), Workspace.allocate(3))
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
 
     def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
-        """Find where the camera was.
+        """Find where the camera was when it saw the last of some frames.
+
+        Several frames are one question: hypotheses come from each of them, and are scored on and
+        refined with all of them. Of each frame's search the time budget is an equal share.
 
         Parameters
         ----------
         observations : sequence of Observation
-            One frame. (Several frames joined by odometry are not searched together yet.)
+            One frame, or up to MAX_FRAMES of one moving camera that odom_from_camera joins; the
+            last is the one whose pose is wanted.
 
         Returns
         -------
@@ -171,26 +188,29 @@ class Relocalizer:
         ------
         OptionsError
             The matching type needs similarities that are missing or of the wrong shape, the
-            vertical is no unit vector, or not exactly one observation was given.
+            vertical is no unit vector, of several frames odom_from_camera is missing or no rigid
+            transform, or there are no frames or too many.
         """
-        if len(observations) != 1:
-            raise OptionsError(f'one observation at a time, not {len(observations)}')
-        observation = observations[0]
         start = time.perf_counter()
+        cameras = _cameras_from_last(observations)
+        share = self._options.time_budget_s / len(observations)
+        frames = [self._search_frame(observation, start + share * (number + 1))
+                  for number, observation in enumerate(observations)]
+        return self._conclude(observations, frames, cameras, start)
+
+    def _search_frame(self, observation: Observation, deadline: float) -> Searched:
+        """Search one frame as if it were alone."""
         scene, share = match_frame(self._map, observation, self._options)
         vertical = self._vertical(observation)
-        size = _sample_size(vertical)
-        if _distinct(scene.pairs) < size:
-            return Relocalization(
-                False, f'{len(observation.detections)} detections give fewer than {size} '
-                'different correspondence candidates', stamp_ns=observation.stamp_ns)
         leaders = Leaders.none_yet(_REFINED if self._options.refine else MAX_DISTINCT)
-        progress, samples = self._search(scene, vertical, leaders, start)
+        if _distinct(scene.pairs) < _sample_size(vertical):
+            return Searched(scene, vertical, leaders, Progress(0, 1.0), None)
+        progress, samples = self._search(scene, vertical, leaders, deadline)
         progress = progress._replace(coverage=progress.coverage * share)
-        return self._conclude(observation, scene, vertical, leaders, progress, samples, start)
+        return Searched(scene, vertical, leaders, progress, samples)
 
     def _vertical(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the vertical as refine takes it; the paper's algorithms know of none."""
+        """Return the vertical as make_rig takes it; the paper's algorithms know of none."""
         up = observation.up_in_camera
         if up is None or self._options.algorithm != 'auto':
             return VERTICAL_UNKNOWN
@@ -206,7 +226,7 @@ class Relocalizer:
                      np.radians(self._options.max_tilt_deg))
 
     def _search(self, scene: Scene, vertical: NDArray[np.float64], leaders: Leaders,
-                start: float) -> tuple[Progress, NDArray[np.int64] | None]:
+                deadline: float) -> tuple[Progress, NDArray[np.int64] | None]:
         """Run the algorithm that the options name, as far as time allows.
 
         Returns how far it came, and the samples (t, 3) where these were drawn.
@@ -227,37 +247,65 @@ class Relocalizer:
         progress = Progress(0, 1.0)
         for step in search:
             progress = step
-            if time.perf_counter() - start > options.time_budget_s:
+            if time.perf_counter() > deadline:
                 break
         return progress, samples
 
-    def _conclude(self, observation: Observation, scene: Scene, vertical: NDArray[np.float64],
-                  leaders: Leaders, progress: Progress, samples: NDArray[np.int64] | None,
-                  start: float) -> Relocalization:
+    def _conclude(self, observations: Sequence[Observation], frames: Sequence[Searched],
+                  cameras: NDArray[np.float64], start: float) -> Relocalization:
         """Turn the leaders into a result, and decide whether to believe the first."""
-        finalists = refined(scene, leaders, vertical) if self._options.refine \
-            else as_found(leaders)
+        stamp_ns = observations[-1].stamp_ns
+        if all(_distinct(one.scene.pairs) < _sample_size(one.vertical) for one in frames):
+            boxes = sum(len(one.detections) for one in observations)
+            return Relocalization(
+                False, f'{boxes} detections give fewer than {_sample_size(frames[-1].vertical)} '
+                'different correspondence candidates', stamp_ns=stamp_ns)
+        tried = sum(one.progress.tried for one in frames)
+        coverage = min(one.progress.coverage for one in frames)
+        rig = make_rig([one.scene for one in frames], cameras,
+                       np.stack([one.vertical for one in frames]))
+        finalists = find_finalists(frames, rig, self._options.refine, _REFINED)
         if not finalists:
-            return Relocalization(False, 'no pose explains any three detections',
-                                  tried=progress.tried, coverage=progress.coverage,
-                                  search_ms=_elapsed_ms(start), stamp_ns=observation.stamp_ns)
+            return Relocalization(False, 'no pose explains any three detections', tried=tried,
+                                  coverage=coverage, search_ms=_elapsed_ms(start),
+                                  stamp_ns=stamp_ns)
         best, hypotheses = finalists[0], tuple(Hypothesis(one.map_from_camera, one.score)
                                                for one in finalists)
-        explained = [matches_of(scene, one) for one in finalists]
-        covariance = covariance_of(scene, best, explained[0], vertical)
-        bboxes = observation.detections.bboxes_xyxy
+        explained = [matches_of(rig, one) for one in finalists]
+        covariance = covariance_of(frames, rig, best, explained[0])
+        bboxes = [one.detections.bboxes_xyxy for one in observations]
         supports = [support(matches, bboxes) for matches in explained]
         evidence = Evidence(
             inliers=supports[0].inliers, score=supports[0].score,
             rival_score=max((rival.score for rival in supports[1:]), default=0.0),
             # those that boxes contradict were looked at too
-            coverage=progress.coverage,
-            tried=max(progress.tried, math.comb(progress.reach, _sample_size(vertical))),
-            meetings=meetings_of(scene, best, explained[0], progress, samples))
+            coverage=coverage, tried=sum(max(one.progress.tried, math.comb(
+                one.progress.reach, _sample_size(one.vertical))) for one in frames),
+            meetings=meetings_of(frames, best, explained[0]))
         reason = refusal(evidence, self._options)
-        return Relocalization(not reason, reason, hypotheses, explained[0], covariance,
-                              progress.tried, best.iteration, progress.coverage,
-                              _elapsed_ms(start), observation.stamp_ns, evidence.strength)
+        return Relocalization(not reason, reason, hypotheses, explained[0][-1], covariance,
+                              tried, best.iteration, coverage, _elapsed_ms(start), stamp_ns,
+                              evidence.strength)
+
+
+def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+    """Return each camera from the last (F, 4, 4), as odometry has it."""
+    if not 1 <= len(observations) <= MAX_FRAMES:
+        raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
+    cameras = np.tile(np.eye(4), (len(observations), 1, 1))
+    if len(observations) == 1:
+        return cameras
+    joined = []
+    for number, one in enumerate(observations, start=1):
+        where = f'odom_from_camera of frame {number} of {len(observations)}'
+        if one.odom_from_camera is None:
+            raise OptionsError(f'{where} is missing: it joins several frames')
+        if not is_rigid(one.odom_from_camera):
+            raise OptionsError(f'{where} is no rigid transform')
+        joined.append(one.odom_from_camera)
+    for row, odom_from_camera in enumerate(joined[:-1]):
+        cameras[row] = invert_transform(odom_from_camera) @ joined[-1]
+    return cameras
 
 
 def _sample_size(vertical: NDArray[np.float64]) -> int:

@@ -22,6 +22,16 @@ def invert_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
     return make_transform(rotation_t, -rotation_t @ a_from_b[:3, 3])
 
 
+def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
+    """Tell whether an array is a rotation and a translation (4, 4), all of it finite."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        return False
+    rotation = transform[:3, :3]
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= tolerance
+                and np.linalg.det(rotation) > 0.0
+                and (transform[3] == [0.0, 0.0, 0.0, 1.0]).all())
+
+
 def transform_from_pose(position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
                         ) -> NDArray[np.float64]:
     """Return the 4x4 transform of a position (3,) [m] and a quaternion x, y, z, w."""

@@ -7,14 +7,8 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.refinement import (
-    _LEAST_SHARE,
-    VERTICAL_UNKNOWN,
-    _linearize,
-    _move,
-    _residuals,
-    refine,
-)
+from cliploc_ros.core.fusion import _LEAST_SHARE, make_rig, refine_rig
+from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, linearize, move, residuals_of
 from cliploc_ros.core.scoring import Workspace, make_scene, verify
 from cliploc_ros.core.transforms import invert_transform, pose_error
 
@@ -31,6 +25,12 @@ def see(room, noise_px=0.0, rng=None):
     potential = np.array(room.class_ids)[:, None] == np.array(room.class_ids)[None]
     return make_scene(CAMERA.normalize_bboxes(boxes), room.centers, room.shapes, potential,
                       np.argwhere(potential), 0.2)
+
+
+def refine(scene, rotation, translation, vertical, workspace):
+    """One frame alone is a rig of one."""
+    return refine_rig(make_rig([scene], np.eye(4)[None], vertical[None]), rotation, translation,
+                      workspace)
 
 
 def shaken(rng, metres, degrees):
@@ -128,21 +128,21 @@ def test_nothing_to_go_by_changes_nothing(room):
 
 def test_derivatives_are_those_of_differences(room, rng):
     scene = see(room)
-    detections = np.arange(len(room))
+    pairs = np.concatenate([scene.box_ellipses, room.centers, room.shapes], axis=1)
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]
-        fixed = scene, detections, detections, vertical
+        fixed = pairs, vertical
         count = 4 * len(room) + 3
         residuals, jacobian = np.empty(count), np.empty((count, 6))
-        assert _residuals(*fixed, rotation, translation, residuals)
-        _linearize(*fixed, rotation, translation, residuals, jacobian, np.empty((6, 6)),
+        assert residuals_of(*fixed, rotation, translation, residuals)
+        linearize(*fixed, rotation, translation, residuals, jacobian, np.empty((6, 6)),
                    np.empty(6))
         there, back = np.empty(count), np.empty(count)
         for axis, step in enumerate(np.eye(6) * 1e-6):
             moved, moved_translation = np.empty((3, 3)), np.empty(3)
             for sign, values in ((1, there), (-1, back)):
-                _move(rotation, translation, sign * step, moved, moved_translation)
-                assert _residuals(*fixed, moved, moved_translation, values)
+                move(rotation, translation, sign * step, moved, moved_translation)
+                assert residuals_of(*fixed, moved, moved_translation, values)
             np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
                                        atol=1e-4)

@@ -133,11 +133,6 @@ def test_boxes_turned_inside_out_are_left_out(room, observation):
     assert sorted(match.detection for match in result.matches) == list(range(3, 12))
 
 
-def test_one_observation_at_a_time(room, observation):
-    with pytest.raises(OptionsError, match='one observation'):
-        Relocalizer(room, RelocalizerOptions()).relocalize([observation, observation])
-
-
 def test_k_larger_than_the_map_is_refused(room):
     with pytest.raises(OptionsError, match='k = 13, but the map has 12 landmarks'):
         Relocalizer(room, RelocalizerOptions(k=13))

@@ -55,18 +55,18 @@ APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=n
 
 
 def test_several_boxes_on_one_landmark_count_once():
-    found = support([Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)], APART)
+    found = support([[Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)]], [APART])
     assert (found.inliers, found.score) == (2, pytest.approx(1.3))
 
 
 def test_several_landmarks_behind_one_box_count_once():
     boxes = np.array([[0, 0, 100, 100], [2, 0, 100, 100], [0, 0, 50, 50]], dtype=np.float64)
-    found = support([Match(0, 1, 0.5), Match(1, 2, 0.7), Match(2, 3, 0.6)], boxes)
+    found = support([[Match(0, 1, 0.5), Match(1, 2, 0.7), Match(2, 3, 0.6)]], [boxes])
     assert (found.inliers, found.score) == (2, pytest.approx(1.3))
 
 
 def test_nothing_supports_nothing():
-    assert support([], APART).inliers == 0
+    assert support([[]], [APART]).inliers == 0
 
 
 def test_evidence_is_score_and_twice_the_margin():

@@ -1,0 +1,200 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames joined by odometry, in a simulated room."""
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
+from cliploc_ros.core.fusion import (
+    _linearize,
+    _pair,
+    _residuals,
+    choose_distinct,
+    make_rig,
+    refine_rig,
+    verify_rig,
+)
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.matching import match_frame
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, move, robust_cost
+from cliploc_ros.core.scoring import Workspace, make_scene, verify
+from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
+
+FRAMES = 4
+
+
+@pytest.fixture(scope='module')
+def room():
+    return make_room()
+
+
+@pytest.fixture
+def walk(rng):
+    """Poses of a camera that walks and turns; the last is the reference."""
+    poses = [MAP_FROM_CAMERA]
+    for _ in range(FRAMES - 1):
+        step = make_transform(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix(),
+                              rng.normal(0, 0.2, 3))
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+def see(room, map_from_camera, noise_px=0.0, rng=None, rows=slice(None)):
+    """The scene of one frame: boxes of some landmarks, which may be any of their class."""
+    outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers[rows],
+                                  room.shapes[rows])
+    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    if noise_px:
+        boxes = boxes + rng.normal(0, noise_px, boxes.shape)
+    classes = np.array(room.class_ids)
+    potential = classes[rows][:, None] == classes[None]
+    return make_scene(CAMERA.normalize_bboxes(boxes), room.centers, room.shapes, potential,
+                      np.argwhere(potential), 0.2)
+
+
+def rig_of(room, poses, verticals=None, **noise):
+    camera_from_reference = np.array([*(invert_transform(pose) @ poses[-1]
+                                        for pose in poses[:-1]), np.eye(4)])
+    if verticals is None:
+        verticals = np.tile(VERTICAL_UNKNOWN, (len(poses), 1))
+    return make_rig([see(room, pose, **noise) for pose in poses], camera_from_reference,
+                    verticals)
+
+
+def split(map_from_camera):
+    inverse = invert_transform(map_from_camera)
+    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
+
+
+def shaken(pose, rng, metres, degrees):
+    turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3))
+    return make_transform(turn.as_matrix() @ pose[:3, :3], pose[:3, 3] + metres * rng.normal(
+        size=3))
+
+
+def test_one_frame_is_verified_as_ever(room, rng):
+    scene, rig = see(room, MAP_FROM_CAMERA), rig_of(room, [MAP_FROM_CAMERA])
+    alone, joined = Workspace.allocate(len(room)), Workspace.allocate(len(room))
+    for _ in range(20):
+        pose = split(shaken(MAP_FROM_CAMERA, rng, 0.2, 4.0))
+        assert verify_rig(rig, *pose, joined) == verify(scene, *pose, alone)
+        np.testing.assert_array_equal(joined.landmarks, alone.landmarks)
+        np.testing.assert_array_equal(joined.ious, alone.ious)
+
+
+def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
+    rig = rig_of(room, walk)
+    workspace, alone = Workspace.allocate(FRAMES * len(room)), Workspace.allocate(len(room))
+    shift = invert_transform(walk[-1]) @ shaken(walk[-1], rng, 0.03, 0.5)
+    scores, landmarks = [], []
+    for pose in walk:  # the rig moves as one
+        moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
+        scores.append(verify(see(room, pose), *split(moved), alone))
+        landmarks.append(alone.landmarks.copy())
+    assert min(scores) > 1.0
+    found = verify_rig(rig, *split(walk[-1] @ shift), workspace)
+    assert found == pytest.approx(sum(scores), abs=1e-9)
+    np.testing.assert_array_equal(workspace.landmarks, np.concatenate(landmarks))
+
+
+def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
+    count = 20
+    shifts = np.repeat(np.c_[30.0 * np.arange(count), np.zeros((count, 2))], len(room), axis=0)
+    many = LandmarkMap(
+        'map', tuple(f'{i}' for i in range(count * len(room))), room.labels * count,
+        room.class_ids * count, np.tile(room.centers, (count, 1)) + shifts,
+        np.tile(room.semi_axes, (count, 1)), np.tile(room.quats_xyzw, (count, 1)))
+    scenes = []
+    for rows in ([0, 1, 2, 3, 5], [], [4, 7], [6]):  # no two frames show the same classes
+        boxes = ellipse_bboxes(ellipses_in_pixels(project_ellipsoids(
+            invert_transform(walk[len(scenes)]), room.centers[rows], room.shapes[rows]), CAMERA))
+        seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
+        scenes.append(match_frame(many, Observation(CAMERA, seen),
+                                  RelocalizerOptions(matching='class'))[0])
+    assert [len(scene.groups.reaches) for scene in scenes] == [3, 0, 1, 1]
+    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
+    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
+    workspace, place = Workspace.allocate(8), 3
+    reference = walk[-1].copy()
+    reference[0, 3] += 30.0 * place
+    verify_rig(rig, *split(reference), workspace)
+    np.testing.assert_array_equal(
+        workspace.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
+    assert workspace.ious.min() > 0.9
+
+
+def test_frames_that_saw_nothing_take_no_part(room, walk):
+    relative = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
+    scenes = [see(room, walk[0]), see(room, walk[1], rows=slice(0, 0)),
+              see(room, walk[2], rows=slice(2, 3)), see(room, walk[3], rows=slice(0, 0))]
+    rig = make_rig(scenes, relative, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
+    workspace = Workspace.allocate(len(room) + 1)
+    rotation, translation = split(walk[-1])
+    perfect = verify_rig(rig, rotation, translation, workspace)
+    np.testing.assert_array_equal(workspace.landmarks, [*range(len(room)), 2])
+    score, information = refine_rig(rig, rotation, translation, workspace)
+    assert score == pytest.approx(perfect, abs=1e-2)
+    assert (np.linalg.eigvalsh(information) > 0).all()
+
+
+def test_the_gradient_is_that_of_differences(room, walk, rng):
+    """Which holds for the information too: both go through the same change of steps."""
+    up = np.array([0.1, -0.2, 0.9]) / np.linalg.norm([0.1, -0.2, 0.9])
+    verticals = np.array([[*(invert_transform(pose)[:3, :3] @ up), *up, 0.02] for pose in walk])
+    rig = rig_of(room, walk, verticals, noise_px=3.0, rng=rng)
+    rotation, translation = split(shaken(walk[-1], rng, 0.1, 2.0))
+    workspace, starts = Workspace.allocate(FRAMES * len(room)), np.zeros(FRAMES + 1, np.int64)
+    verify_rig(rig, rotation, translation, workspace)
+    fixed = _pair(rig, workspace, starts), starts, rig.cameras, rig.verticals
+    assert starts[-1] > 2 * len(room)
+    residuals = np.empty(4 * starts[-1] + 3 * FRAMES)
+
+    def cost(step):
+        moved, moved_translation = np.empty((3, 3)), np.empty(3)
+        move(rotation, translation, step, moved, moved_translation)
+        assert _residuals(*fixed, moved, moved_translation, residuals)
+        return robust_cost(residuals)
+
+    differences = [(cost(step) - cost(-step)) / 2e-6 for step in np.eye(6) * 1e-6]
+    information, gradient = np.empty((6, 6)), np.empty(6)
+    assert _residuals(*fixed, rotation, translation, residuals)
+    _linearize(*fixed, rotation, translation, residuals, information, gradient)
+    np.testing.assert_allclose(-2.0 * gradient, differences, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
+
+
+def test_several_views_are_nearer_the_truth_than_one(room, walk, rng):
+    errors = {1: [], FRAMES: []}
+    for _ in range(60):
+        start = shaken(walk[-1], rng, 0.05, 1.0)
+        noise = {'noise_px': 3.0, 'rng': rng}
+        for count, found in errors.items():
+            rotation, translation = split(start)
+            rig = rig_of(room, walk[-count:], **noise)
+            refine_rig(rig, rotation, translation, Workspace.allocate(count * len(room)))
+            pose = invert_transform(make_transform(rotation, translation))
+            found.append(pose_error(pose, walk[-1])[0])
+    medians = {count: np.median(found) for count, found in errors.items()}
+    print(f'\nboxes by 3 px: one frame {medians[1]:.3f} m off, {FRAMES} frames '
+          f'{medians[FRAMES]:.3f} m (median)')
+    assert medians[FRAMES] < 0.7 * medians[1]
+
+
+def test_the_best_at_each_place_are_chosen(room, walk, rng):
+    rig, workspace = rig_of(room, walk), Workspace.allocate(FRAMES * len(room))
+    near = [shaken(walk[-1], rng, 0.02, 0.3) for _ in range(6)]
+    far = walk[-1].copy()
+    far[2, 3] -= 1.0
+    poses = [*near[:3], far, *near[3:]]
+    rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
+    rows, scores = choose_distinct(rig, rotations, translations, 5, workspace)
+    assert len(rows) == 2
+    assert rows[1] == 3
+    assert scores[rows[0]] == scores.max() > scores[3]
+    rows, _ = choose_distinct(rig, rotations, translations, 1, workspace)
+    np.testing.assert_array_equal(rows, [int(np.argmax(scores))])

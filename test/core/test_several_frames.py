@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Several frames joined by odometry, through the one door to the method."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
+from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.errors import OptionsError
+
+ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
+                               np.array([30.0, -4.0, 1.0]))
+OPTIONS = RelocalizerOptions(matching='class')
+LIMITS_M = (0.25, 0.5, 1.0)
+
+
+@pytest.fixture(scope='module')
+def room():
+    return make_room()
+
+
+def see(room, map_from_camera, rows=None):
+    """An observation of some landmarks, whose odometry has no error."""
+    rows = np.arange(len(room)) if rows is None else np.asarray(rows, dtype=np.int64)
+    outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers[rows],
+                                  room.shapes[rows])
+    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    return Observation(CAMERA, Detections(boxes, tuple(room.class_ids[row] for row in rows),
+                                          np.full(len(rows), 0.9)),
+                       odom_from_camera=ODOM_FROM_MAP @ map_from_camera)
+
+
+def moved(map_from_camera, metres, degrees):
+    """A camera that went on and turned about its vertical axis."""
+    turn = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
+    return map_from_camera @ make_transform(turn, np.array([metres, 0.0, 0.5 * metres]))
+
+
+@pytest.fixture
+def walk():
+    return [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(4)]
+
+
+def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
+    """No frame alone shows three objects that can be told apart."""
+    shares = [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
+    frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
+    relocalizer = Relocalizer(room, OPTIONS)
+    assert not any(relocalizer.relocalize([one]).accepted for one in frames)
+    found = relocalizer.relocalize(frames)
+    assert found.accepted, found.reason
+    assert pose_error(found.map_from_camera, walk[-1]) < (0.01, 0.2)
+    # of the last frame alone
+    assert [match.detection for match in found.matches] == [0, 1]
+    assert [match.landmark for match in found.matches] == shares[-1]
+
+
+def test_the_last_frame_is_the_one_asked_about(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    frames = [replace(see(room, pose), stamp_ns=number) for number, pose in enumerate(walk)]
+    for last in range(4):
+        order = [frames[(last + 1 + step) % 4] for step in range(4)]
+        found = relocalizer.relocalize(order)
+        assert found.accepted
+        assert found.stamp_ns == last
+        assert pose_error(found.map_from_camera, walk[last]) < (0.01, 0.2)
+
+
+def test_one_frame_needs_no_odometry_and_is_not_changed_by_it(room, walk):
+    relocalizer, frame = Relocalizer(room, OPTIONS), see(room, walk[1])
+    without = relocalizer.relocalize([replace(frame, odom_from_camera=None)])
+    found = relocalizer.relocalize([frame])
+    np.testing.assert_array_equal(found.map_from_camera, without.map_from_camera)
+    np.testing.assert_array_equal(found.covariance, without.covariance)
+    assert (found.score, found.evidence, found.tried) == (
+        without.score, without.evidence, without.tried)
+
+
+@pytest.mark.parametrize('refine', [True, False])
+def test_the_same_view_again_is_no_more_evidence(refine, room):
+    relocalizer = Relocalizer(room, replace(OPTIONS, refine=refine))
+    frame = see(room, MAP_FROM_CAMERA, [0, 1, 2, 4])
+    once, often = relocalizer.relocalize([frame]), relocalizer.relocalize([frame] * 5)
+    assert often.score == pytest.approx(5 * once.score, rel=0.02)
+    assert often.evidence == pytest.approx(once.evidence, rel=0.05)
+    # to what one view leaves open comes what odometry does
+    assert (np.diag(often.covariance) > 0.9 * np.diag(once.covariance)).all()
+
+
+def test_a_frame_that_shows_nothing_changes_nothing(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    for empty in ([], [0], [0, 0]):
+        found = relocalizer.relocalize([see(room, walk[0]), see(room, walk[1], empty)])
+        assert found.accepted
+        assert pose_error(found.map_from_camera, walk[1]) < (0.01, 0.2)
+    found = relocalizer.relocalize([see(room, walk[0], []), see(room, walk[1], [3])])
+    assert not found.solved
+    assert found.reason == '1 detections give fewer than 3 different correspondence candidates'
+
+
+def test_two_rooms_alike_are_ambiguous_in_any_number_of_frames(room, walk):
+    """Until a frame shows what only one of them has."""
+    shift = np.array([40.0, 0.0, 0.0])
+    unique = [[0.5, 0.4, 4.0]]
+    both = LandmarkMap(
+        'map', tuple(f'{i}' for i in range(25)), tuple(f'thing {i}' for i in range(25)),
+        (*room.class_ids, *room.class_ids, 'piano'),
+        np.concatenate([room.centers, room.centers + shift, unique]),
+        np.concatenate([room.semi_axes, room.semi_axes, [[0.2, 0.3, 0.25]]]),
+        np.concatenate([room.quats_xyzw, room.quats_xyzw, [[0, 0, 0, 1.0]]]))
+    relocalizer = Relocalizer(both, OPTIONS)
+    alike = [see(both, pose, range(12)) for pose in walk]
+    for count in (1, 2, 4):
+        found = relocalizer.relocalize(alike[:count])
+        assert not found.accepted
+        assert 'ambiguous' in found.reason
+    told_apart = relocalizer.relocalize([see(both, walk[0], [*range(12), 24]), *alike[1:]])
+    assert pose_error(told_apart.map_from_camera, walk[-1]) < (0.01, 0.2)
+    assert told_apart.score > told_apart.hypotheses[1].score + 0.5
+
+
+def test_bad_odometry_is_named(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    first, last = see(room, walk[0]), see(room, walk[1])
+    scaled, broken, mirrored = (first.odom_from_camera.copy() for _ in range(3))
+    scaled[:3, :3] *= 1.01
+    broken[0, 3] = np.nan
+    mirrored[:3, 0] *= -1.0
+    for odom, named in ((None, 'missing'), (scaled, 'no rigid'), (broken, 'no rigid'),
+                        (mirrored, 'no rigid'), (np.eye(3), 'no rigid')):
+        bad = replace(first, odom_from_camera=odom)
+        with pytest.raises(OptionsError, match=f'odom_from_camera of frame 1 of 2 is {named}'):
+            relocalizer.relocalize([bad, last])
+        with pytest.raises(OptionsError, match=f'odom_from_camera of frame 2 of 2 is {named}'):
+            relocalizer.relocalize([last, bad])
+    with pytest.raises(OptionsError, match=f'1 to {MAX_FRAMES} observations at a time, not 0'):
+        relocalizer.relocalize([])
+    with pytest.raises(OptionsError, match=f'not {MAX_FRAMES + 1}'):
+        relocalizer.relocalize([first] * (MAX_FRAMES + 1))
+
+
+def joined(frames, rng, metres, degrees):
+    """Frames in the order of time, joined by steps of odometry that are off at random."""
+    pose, poses = np.eye(4), [np.eye(4)]
+    for before, after in pairwise(frames):
+        step = invert_transform(before.map_from_camera) @ after.map_from_camera
+        step[:3, 3] += rng.normal(0, metres, 3)
+        turn = Rotation.from_rotvec(rng.normal(0, np.radians(degrees), 3))
+        step[:3, :3] = step[:3, :3] @ turn.as_matrix()
+        pose = pose @ step
+        poses.append(pose)
+    return poses
+
+
+@pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
+def test_five_real_frames(case, office_map, queries, observe, thresholds):
+    """The 52 queries with their neighbours, 1 cm and 0.5 degrees of noise a step and axis."""
+    asked, seeds, options = thresholds['fused'][case], (0, 1, 2), RelocalizerOptions()
+    knows_up = case != 'nothing'
+    if knows_up:
+        options = replace(options, height_range_m=(0.8, 2.2))
+    relocalizer = Relocalizer(office_map, options)
+    errors, accepted, normalized, milliseconds = [], [], [], []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        for main in queries.main_frames():
+            frames = sorted(queries.group(main.group), key=lambda frame: frame.stamp_ns)
+            observations = []
+            for frame, odom in zip(frames, joined(frames, rng, 0.01, 0.5), strict=True):
+                tilt = Rotation.from_rotvec(rng.normal(0, np.radians(1.0 / np.sqrt(2)), 3))
+                up = tilt.apply(frame.map_from_camera[2, :3]) if knows_up else None
+                observations.append(replace(observe(frame), odom_from_camera=odom,
+                                            up_in_camera=up))
+            row = frames.index(main)
+            found = relocalizer.relocalize(
+                [*observations[:row], *observations[row + 1:], observations[row]])
+            milliseconds.append(found.search_ms)
+            accepted.append(found.accepted)
+            errors.append(np.inf)
+            if found.solved:
+                pose, truth = found.map_from_camera, main.map_from_camera
+                errors[-1] = pose_error(pose, truth)[0]
+                error = np.r_[truth[:3, 3] - pose[:3, 3], Rotation.from_matrix(
+                    truth[:3, :3] @ pose[:3, :3].T).as_rotvec()]
+                if found.accepted and errors[-1] <= 1.0:
+                    normalized.append(error @ np.linalg.solve(found.covariance, error))
+    errors, accepted = np.array(errors), np.array(accepted)
+    success = [float((errors <= limit).mean()) for limit in LIMITS_M]
+    wrong = int((accepted & (errors > 1.0)).sum())
+    recall = float(accepted[errors <= 1.0].mean())
+    within = float((np.array(normalized) <= chi2.ppf(0.95, 6)).mean())
+    print(f'\n{case}: success {np.round(success, 3)} at {LIMITS_M} m, median '
+          f'{np.median(errors):.3f} m, accepted {accepted.mean():.2f} of all, {recall:.2f} of the '
+          f'right, {wrong} wrong; {within:.2f} within their 95 % ellipsoids; '
+          f'{np.median(milliseconds):.0f} ms')
+    assert all(got >= least for got, least in zip(success, asked['success'], strict=True))
+    assert wrong == 0
+    assert recall >= asked['recall']
+    assert within >= 0.9
