@@ -52,6 +52,8 @@ MAX_FRAMES = 10
 _UP_IN_MAP = (0.0, 0.0, 1.0)
 _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
+# Of the time budget; refining and judging what was found takes the rest, or less.
+_SEARCH_SHARE = 0.85
 # So many of the best are refined: what is worse has never led afterwards on real frames.
 _REFINED = 32
 
@@ -193,7 +195,7 @@ class Relocalizer:
         """
         start = time.perf_counter()
         cameras = _cameras_from_last(observations)
-        share = self._options.time_budget_s / len(observations)
+        share = _SEARCH_SHARE * self._options.time_budget_s / len(observations)
         frames = [self._search_frame(observation, start + share * (number + 1))
                   for number, observation in enumerate(observations)]
         return self._conclude(observations, frames, cameras, start)
