@@ -119,10 +119,10 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
         if evidence.tried < _MIN_ITERATIONS:
             return (f'the search was cut short after {evidence.tried} hypotheses, too few to know '
-                    f'the rivals of a pose: raise time_budget_s and iterations')
+                    f'the rivals of a pose: raise the time budget and iterations')
     elif evidence.coverage < 1.0:
         return (f'the search was cut short after {100 * evidence.coverage:.3g} %, so a better '
-                'pose may be elsewhere: raise time_budget_s, or set algorithm to auto')
+                'pose may be elsewhere: raise the time budget, or set algorithm to auto')
     elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
         return (f'iterations = {options.iterations} are too few to know the rivals of a pose: '
                 f'set at least {_MIN_ITERATIONS}')

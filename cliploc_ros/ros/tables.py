@@ -67,8 +67,9 @@ RELOCALIZER = (
     ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
                  low=0.0, high=1.0),
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
-    ParameterRow('time_budget_s', 10.0, 'The search stops after this long, and what it found '
-                 'is then refused, but for auto.', unit='s', low=0.0, high=3600.0),
+    ParameterRow('time_budget_ms', 50.0, 'A search with all that belongs to it takes no longer; '
+                 'what it found by then is refused, but for auto.', unit='ms', low=0.0,
+                 high=3.6e6),
     ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
                  'base_frame, or the topic imu. auto then needs two objects in place of three.',
                  choices=SOURCES, read_only=True),
@@ -118,12 +119,14 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     OptionsError
         Names the option and what it allows.
     """
-    names = RelocalizerOptions.__dataclass_fields__.keys()
+    names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s'}
     _check_mount(values['base_from_camera'])
     parse_class_map(str(values['class_map']))
     if values['gravity'] == 'base_frame' and not values['base_frame']:
         raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
     given: dict[str, Any] = {name: values[name] for name in names}
+    assert isinstance(values['time_budget_ms'], float)
+    given['time_budget_s'] = values['time_budget_ms'] / 1e3
     given['height_range_m'] = _height_range(values['height_range_m'])
     return RelocalizerOptions(**given)
 
