@@ -166,6 +166,7 @@ class Relocalizer:
         rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
         choose_distinct(rig, np.eye(3)[None], np.zeros((1, 3)), 1, Workspace.allocate(3))
         refine_all(rig, np.eye(3)[None], np.zeros((1, 3)), Workspace.allocate(3))
+        verify_rig(rig, np.eye(3), np.zeros(3), Workspace.allocate(3))
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
 
