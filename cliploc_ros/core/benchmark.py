@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast the search is on this machine: ``python -m cliploc_ros.core.benchmark``.
 
-One core, beside a plain loop over OpenCV and NumPy that does the same, in one run. With --queries
-and --map also the time that every sample of each recorded query takes.
+One core, beside a plain loop over OpenCV and NumPy that does the same, and maps of several sizes,
+in one run. With --queries and --map also the time that every sample of each recorded query takes.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core import association
+from cliploc_ros.core.benchmark_maps import measure_first_request, measure_maps
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import compiled
@@ -47,10 +48,14 @@ def main() -> int:
                                      description=__doc__)
     parser.add_argument('--queries', type=Path, metavar='NPZ', help='recorded frames')
     parser.add_argument('--map', type=Path, metavar='YAML', help='their map')
+    parser.add_argument('--landmarks', type=int, nargs='*', default=(100, 100_000, 1_000_000),
+                        metavar='N', help='sizes of the maps (%(default)s); 1,000,000 take 6 GB')
     options = parser.parse_args()
     if (options.queries is None) != (options.map is None):
         parser.error('--queries and --map belong together')
+    measure_first_request()
     _measure_hypotheses(synthetic_scene())
+    measure_maps(options.landmarks)
     if options.queries is not None:
         for matching in ('hybrid', 'class'):
             scenes = query_scenes(options.queries, options.map, matching)
