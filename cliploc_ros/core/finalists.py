@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The last few of a search: refined, told apart, and each with what it explains."""
 
+import time
 from collections.abc import Sequence
-from itertools import pairwise
-from math import comb
+from itertools import batched, pairwise
+from math import comb, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,9 @@ from cliploc_ros.core.uncertainty import (
     pose_covariance,
     refined_covariance,
 )
+
+# Between so many a time limit is looked at.
+_REFINED_AT_ONCE = 4
 
 
 class Searched(NamedTuple):
@@ -79,8 +83,8 @@ class Finalist(NamedTuple):
         return invert_transform(make_transform(self.rotation, self.translation))
 
 
-def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: int
-                   ) -> list[Finalist]:
+def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: int,
+                   deadline: float = inf) -> list[Finalist]:
     """Return the best of all frames' leaders, best first; what went to the same place is one.
 
     Parameters
@@ -92,11 +96,13 @@ def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: in
         Whether to refine them.
     count : int
         How many at most are refined.
+    deadline : float, optional
+        When to stop, of time.perf_counter [s]: what is left then, the worst, stays as found.
     """
     found = [one for frame in range(len(frames)) for one in _leaders_of(frames, rig, frame)]
     if len(frames) > 1 and found:
         found = _best_in_all(found, rig, count)
-    return _refined(found, rig)[:MAX_DISTINCT] if refine and found else found[:MAX_DISTINCT]
+    return _refined(found, rig, deadline)[:MAX_DISTINCT] if refine else found[:MAX_DISTINCT]
 
 
 def _leaders_of(frames: Sequence[Searched], rig: Rig, frame: int) -> list[Finalist]:
@@ -116,13 +122,18 @@ def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
     return [found[row]._replace(score=float(scores[row])) for row in rows]
 
 
-def _refined(found: list[Finalist], rig: Rig) -> list[Finalist]:
+def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:
     """Return them after refinement, best first, each place once."""
-    rotations, translations = _poses(found)
-    scores, informations = refine_all(rig, rotations, translations, _workspace(rig))
-    improved = [one._replace(rotation=rotations[row], translation=translations[row],
-                             score=float(scores[row]), information=informations[row])
-                for row, one in enumerate(found)]
+    improved: list[Finalist] = []
+    for some in batched(found, _REFINED_AT_ONCE):
+        if improved and time.perf_counter() > deadline:
+            improved += some
+            continue
+        rotations, translations = _poses(some)
+        scores, informations = refine_all(rig, rotations, translations, _workspace(rig))
+        improved += [one._replace(rotation=rotations[row], translation=translations[row],
+                                  score=float(scores[row]), information=informations[row])
+                     for row, one in enumerate(some)]
     distinct: list[Finalist] = []
     for one in sorted(improved, key=lambda one: -one.score):
         if not any(same_place(one.rotation, one.translation, better.rotation, better.translation)
@@ -131,7 +142,7 @@ def _refined(found: list[Finalist], rig: Rig) -> list[Finalist]:
     return distinct
 
 
-def _poses(found: list[Finalist]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _poses(found: Sequence[Finalist]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return (np.stack([one.rotation for one in found]),
             np.stack([one.translation for one in found]))
 

@@ -23,7 +23,7 @@ from cliploc_ros.core.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fusion import choose_distinct, make_rig, refine_all
+from cliploc_ros.core.fusion import choose_distinct, make_rig, refine_all, verify_rig
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Observation
@@ -52,8 +52,8 @@ MAX_FRAMES = 10
 _UP_IN_MAP = (0.0, 0.0, 1.0)
 _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
-# Of the time budget; refining and judging what was found takes the rest, or less.
-_SEARCH_SHARE = 0.85
+# Of the time budget: when the search ends, and the refinement; judging the result takes the rest.
+_SEARCH_SHARE, _REFINED_SHARE = 0.8, 0.9
 # So many of the best are refined: what is worse has never led afterwards on real frames.
 _REFINED = 32
 
@@ -267,7 +267,8 @@ class Relocalizer:
         coverage = min(one.progress.coverage for one in frames)
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]))
-        finalists = find_finalists(frames, rig, self._options.refine, _REFINED)
+        finalists = find_finalists(frames, rig, self._options.refine, _REFINED,
+                                   start + _REFINED_SHARE * self._options.time_budget_s)
         if not finalists:
             return Relocalization(False, 'no pose explains any three detections', tried=tried,
                                   coverage=coverage, search_ms=_elapsed_ms(start),
