@@ -67,8 +67,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--resume', action='store_true', help='go on with a run that was stopped')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
     parser.add_argument('--tune', action='store_true',
-                        help='choose k, IoU threshold, iterations and min_evidence of one method '
-                        'on half of the queries, and report on the other half')
+                        help='choose k, IoU threshold, iterations and min_confidence of one '
+                        'method on half of the queries, and report on the other half')
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)

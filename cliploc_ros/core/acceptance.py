@@ -2,20 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether to believe the best pose. A wrong pose is worse than none."""
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.options import RelocalizerOptions
 
-# Boxes that overlap more than this show one object, detected twice.
-_SAME_BOX_IOU = 0.8
-# Fewer samples have not looked for rivals: the margin over them would mean nothing.
+# Fewer samples have not looked for rivals: the confidence would mean nothing.
 _MIN_ITERATIONS = 500
-# A rival as good as a pose that was met so often is missed with a chance of .05.
-_MIN_MEETINGS = 3
+# Of likely poses that a search had met once or never, at most so many were wrong.
+_MISSED_IS_RIGHT = 0.2
 
 
 @dataclass(frozen=True)
@@ -28,14 +23,6 @@ class Match:
 
 
 @dataclass(frozen=True)
-class Support:
-    """How many objects speak for a pose, and the sum of their IoUs."""
-
-    inliers: int
-    score: float
-
-
-@dataclass(frozen=True)
 class Evidence:
     """What speaks for the best hypothesis, and what against it.
 
@@ -43,75 +30,44 @@ class Evidence:
     ----------
     inliers : int
         Objects that the best explains.
-    score : float
-        Sum of their IoUs.
-    rival_score : float
-        The same of the best hypothesis elsewhere; 0 when there is none.
+    likely : float
+        How likely it is right, of all that were found, see cliploc_ros.core.confidence.
+    rival : float
+        The same of the likeliest other hypothesis; 0 when there is none.
     coverage : float
         The share of its samples that the search tried, 0 to 1.
     tried : int
         How many these are.
-    meetings : int
+    meetings : float
         How many samples, of those that the search tried, hold nothing but inliers of the best
-        hypothesis. A rival with as many inliers is met about as often, and missed with a chance
-        of about exp(-meetings) (Fischler and Bolles 1981).
+        hypothesis; infinite of a search that tried all.
     """
 
     inliers: int
-    score: float
-    rival_score: float
+    likely: float
+    rival: float = 0.0
     coverage: float = 1.0
     tried: int = 0
-    meetings: int = 1_000_000
+    meetings: float = math.inf
 
     @property
-    def strength(self) -> float:
-        """Return the score plus twice its margin over the best hypothesis elsewhere."""
-        return self.score + 2.0 * (self.score - self.rival_score)
+    def found(self) -> float:
+        """Return how likely the search has not missed what is right in place of the best.
+
+        A rival with as many inliers is met about as often, so it is missed with a chance of about
+        exp(-meetings) (Fischler and Bolles 1981).
+        """
+        return 1.0 - _MISSED_IS_RIGHT * math.exp(-self.meetings)
+
+    @property
+    def confidence(self) -> float:
+        """Return how likely the best hypothesis is right, of all that there may be."""
+        return self.likely * self.found
 
 
-def support(matches: Sequence[Sequence[Match]], bboxes_xyxy: Sequence[NDArray[np.float64]]
-            ) -> Support:
-    """Return what speaks for a pose, each object once.
-
-    Several boxes on one landmark, and several landmarks behind one box, say no more than the
-    best of them. Frames that show one object share the errors of its shape in the map, so that
-    their agreement is no more evidence than one of them: it counts with its mean IoU.
-
-    Parameters
-    ----------
-    matches : sequence of sequence of Match
-        Of each frame.
-    bboxes_xyxy : sequence of ndarray (n, 4)
-        The boxes that the matches count, of each frame [px].
-    """
-    ious: dict[int, list[float]] = {}
-    for matches_here, boxes_here in zip(matches, bboxes_xyxy, strict=True):
-        for match in _one_to_one(matches_here, boxes_here):
-            ious.setdefault(match.landmark, []).append(match.iou)
-    return Support(len(ious), sum(sum(some) / len(some) for some in ious.values()))
-
-
-def _one_to_one(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> list[Match]:
-    """Return the best matches of one frame, each landmark and each object once."""
-    taken: list[Match] = []
-    for match in sorted(matches, key=lambda match: -match.iou):
-        boxes = bboxes_xyxy[[other.detection for other in taken]]
-        if match.landmark in [other.landmark for other in taken]:
-            continue
-        if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
-            continue
-        taken.append(match)
-    return taken
-
-
-def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the IoU of a box (4,) with others (m, 4)."""
-    others = others.reshape(-1, 4)
-    overlap = np.prod(np.maximum(0.0, np.minimum(box[2:], others[:, 2:])
-                                 - np.maximum(box[:2], others[:, :2])), axis=1)
-    areas = np.prod(others[:, 2:] - others[:, :2], axis=1)
-    return overlap / (np.prod(box[2:] - box[:2]) + areas - overlap)
+def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
+    """Return whether a search has tried every sample."""
+    return coverage == 1.0 and options.algorithm in ('auto', 'bf')
 
 
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
@@ -126,20 +82,24 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
         return (f'iterations = {options.iterations} are too few to know the rivals of a pose: '
                 f'set at least {_MIN_ITERATIONS}')
-    if evidence.meetings < _MIN_MEETINGS and not (
-            options.algorithm in ('auto', 'bf') and evidence.coverage == 1.0):
-        return (f'the search met this pose only {evidence.meetings} times in {evidence.tried} '
-                'samples, so one as good may have been missed: raise iterations, or set '
-                'algorithm to auto')
     if evidence.inliers < options.min_inliers:
         return (f'only {evidence.inliers} objects are where the map has them, '
                 f'{options.min_inliers} are needed: turn to where more are in view')
-    if evidence.strength < options.min_evidence:
-        return (f'ambiguous: evidence {evidence.strength:.2f} is below '
-                f'{options.min_evidence:.2f} (score {evidence.score:.2f}, best elsewhere '
-                f'{evidence.rival_score:.2f})')
-    if evidence.rival_score > options.max_rival * evidence.score:
-        return (f'ambiguous: a pose elsewhere explains the image nearly as well (score '
-                f'{evidence.score:.2f}, best elsewhere {evidence.rival_score:.2f}): turn to where '
-                'more can be told apart')
-    return ''
+    if evidence.confidence >= options.min_confidence:
+        return ''
+    if evidence.likely >= options.min_confidence:
+        return (f'the search met this pose only {evidence.meetings:g} times in {evidence.tried} '
+                'samples, so one as good may have been missed: raise iterations, or set '
+                'algorithm to auto')
+    says = f'{_percent(evidence.confidence)}, {_percent(options.min_confidence)} are asked for'
+    # where a rival holds most of what is missing, or is the likelier
+    if evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely)):
+        return (f'ambiguous: the best pose is right with {says}, another with '
+                f'{_percent(evidence.rival)}: turn to where more can be told apart')
+    return (f'unsure: {evidence.inliers} objects make the best pose right with {says}: turn to '
+            'where more are in view')
+
+
+def _percent(share: float) -> str:
+    """Return a percentage that is never rounded up to another hundredth."""
+    return f'{math.floor(share * 1000) / 10:g} %'

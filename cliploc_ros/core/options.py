@@ -51,10 +51,9 @@ class RelocalizerOptions:
         the paper does not.
     min_inliers : int
         Fewer explained objects are refused.
-    min_evidence : float
-        Less evidence is refused, see cliploc_ros.core.acceptance.
-    max_rival : float
-        A pose is refused if one elsewhere scores more than this share of its score (0 to 1).
+    min_confidence : float
+        A pose that is within 1 m of the truth with less probability is refused (0 to 1), see
+        cliploc_ros.core.confidence.
 
     Raises
     ------
@@ -73,9 +72,8 @@ class RelocalizerOptions:
     max_tilt_deg: float = 180.0
     vertical_deviation_deg: float = 1.0
     refine: bool = True
-    min_inliers: int = 4
-    min_evidence: float = 4.0
-    max_rival: float = 0.9
+    min_inliers: int = 3
+    min_confidence: float = 0.99
 
     def __post_init__(self) -> None:
         """Refuse values outside what each option allows."""
@@ -92,8 +90,7 @@ class RelocalizerOptions:
         _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
         _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
         _check_range('min_inliers', self.min_inliers, 3, math.inf)
-        _check_range('min_evidence', self.min_evidence, 0.0, math.inf)
-        _check_range('max_rival', self.max_rival, 0.0, 1.0)
+        _check_range('min_confidence', self.min_confidence, 0.0, 1.0)
 
     @property
     def needs_similarities(self) -> bool:

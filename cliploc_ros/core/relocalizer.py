@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core import association
-from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
+from cliploc_ros.core.acceptance import Evidence, Match, is_exhaustive, refusal
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.compatibility import compatible_pairs
 from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.confidence import Support, View, confidences, support
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.finalists import (
     Searched,
@@ -60,10 +61,23 @@ _REFINED = 32
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A pose the camera may have had, and the sum of IoUs that speaks for it."""
+    """A pose the camera may have had.
+
+    Parameters
+    ----------
+    map_from_camera : ndarray (4, 4)
+    score : float
+        Sum of the IoUs that speak for it.
+    confidence : float
+        How likely it is within 1 m of the truth, 0 to 1.
+    support : Support
+        Why so.
+    """
 
     map_from_camera: NDArray[np.float64]
     score: float
+    confidence: float
+    support: Support
 
 
 @dataclass(frozen=True)
@@ -92,8 +106,6 @@ class Relocalization:
         How long association, search and verification took [ms].
     stamp_ns : int
         Stamp of the observation [ns].
-    evidence : float
-        What acceptance compares with min_evidence; 0 when nothing was found.
     """
 
     accepted: bool
@@ -106,7 +118,6 @@ class Relocalization:
     coverage: float = 1.0
     search_ms: float = 0.0
     stamp_ns: int = 0
-    evidence: float = 0.0
 
     @property
     def solved(self) -> bool:
@@ -117,6 +128,11 @@ class Relocalization:
     def map_from_camera(self) -> NDArray[np.float64] | None:
         """Return the best pose (4, 4), believed or not; None when there is none."""
         return self.hypotheses[0].map_from_camera if self.hypotheses else None
+
+    @property
+    def confidence(self) -> float:
+        """Return how likely the best pose is within 1 m; 0 when nothing was found."""
+        return self.hypotheses[0].confidence if self.hypotheses else 0.0
 
     @property
     def score(self) -> float:
@@ -273,23 +289,27 @@ class Relocalizer:
             return Relocalization(False, 'no pose explains any three detections', tried=tried,
                                   coverage=coverage, search_ms=_elapsed_ms(start),
                                   stamp_ns=stamp_ns)
-        best, hypotheses = finalists[0], tuple(Hypothesis(one.map_from_camera, one.score)
-                                               for one in finalists)
-        explained = [matches_of(rig, one) for one in finalists]
+        best, explained = finalists[0], [matches_of(rig, one) for one in finalists]
         covariance = covariance_of(frames, rig, best, explained[0])
-        bboxes = [one.detections.bboxes_xyxy for one in observations]
-        supports = [support(matches, bboxes) for matches in explained]
+        poses = np.array([one.map_from_camera for one in finalists])
+        views = [View(observation, one.scene, self._map, self._options.needs_similarities)
+                 for observation, one in zip(observations, frames, strict=True)]
+        last_from_cameras = np.linalg.inv(cameras)
+        supports = [support(views, pose @ last_from_cameras, matches)
+                    for pose, matches in zip(poses, explained, strict=True)]
+        likely = confidences(supports, poses)
         evidence = Evidence(
-            inliers=supports[0].inliers, score=supports[0].score,
-            rival_score=max((rival.score for rival in supports[1:]), default=0.0),
+            supports[0].inliers, likely[0], max(likely[1:], default=0.0), coverage,
             # those that boxes contradict were looked at too
-            coverage=coverage, tried=sum(max(one.progress.tried, math.comb(
+            tried=sum(max(one.progress.tried, math.comb(
                 one.progress.reach, _sample_size(one.vertical))) for one in frames),
-            meetings=meetings_of(frames, best, explained[0]))
+            meetings=math.inf if is_exhaustive(coverage, self._options)
+            else meetings_of(frames, best, explained[0]))
         reason = refusal(evidence, self._options)
+        hypotheses = tuple(map(Hypothesis, poses, (one.score for one in finalists),
+                               likely * evidence.found, supports))
         return Relocalization(not reason, reason, hypotheses, explained[0][-1], covariance,
-                              tried, best.iteration, coverage, _elapsed_ms(start), stamp_ns,
-                              evidence.strength)
+                              tried, best.iteration, coverage, _elapsed_ms(start), stamp_ns)
 
 
 def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:

@@ -183,3 +183,25 @@ def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray
     ranks = np.arange(len(rows)) - np.searchsorted(rows, rows)
     taken = order[ranks < k]  # of each row at least k, since its k best labels have as many
     return landmarks[taken].reshape(-1, k), alike[taken].reshape(-1, k)
+
+
+def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
+                      landmarks: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the similarities (m,) of pairs of a crop (m,) and a landmark (m,)."""
+    if not isinstance(similarities, CropSimilarities):
+        return similarities[crops, landmarks]
+    labels = similarities.labels.unique[similarities.labels.of_landmarks[landmarks]]
+    return np.asarray(np.einsum('ij,ij->i', similarities.crops[crops], labels))
+
+
+def sampled_similarities(similarities: Similarities, crops: NDArray[np.int64], most: int
+                         ) -> NDArray[np.float32]:
+    """Return the similarities (m, s) of crops (m,) with landmarks spread over the map.
+
+    Of a small map these are all landmarks, of others at least half of the most asked for.
+    """
+    step = -(-similarities.shape[1] // most)
+    if not isinstance(similarities, CropSimilarities):
+        return similarities[crops, ::step]
+    labels = similarities.labels.unique[similarities.labels.of_landmarks[::step]]
+    return similarities.crops[crops] @ labels.T

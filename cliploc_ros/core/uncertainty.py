@@ -126,6 +126,24 @@ def odometry_covariance() -> NDArray[np.float64]:
     return np.diag(np.repeat(np.square([_ODOMETRY_DEVIATION_M, _ODOMETRY_DEVIATION_RAD]), 3))
 
 
+def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
+                      truth: NDArray[np.float64]) -> float:
+    """Return the squared error of a pose in its own covariance (NEES).
+
+    Over many poses whose covariances are true it has the chi-squared distribution of six degrees
+    of freedom (Bar-Shalom, Li and Kirubarajan 2001).
+
+    Parameters
+    ----------
+    map_from_camera, truth : ndarray (4, 4)
+    covariance : ndarray (6, 6)
+        As of pose_covariance.
+    """
+    turn = Rotation.from_matrix(truth[:3, :3] @ map_from_camera[:3, :3].T).as_rotvec()
+    error = np.concatenate([truth[:3, 3] - map_from_camera[:3, 3], turn])
+    return float(error @ np.linalg.solve(covariance, error))
+
+
 def _moved(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a pose displaced by a step (6,) of position and of rotation about fixed axes."""
     moved = pose.copy()

@@ -178,7 +178,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
             axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
                       markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
-    axes.set_title('lines: every threshold of the evidence; markers: the options as run',
+    axes.set_title('lines: every threshold of the confidence; markers: the options as run',
                    fontsize=9)
     _legend(figure)
     return figure
@@ -186,7 +186,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
 
 def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return recall (m,) and precision (m,) of believing all poses above each evidence.
+    """Return recall (m,) and precision (m,) of believing all poses above each confidence.
 
     Parameters
     ----------
@@ -200,13 +200,13 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
         From the strictest threshold on; empty if no pose is right.
     """
     solved = np.isfinite(one.errors_m)
-    order = np.argsort(-one.evidence[solved], kind='stable')
+    order = np.argsort(-one.confidence[solved], kind='stable')
     right = (one.errors_m[solved] < limit_m)[order]
     if not right.any():
         return np.empty(0), np.empty(0)
     believed = np.cumsum(right)
-    # of equal evidence all or none are believed
-    last = np.append(np.diff(one.evidence[solved][order]) != 0, True)
+    # of equal confidence all or none are believed
+    last = np.append(np.diff(one.confidence[solved][order]) != 0, True)
     return (believed / right.sum())[last], (believed / np.arange(1, right.size + 1))[last]
 
 

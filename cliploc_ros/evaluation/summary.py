@@ -30,7 +30,7 @@ class Summary:
     errors_m : ndarray (t, q)
         Distance of the best pose from the truth; infinite where none was found.
     accepted : ndarray (t, q) of bool
-    evidence : ndarray (t, q)
+    confidence : ndarray (t, q)
     search_ms : ndarray (t, q)
     coverage : ndarray (t, q)
     best_iterations, hypotheses : ndarray (t, q) of int
@@ -41,7 +41,7 @@ class Summary:
     queries: tuple[int, ...]
     errors_m: NDArray[np.float64]
     accepted: NDArray[np.bool_]
-    evidence: NDArray[np.float64]
+    confidence: NDArray[np.float64]
     search_ms: NDArray[np.float64]
     coverage: NDArray[np.float64]
     best_iterations: NDArray[np.int64]
@@ -108,7 +108,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     errors = [np.inf if result.error_m is None else result.error_m for result in results]
     return Summary(
         method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
-        column('evidence'), column('search_ms'), column('coverage'), column('best_iteration'),
+        column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
         column('hypotheses'), column('boxes')[0])
 
 

@@ -14,6 +14,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.uncertainty import normalized_square
 from cliploc_ros.datasets.queries import Queries, QueryFrame
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.methods import Method
@@ -62,8 +63,10 @@ class Result:
         Its distance from the truth.
     score : float
         Sum of its IoUs.
-    evidence : float
-        What acceptance looks at.
+    confidence : float
+        How likely the pose is within 1 m, as the relocalizer has it.
+    nees : float or None
+        Squared error of the pose in its own covariance, see normalized_square.
     inliers : int
     hypotheses : int
         How many were tried.
@@ -88,7 +91,8 @@ class Result:
     error_m: float | None
     error_deg: float | None
     score: float
-    evidence: float
+    confidence: float
+    nees: float | None
     inliers: int
     hypotheses: int
     best_iteration: int
@@ -165,6 +169,9 @@ def _judge(method: str, trial: int, query: Query, found: Relocalization) -> Resu
         map_from_camera=None if pose is None else pose.tolist(),
         error_m=None if error_m is None else float(error_m),
         error_deg=None if error_deg is None else float(error_deg), score=float(found.score),
-        evidence=float(found.evidence), inliers=len(found.matches), hypotheses=int(found.tried),
+        confidence=float(found.confidence),
+        nees=None if pose is None or found.covariance is None
+        else normalized_square(pose, found.covariance, query.map_from_camera),
+        inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
         reason=found.reason, search_ms=float(found.search_ms))

@@ -65,7 +65,7 @@ def split(queries: Sequence[Query], seed: int) -> tuple[list[Query], list[Query]
 def tune(landmark_map: LandmarkMap, start: RelocalizerOptions, queries: Sequence[Query], *,
          trials: int, workers: int, seed: int,
          advance: Callable[[list[Result]], object] = lambda results: None) -> Tuned:
-    """Choose k, IoU threshold, number of samples and evidence asked for.
+    """Choose k, IoU threshold, number of samples and confidence asked for.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ def tune(landmark_map: LandmarkMap, start: RelocalizerOptions, queries: Sequence
     for name, values in candidates(start, len(landmark_map)).items():
         tried = [replace(chosen, **{name: value}) for value in values]
         chosen = _least_worthwhile(tried, measure(tried, choosing))
-    evidence = least_evidence(measure([replace(chosen, min_evidence=0.0)], choosing)[0])
-    chosen = replace(chosen, min_evidence=evidence)
+    confidence = least_confidence(measure([replace(chosen, min_confidence=0.0)], choosing)[0])
+    chosen = replace(chosen, min_confidence=confidence)
     before, after = measure([start, chosen], judging)
     return Tuned(chosen, replace(before, method='as given'), replace(after, method='tuned'))
 
@@ -123,32 +123,32 @@ def _least_worthwhile(options: Sequence[RelocalizerOptions], summaries: Sequence
                 if merit >= max(merits) - _WORTHWHILE)
 
 
-def least_evidence(one: Summary, limit_m: float = 1.0) -> float:
-    """Return the least evidence to ask for, so that believed poses are right often enough.
+def least_confidence(one: Summary, limit_m: float = 1.0) -> float:
+    """Return the least confidence to ask for, so that believed poses are right often enough.
 
     Parameters
     ----------
     one : Summary
-        Of options that ask for no evidence.
+        Of options that ask for no confidence.
     limit_m : float
         What counts as right.
 
     Returns
     -------
     float
-        With a precision of .99 on these queries; rounded up to a hundredth.
+        With a precision of .99 on these queries, rounded up to a thousandth; 1 if there is none.
     """
-    evidence = one.evidence[one.accepted]
+    confidence = one.confidence[one.accepted]
     right = (one.errors_m < limit_m)[one.accepted]
-    levels: NDArray[np.float64] = np.unique(evidence)
+    levels: NDArray[np.float64] = np.unique(confidence)
     for level in levels:
-        if right[evidence >= level].mean() >= _LEAST_PRECISION:
-            return float(np.ceil(level * 100) / 100)
-    return float(np.ceil(evidence.max(initial=0.0) * 100) / 100 + 0.01)
+        if right[confidence >= level].mean() >= _LEAST_PRECISION:
+            return float(np.ceil(level * 1000) / 1000)
+    return 1.0
 
 
 def as_parameter_file(options: RelocalizerOptions) -> str:
     """Return the options chosen as a ROS 2 parameter file for the relocalizer."""
-    names = ('matching', 'algorithm', 'k', 'iterations', 'iou_threshold', 'min_evidence')
+    names = ('matching', 'algorithm', 'k', 'iterations', 'iou_threshold', 'min_confidence')
     values = {name: getattr(options, name) for name in names}
     return yaml.safe_dump({'relocalizer': {'ros__parameters': values}}, sort_keys=False)

@@ -81,12 +81,10 @@ RELOCALIZER = (
                  'way.', unit='deg', low=0.0, high=180.0),
     ParameterRow('refine', True, 'Improve the best poses on all of their inliers; the paper does '
                  'not.'),
-    ParameterRow('min_inliers', 4, 'A pose that explains fewer objects is refused.', low=3,
+    ParameterRow('min_inliers', 3, 'A pose that explains fewer objects is refused.', low=3,
                  high=1000),
-    ParameterRow('min_evidence', 4.0, 'A pose with less evidence (score plus twice its margin '
-                 'over the best elsewhere) is refused.', low=0.0, high=1e6),
-    ParameterRow('max_rival', 0.9, 'A pose is refused if one elsewhere scores more than this '
-                 'share of it.', low=0.0, high=1.0),
+    ParameterRow('min_confidence', 0.99, 'A pose that is within 1 m with less probability is '
+                 'refused.', low=0.0, high=1.0),
     ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
                  "'tvmonitor=tv, pottedplant=potted plant'."),
     ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance import Evidence, Match, refusal, support
+from cliploc_ros.core.acceptance import Evidence, Match, refusal
 from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.confidence import Support, View, confidences, support
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.scoring import make_scene
 from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.core.uncertainty import pose_covariance
 
@@ -54,48 +56,133 @@ def test_accepted_poses_are_right_and_their_covariances_true(iterations, office_
 APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=np.float64)
 
 
-def test_several_boxes_on_one_landmark_count_once():
-    found = support([[Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)]], [APART])
+@pytest.fixture
+def view(office_map, queries, observe):
+    """A frame whose boxes are three that lie apart and one that nearly repeats the third."""
+    boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
+    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
+    detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
+                            np.ones(4))
+    similarities = np.zeros((4, len(office_map)), dtype=np.float32)
+    similarities[1, 4] = 1.0
+    scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
+                       np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
+    return View(Observation(camera, detections, similarities), scene, office_map, True)
+
+
+def test_several_boxes_on_one_landmark_count_once(view, queries):
+    found = support([view], queries[0].map_from_camera[None],
+                    [[Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)]])
     assert (found.inliers, found.score) == (2, pytest.approx(1.3))
 
 
-def test_several_landmarks_behind_one_box_count_once():
-    boxes = np.array([[0, 0, 100, 100], [2, 0, 100, 100], [0, 0, 50, 50]], dtype=np.float64)
-    found = support([[Match(0, 1, 0.5), Match(1, 2, 0.7), Match(2, 3, 0.6)]], [boxes])
+def test_several_landmarks_behind_one_box_count_once(view, queries):
+    found = support([view], queries[0].map_from_camera[None],
+                    [[Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)]])
     assert (found.inliers, found.score) == (2, pytest.approx(1.3))
 
 
-def test_nothing_supports_nothing():
-    assert support([[]], [APART]).inliers == 0
+def test_nothing_supports_nothing(view):
+    assert support([view], np.eye(4)[None], [[]]) == Support()
 
 
-def test_evidence_is_score_and_twice_the_margin():
-    assert Evidence(2, score=1.5, rival_score=1.0).strength == pytest.approx(1.5 + 2 * 0.5)
+def test_labels_and_classes_support_a_pose(view, queries, office_map):
+    poses, matches = queries[0].map_from_camera[None], [[Match(1, 4, 0.5)]]
+    found = support([view], poses, matches)
+    count = len(office_map)
+    # one of all columns is 1, the others are 0
+    assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
+    assert (found.same_class, found.unlabelled) == (1, 0)
+    by_class = support([view._replace(by_label=False)], poses, matches)
+    assert (by_class.likeness, by_class.unlabelled) == (0.0, 1)
+    assert by_class.misfit == found.misfit > 0
+
+
+def test_an_object_in_several_frames_counts_once(view, queries):
+    poses = np.tile(queries[0].map_from_camera, (2, 1, 1))
+    once = support([view], poses[:1], [[Match(1, 4, 0.5)]])
+    twice = support([view, view], poses, [[Match(1, 4, 0.5)], [Match(1, 4, 0.7)]])
+    assert twice == Support(1, pytest.approx(0.6), *list(vars(once).values())[2:])
+    both = support([view, view], poses, [[Match(1, 4, 0.5)], [Match(0, 3, 0.7)]])
+    assert (both.inliers, both.score) == (2, pytest.approx(1.2))
+
+
+def poses_at(*positions):
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, 0, 3] = positions
+    return poses
+
+
+STRONG, WEAK = Support(7, 5.0, 10.0, 14.0, 7), Support(3, 1.5, 10.0, 2.0, 2)
+
+
+def test_confidence_is_shared_by_poses_that_differ():
+    alone = confidences([STRONG], poses_at(0))[0]
+    first, second = confidences([STRONG, STRONG], poses_at(0, 5))
+    assert alone > 0.99
+    assert first == pytest.approx(second)
+    assert 0.45 < first <= 0.5
+
+
+def test_poses_that_agree_speak_for_each_other():
+    assert confidences([STRONG, STRONG], poses_at(0, 0.6)).min() > 0.99
+    turned = poses_at(0, 0.6)
+    turned[1, :3, :3] = Rotation.from_euler('z', 90, degrees=True).as_matrix()
+    assert confidences([STRONG, STRONG], turned).max() <= 0.5
+
+
+def test_little_support_is_little_confidence():
+    weak, rival = confidences([WEAK, WEAK], poses_at(0, 5))
+    assert weak + rival < 0.3
+    assert confidences([Support()], poses_at(0))[0] < 0.01
+
+
+def test_confidences_never_exceed_certainty(rng):
+    for _ in range(200):
+        count = rng.integers(1, 9)
+        supports = [Support(int(rng.integers(0, 9)), *rng.uniform(0, 20, 3), 0, 0)
+                    for _ in range(count)]
+        found = confidences(supports, poses_at(*rng.uniform(0, 100, count)))
+        assert (found >= 0).all()
+        apart = found[np.abs(np.subtract.outer(found, found)).sum(axis=0) > 0]
+        assert (apart <= 1).all() and np.isfinite(found).all()
 
 
 @pytest.mark.parametrize(('evidence', 'options', 'reason'), [
-    (Evidence(3, 2.5, 0.0), {}, 'only 3 objects'),
-    (Evidence(5, 3.5, 3.5), {}, 'ambiguous: evidence'),
-    (Evidence(8, 6.0, 5.5), {}, 'ambiguous: a pose elsewhere'),
-    (Evidence(8, 6.0, 5.5), {'max_rival': 0.95}, ''),
-    (Evidence(5, 3.5, 1.0, coverage=0.5), {'algorithm': 'bf'},
+    (Evidence(3, 0.995), {'min_inliers': 4}, 'only 3 objects'),
+    (Evidence(3, 0.995), {}, ''),
+    (Evidence(5, 0.5, 0.3), {}, 'ambiguous: the best pose is right with 50 %'),
+    (Evidence(5, 0.5, 0.1), {}, 'unsure: 5 objects'),
+    (Evidence(5, 0.1, 0.3), {}, 'ambiguous: '),
+    (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
+    (Evidence(8, 0.98999), {}, 'unsure: 8 objects make the best pose right with 98.9 %'),
+    (Evidence(5, 0.995, coverage=0.5), {'algorithm': 'bf'},
      'the search was cut short after 50 %'),
-    (Evidence(5, 3.5, 1.0, coverage=0.5, tried=100), {},
+    (Evidence(5, 0.995, coverage=0.5, tried=100), {},
      'the search was cut short after 100 hypotheses'),
-    (Evidence(5, 3.5, 1.0, coverage=0.5, tried=5000), {}, ''),
-    (Evidence(5, 3.5, 1.0, coverage=0.5, tried=5000, meetings=2), {}, 'the search met this pose'),
-    (Evidence(5, 3.5, 1.0, meetings=0), {}, ''),
-    (Evidence(5, 3.5, 1.0, meetings=2), {'algorithm': 'ransac'}, 'the search met this pose'),
-    (Evidence(5, 3.5, 1.0, meetings=3), {'algorithm': 'ransac'}, ''),
-    (Evidence(5, 3.5, 1.0), {'iterations': 100, 'algorithm': 'b-prosac'},
+    (Evidence(5, 0.995, coverage=0.5, tried=5000), {}, ''),
+    (Evidence(5, 0.995, coverage=0.5, tried=5000, meetings=2), {}, 'the search met this pose'),
+    (Evidence(5, 0.995, meetings=1), {'algorithm': 'ransac'}, 'the search met this pose'),
+    (Evidence(5, 0.999, meetings=4), {'algorithm': 'ransac'}, ''),
+    (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'},
      'iterations = 100 are too few'),
-    (Evidence(5, 3.5, 1.0), {'iterations': 100, 'algorithm': 'bf'}, ''),
-    (Evidence(5, 3.5, 1.0), {}, ''),
+    (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'bf'}, ''),
 ])
 def test_refusal_names_its_reason(evidence, options, reason):
     answer = refusal(evidence, RelocalizerOptions(**options))
     assert answer.startswith(reason)
     assert bool(answer) == bool(reason)
+
+
+def test_an_ambiguous_scene_shares_its_confidence(office_map, queries, observe):
+    relocalizer = Relocalizer(office_map, RelocalizerOptions())
+    for frame in queries.main_frames():
+        result = relocalizer.relocalize([observe(frame)])
+        given = [one.confidence for one in result.hypotheses]
+        assert all(0 <= one <= 1 for one in given)
+        assert result.confidence == (given[0] if given else 0)
+        assert result.accepted == (result.confidence >= 0.99)
+        assert result.accepted == (not result.reason)
 
 
 def garbage(rng, kind):

@@ -35,10 +35,10 @@ def test_a_name_given_twice_counts_once():
 
 def test_named_sets_of_options(tmp_path):
     path = tmp_path / 'mine.yaml'
-    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_evidence: 6}\n')
+    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_confidence: 0.9}\n')
     wide, strict = parse_methods([str(path)], PAPER, 40)
     assert (wide.name, wide.options.k, wide.options.iterations) == ('wide', 9, 500)
-    assert (strict.options.min_evidence, strict.options.iterations) == (6, 10_000)
+    assert (strict.options.min_confidence, strict.options.iterations) == (0.9, 10_000)
 
 
 @pytest.mark.parametrize(('text', 'named'), [

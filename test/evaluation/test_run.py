@@ -118,7 +118,7 @@ def test_a_journal_forgets_only_a_line_cut_off(results, tmp_path):
 
 
 def test_tuning_chooses_on_one_half_and_judges_on_the_other(room, questions):
-    start = RelocalizerOptions(k=1, iterations=500, min_evidence=100.0)
+    start = RelocalizerOptions(k=1, iterations=500, min_confidence=1.0)
     seen = []
     tuned = tuning.tune(room, start, questions, trials=2, workers=1, seed=0, advance=seen.extend)
     chose, judged = tuning.split(questions, 0)
@@ -127,18 +127,18 @@ def test_tuning_chooses_on_one_half_and_judges_on_the_other(room, questions):
     assert tuned.after.queries == tuned.before.queries == tuple(one.number for one in judged)
     assert not tuned.before.accepted.any()
     assert tuned.after.accepted.any()
-    assert tuned.options.min_evidence < 100.0
+    assert tuned.options.min_confidence < 1.0
     read = yaml.safe_load(tuning.as_parameter_file(tuned.options))['relocalizer']
     assert read['ros__parameters']['k'] == tuned.options.k
     with pytest.raises(OptionsError, match='at least 8'):
         tuning.split(questions[:7], 0)
 
 
-def test_the_least_evidence_that_is_right_often_enough():
-    def evidence(errors, levels):
-        return tuning.least_evidence(make_summary(
-            errors, accepted=[True] * len(errors), evidence=levels))
+def test_the_least_confidence_that_is_right_often_enough():
+    def least(errors, levels):
+        return tuning.least_confidence(make_summary(
+            errors, accepted=[True] * len(errors), confidence=levels))
 
-    assert evidence([0.1, 0.1, 2.0], [5.0, 4.0, 3.0]) == 4.0
-    assert evidence([0.1, 2.0, 0.1], [5.0, 4.004, 3.0]) == 5.0
-    assert evidence([2.0, 0.1], [5.0, 4.0]) > 5.0
+    assert least([0.1, 0.1, 2.0], [0.9, 0.8, 0.7]) == 0.8
+    assert least([0.1, 2.0, 0.1], [0.9001, 0.8, 0.7]) == 0.901
+    assert least([2.0, 0.1], [0.9, 0.8]) == 1.0

@@ -15,13 +15,13 @@ from cliploc_ros.evaluation.tables import as_csv, as_json, as_markdown, as_text,
 from cliploc_ros.evaluation.trials import Result
 
 
-def make_summary(errors, method='auto', accepted=None, evidence=None):
+def make_summary(errors, method='auto', accepted=None, confidence=None):
     errors = np.atleast_2d(np.array(errors, dtype=float))
     shape = errors.shape
     return Summary(
         method, tuple(range(shape[1])), errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
-        np.zeros(shape) if evidence is None else np.atleast_2d(evidence), np.full(shape, 2.0),
+        np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
         np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5))
 
 
@@ -29,8 +29,8 @@ def make_result(**changes):
     fields = {
         'method': 'clip_bf', 'trial': 0, 'query': 3, 'timestamp': 1.5, 'boxes': 4, 'solved': True,
         'accepted': True, 'map_from_camera': np.eye(4).tolist(), 'error_m': 0.5, 'error_deg': 2.0,
-        'score': 3.0, 'evidence': 5.0, 'inliers': 4, 'hypotheses': 9, 'best_iteration': 2,
-        'coverage': 1.0, 'reason': '', 'search_ms': 1.0}
+        'score': 3.0, 'confidence': 0.5, 'nees': 3.0, 'inliers': 4, 'hypotheses': 9,
+        'best_iteration': 2, 'coverage': 1.0, 'reason': '', 'search_ms': 1.0}
     return Result(**(fields | changes))
 
 
@@ -105,7 +105,7 @@ def test_csv_and_json_say_the_same():
 
 
 def test_precision_falls_as_recall_rises():
-    one = make_summary([0.1, 0.1, 2.0, 0.1, np.inf], evidence=[5.0, 4.0, 3.0, 3.0, 9.0])
+    one = make_summary([0.1, 0.1, 2.0, 0.1, np.inf], confidence=[5.0, 4.0, 3.0, 3.0, 9.0])
     recall, precision = precision_recall(one)
     assert recall.tolist() == pytest.approx([1 / 3, 2 / 3, 1.0])
     assert precision.tolist() == pytest.approx([1.0, 1.0, 0.75])

@@ -63,7 +63,7 @@ def test_a_rectified_image_is_measured_with_p(localizer, values):
 
 def test_options_hold_from_the_next_frame_on(localizer, values):
     assert localizer.localize(make_frame(), values)[0].accepted
-    assert not localizer.localize(make_frame(), values | {'min_evidence': 1e6})[0].accepted
+    assert not localizer.localize(make_frame(), values | {'min_confidence': 1.0})[0].accepted
     found, _ = localizer.localize(make_frame(), values | {'algorithm': 'ransac'})
     assert found.accepted and localizer.description.endswith('class_ransac')
 

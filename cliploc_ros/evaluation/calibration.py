@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fitting what makes confidences true: ``python -m cliploc_ros.evaluation.calibration --help``.
+
+Each frame is localized whole and with some of its boxes dropped, by labels and by classes alone.
+The coefficients make what turned out right the likeliest. Half of the places choose them and the
+other half judges, and the other way round; neighbouring frames are always in the same half.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
+from tqdm import tqdm
+
+from cliploc_ros.cli.command import run_command
+from cliploc_ros.core.confidence import DEFAULT, Calibration, Support, confidences
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.core.search import MAX_DISTINCT
+from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.trials import Query, make_queries
+
+RIGHT_M = 1.0
+#: Of labels: what share of the boxes is dropped, once for each; of classes alone fewer, since
+#: these need more boxes.
+DROPS = {'hybrid': (0.0, 0.3, 0.3, 0.5, 0.5), 'class': (0.0, 0.3)}
+_FIELDS = ('score', 'misfit', 'likeness', 'same_class', 'unlabelled', 'is_bare')
+# Nothing that speaks for a pose may count against it, whatever a small data set says.
+_BOUNDS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None))
+_KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
+_MOST_SLOPE = 3.0
+_RIDGE = 1e-4
+# What was made harder shows what wrong poses look like, but is not what is asked.
+_WEIGHT_OF_DROPPED = 0.1
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a search found, and what of it is right.
+
+    Parameters
+    ----------
+    place : str
+        Frames of one place are never parted.
+    whole : bool
+        Whether labels were matched and no box was dropped: what is reported on.
+    supports : tuple of m Support
+    poses : ndarray (m, 4, 4)
+    right : ndarray (m,) of bool
+    """
+
+    place: str
+    whole: bool
+    supports: tuple[Support, ...]
+    poses: NDArray[np.float64]
+    right: NDArray[np.bool_]
+
+
+def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: str,
+          whole: bool = True) -> Case:
+    """Return what a search found, judged by the truth (4, 4)."""
+    poses = np.array([one.map_from_camera for one in found.hypotheses])
+    errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
+    return Case(place, whole, tuple(one.support for one in found.hypotheses), poses,
+                errors < RIGHT_M)
+
+
+def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequence[str],
+            seed: int = 0) -> Iterator[Case | None]:
+    """Localize frames whole and with boxes dropped.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    queries : sequence of Query
+    places : sequence of str
+        Of each query.
+    seed : int
+        Of the choice of boxes.
+
+    Yields
+    ------
+    Case or None
+        None where no pose was found.
+    """
+    rng = np.random.default_rng(seed)
+    for matching, drops in DROPS.items():
+        options = RelocalizerOptions(matching=matching)
+        relocalizer = Relocalizer(landmark_map, replace(
+            options, k=min(options.k, len(landmark_map))))
+        for drop in drops:
+            for query, place in zip(queries, places, strict=True):
+                found = relocalizer.relocalize([without_boxes(query, drop, rng).observation])
+                yield judge(found, query.map_from_camera, place, drop == 0 and matching
+                            == 'hybrid') if found.solved else None
+
+
+def without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:
+    """Return a query with a share of its boxes dropped at random."""
+    observation = query.observation
+    rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
+    similarities = observation.similarities
+    return replace(query, observation=replace(
+        observation, detections=observation.detections.select(rows),
+        similarities=None if similarities is None else np.asarray(similarities)[rows]))
+
+
+def fit(cases: Sequence[Case]) -> Calibration:
+    """Return the coefficients that make what is right the likeliest.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+
+    Raises
+    ------
+    OptionsError
+        Nothing is right, or nothing is wrong: that says nothing.
+    """
+    first = np.array([case.right[0] for case in cases], dtype=bool)
+    if first.all() or not first.any():
+        raise OptionsError(f'of {len(first)} poses {first.sum()} are right: a fit needs both')
+    support, given, right = _padded(cases)
+    scale = np.append(support[given].std(axis=0) + 1e-9, 1.0)
+    weights = np.array([1.0 if case.whole else _WEIGHT_OF_DROPPED for case in cases])
+    weights /= weights.sum()
+    solved = minimize(_loss, np.append(0.0 * scale[:-1], 1.0),
+                      (support / scale[:-1], given, right, weights),
+                      jac=True, method='L-BFGS-B', bounds=_BOUNDS)
+    raw = Calibration(*map(float, [*solved.x / scale, 0.0, 0.0]))
+    likely = np.clip(confidence(cases, raw), 1e-12, 1.0 - 1e-12)
+    log_odds = np.log(likely / (1.0 - likely))
+
+    def surprise(slope: float, knee: float) -> float:
+        sharper = log_odds + slope * np.maximum(0.0, log_odds - knee)
+        return float(weights @ np.log1p(np.exp(np.where(first, -sharper, sharper))))
+
+    solutions = [minimize_scalar(surprise, bounds=(0.0, _MOST_SLOPE), args=(knee,),
+                                 method='bounded') for knee in _KNEES]
+    best = int(np.argmin([one.fun for one in solutions]))
+    return raw._replace(knee=_KNEES[best], slope=float(solutions[best].x))
+
+
+def _padded(cases: Sequence[Case]) -> tuple[NDArray[np.float64], NDArray[np.bool_],
+                                             NDArray[np.bool_]]:
+    """Return supports (n, h, 6), which hypotheses there are (n, h), and which are right."""
+    support = np.zeros((len(cases), MAX_DISTINCT, len(_FIELDS)))
+    given = np.zeros((len(cases), MAX_DISTINCT), dtype=bool)
+    right = np.zeros_like(given)
+    for row, case in enumerate(cases):
+        count = len(case.supports)
+        support[row, :count] = [[getattr(one, name) for name in _FIELDS]
+                                for one in case.supports]
+        given[row, :count], right[row, :count] = True, case.right
+    return support, given, right
+
+
+def _loss(coefficients: NDArray[np.float64], support: NDArray[np.float64],
+          given: NDArray[np.bool_], right: NDArray[np.bool_], weights: NDArray[np.float64]
+          ) -> tuple[float, NDArray[np.float64]]:
+    """Return how surprising what is right is, and the derivatives (7,) by the coefficients."""
+    utility = np.where(given, support @ coefficients[:-1], -1e9)
+    utility = np.column_stack([utility, np.full(len(utility), coefficients[-1])])
+    odds = np.exp(utility - utility.max(axis=1, keepdims=True))
+    truth = np.column_stack([right, ~right.any(axis=1)])
+    share = odds / odds.sum(axis=1, keepdims=True)
+    true_share = odds * truth + 1e-300
+    likely = true_share.sum(axis=1) / odds.sum(axis=1)
+    pull = (share - true_share / true_share.sum(axis=1, keepdims=True)) * weights[:, None]
+    gradient = np.append(np.einsum('nh,nhk->k', pull[:, :-1] * given, support),
+                         pull[:, -1].sum())
+    shrink = _RIDGE * np.append(coefficients[:-1], 0.0)
+    return float(-weights @ np.log(likely) + shrink @ coefficients / 2), gradient + shrink
+
+
+def confidence(cases: Iterable[Case], calibration: Calibration = DEFAULT) -> NDArray[np.float64]:
+    """Return the confidence (n,) in the best pose of each case."""
+    return np.array([confidences(case.supports, case.poses, calibration)[0] for case in cases])
+
+
+def halves(cases: Sequence[Case], seed: int = 0) -> tuple[set[str], set[str]]:
+    """Return the places in two halves, at random."""
+    places = sorted({case.place for case in cases})
+    order = np.random.default_rng(seed).permutation(len(places))
+    return ({places[row] for row in order[::2]}, {places[row] for row in order[1::2]})
+
+
+def cross_fitted(cases: Sequence[Case], seed: int = 0
+                 ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    """Return confidence and rightness of the whole frames of each half, as the other has it."""
+    judged = []
+    for own in halves(cases, seed):
+        calibration = fit([case for case in cases if case.place not in own])
+        whole = [case for case in cases if case.place in own and case.whole]
+        judged.append((confidence(whole, calibration),
+                       np.array([case.right[0] for case in whole], dtype=bool)))
+    return judged
+
+
+def _read(options: argparse.Namespace) -> list[Case]:
+    """Return the cases of all query files."""
+    if len(options.queries) != len(options.map):
+        raise OptionsError('give as many maps as query files, in the same order')
+    cases: list[Case | None] = []
+    for number, (path, map_path) in enumerate(zip(options.queries, options.map, strict=True)):
+        landmark_map = LandmarkMap.from_file(map_path)
+        recorded = load_queries(path, landmark_map.landmark_ids)
+        queries = make_queries(recorded, landmark_map, every_frame=True)
+        cases += tqdm(collect(landmark_map, queries,
+                              [f'{number}.{frame.group}' for frame in recorded], options.seed),
+                      path.name, len(queries) * sum(map(len, DROPS.values())), disable=None)
+    return [case for case in cases if case is not None]
+
+
+def _report(name: str, likely: NDArray[np.float64], right: NDArray[np.bool_]) -> str:
+    lines = [f'{name}: {len(right)} poses, {right.sum()} of them within {RIGHT_M:g} m']
+    for least in (0.9, 0.95, 0.98, 0.99, 0.995):
+        believed = likely >= least
+        lines.append(f'  min_confidence {least:5}: {believed.sum():4} believed, '
+                     f'{(believed & ~right).sum()} of them wrong, '
+                     f'recall {(believed & right).sum() / max(int(right.sum()), 1):.3f}')
+    return '\n'.join(lines)
+
+
+def run(arguments: list[str]) -> int:
+    """Fit, judge, print."""
+    parser = argparse.ArgumentParser(prog='calibration', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--queries', type=Path, required=True, nargs='+', metavar='NPZ')
+    parser.add_argument('--map', type=Path, required=True, nargs='+', metavar='YAML',
+                        help='of each query file')
+    parser.add_argument('--seed', type=int, default=0)
+    options = parser.parse_args(arguments)
+    cases = _read(options)
+    judged = cross_fitted(cases, options.seed)
+    for number, half in enumerate(judged, start=1):
+        print(_report(f'half {number}, as the other half has it', *half))
+    print(_report('both', np.concatenate([half[0] for half in judged]),
+                  np.concatenate([half[1] for half in judged])))
+    print('\nfitted on all, for cliploc_ros/core/confidence.py:\n'
+          + ', '.join(f'{name}={value:.3g}' for name, value in fit(cases)._asdict().items()))
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
