@@ -136,14 +136,14 @@ def least_confidence(one: Summary, limit_m: float = 1.0) -> float:
     Returns
     -------
     float
-        With a precision of .99 on these queries, rounded up to a thousandth; 1 if there is none.
+        With a precision of .99 on these queries, rounded up to a ten-thousandth; 1 if there is none.
     """
     confidence = one.confidence[one.accepted]
     right = (one.errors_m < limit_m)[one.accepted]
     levels: NDArray[np.float64] = np.unique(confidence)
     for level in levels:
         if right[confidence >= level].mean() >= _LEAST_PRECISION:
-            return float(np.ceil(level * 1000) / 1000)
+            return float(np.ceil(level * 10_000 - 1e-6) / 10_000)
     return 1.0
 
 

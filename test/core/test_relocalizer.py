@@ -77,8 +77,10 @@ def test_fewer_than_three_boxes_give_no_pose(rows, room, observation):
     assert f'{len(rows)} detections' in result.reason
 
 
-def test_three_boxes_give_a_pose_that_is_refused(room, observation):
-    result = Relocalizer(room, RelocalizerOptions()).relocalize([only(observation, [0, 1, 2])])
+@pytest.mark.parametrize('options', [{'matching': 'class'}, {'min_inliers': 4}])
+def test_three_boxes_give_a_pose_that_is_refused(options, room, observation):
+    result = Relocalizer(room, RelocalizerOptions(**options)).relocalize(
+        [only(observation, [0, 1, 2])])
     assert result.solved
     assert not result.accepted
 

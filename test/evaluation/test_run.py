@@ -140,5 +140,5 @@ def test_the_least_confidence_that_is_right_often_enough():
             errors, accepted=[True] * len(errors), confidence=levels))
 
     assert least([0.1, 0.1, 2.0], [0.9, 0.8, 0.7]) == 0.8
-    assert least([0.1, 2.0, 0.1], [0.9001, 0.8, 0.7]) == 0.901
+    assert least([0.1, 2.0, 0.1], [0.90001, 0.8, 0.7]) == 0.9001
     assert least([2.0, 0.1], [0.9, 0.8]) == 1.0
