@@ -148,7 +148,8 @@ def support(views: Sequence[View], map_from_cameras: NDArray[np.float64],
                 told.setdefault(match.landmark, []).append(says)
     if not told:
         return Support()
-    return Support(len(told), *map(float, sum(np.mean(says, axis=0) for says in told.values())))
+    total = np.sum([np.mean(says, axis=0) for says in told.values()], axis=0)
+    return Support(len(told), *map(float, total))
 
 
 def _told(view: View, map_from_camera: NDArray[np.float64], matches: Sequence[Match]

@@ -136,7 +136,7 @@ def least_confidence(one: Summary, limit_m: float = 1.0) -> float:
     Returns
     -------
     float
-        With a precision of .99 on these queries, rounded up to a ten-thousandth; 1 if there is none.
+        With a precision of .99 on these queries; 1 if there is none.
     """
     confidence = one.confidence[one.accepted]
     right = (one.errors_m < limit_m)[one.accepted]

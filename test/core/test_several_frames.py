@@ -83,8 +83,8 @@ def test_one_frame_needs_no_odometry_and_is_not_changed_by_it(room, walk):
     found = relocalizer.relocalize([frame])
     np.testing.assert_array_equal(found.map_from_camera, without.map_from_camera)
     np.testing.assert_array_equal(found.covariance, without.covariance)
-    assert (found.score, found.evidence, found.tried) == (
-        without.score, without.evidence, without.tried)
+    assert (found.score, found.confidence, found.tried) == (
+        without.score, without.confidence, without.tried)
 
 
 @pytest.mark.parametrize('refine', [True, False])
@@ -93,7 +93,7 @@ def test_the_same_view_again_is_no_more_evidence(refine, room):
     frame = see(room, MAP_FROM_CAMERA, [0, 1, 2, 4])
     once, often = relocalizer.relocalize([frame]), relocalizer.relocalize([frame] * 5)
     assert often.score == pytest.approx(5 * once.score, rel=0.02)
-    assert often.evidence == pytest.approx(once.evidence, rel=0.05)
+    assert often.confidence == pytest.approx(once.confidence, rel=0.05)
     # to what one view leaves open comes what odometry does
     assert (np.diag(often.covariance) > 0.9 * np.diag(once.covariance)).all()
 
