@@ -67,9 +67,9 @@ RELOCALIZER = (
     ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
                  low=0.0, high=1.0),
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
-    ParameterRow('time_budget_ms', 50.0, 'A search with all that belongs to it takes no longer; '
-                 'what it found by then is refused, but for auto.', unit='ms', low=0.0,
-                 high=3.6e6),
+    ParameterRow('time_budget_ms', 50.0, 'Search and refinement of auto take no longer; the other '
+                 'algorithms have timeout_s, and what they are cut short in is refused.',
+                 unit='ms', low=0.0, high=3.6e6),
     ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
                  'base_frame, or the topic imu. auto then needs two objects in place of three.',
                  choices=SOURCES, read_only=True),
@@ -123,8 +123,10 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     if values['gravity'] == 'base_frame' and not values['base_frame']:
         raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
     given: dict[str, Any] = {name: values[name] for name in names}
-    assert isinstance(values['time_budget_ms'], float)
-    given['time_budget_s'] = values['time_budget_ms'] / 1e3
+    budget_ms, timeout_s = values['time_budget_ms'], values['timeout_s']
+    assert isinstance(budget_ms, float) and isinstance(timeout_s, float)
+    # what the paper's algorithms are cut short in is refused: they get what a request may take
+    given['time_budget_s'] = budget_ms / 1e3 if values['algorithm'] == 'auto' else timeout_s
     given['height_range_m'] = _height_range(values['height_range_m'])
     return RelocalizerOptions(**given)
 
