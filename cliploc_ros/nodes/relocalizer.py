@@ -143,7 +143,8 @@ class RelocalizerNode(ManagedNode):
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
-            self.get_logger().error(traceback.format_exc())
+            if self.context.ok():  # else the process is told to end, and rclpy stumbles over that
+                self.get_logger().error(traceback.format_exc())
             answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
         if answer.pose is not None:
             self._initial_pose.publish(answer.pose)

@@ -21,6 +21,8 @@ from cliploc_ros.ros.requests import MAX_REQUESTS
 # For the requests that may wait, for transitions, frames, parameters and the rest. Threads are
 # made when they are first needed.
 _THREADS = MAX_REQUESTS + 8
+# For callbacks to end before their node does.
+_GRACE_S = 1.0
 
 
 def _spin(executor: MultiThreadedExecutor, node: ManagedNode) -> None:
@@ -65,6 +67,9 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
         if node is not None:
             node.release()
             node.worker.stop()
+            # A callback that goes on in a destroyed node ends the process by a segmentation
+            # fault. rclpy's own shutdown means to wait for callbacks, and does not.
+            executor._work_tracker.wait(_GRACE_S)
             # Others would take a node that does not say good-bye for alive, and wait for it.
             node.destroy_node()
         rclpy.try_shutdown()
