@@ -36,8 +36,9 @@ class RelocalizerOptions:
     time_budget_s : float
         Association, search and refinement take no longer than this [s], to within 10 %; what
         is cut short, but for auto, is refused, and says how far it came. Results that it cuts
-        depend on the machine: the iterations are there to end a search before, and 10,000 take
-        about 30 ms on one core, in maps of any size.
+        depend on the machine: the iterations are there to end a search before. 10,000 took
+        32 ms at most on the 258 recorded frames (40 landmarks, one idle core); crowded maps take
+        longer.
     height_range_m : tuple of float
         The least and the greatest height of the camera in the map [m]; poses outside are left.
     max_tilt_deg : float
