@@ -31,6 +31,7 @@ examples:
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
   evaluate --queries office.npz --map office.yaml --methods hybrid_b-prosac --tune
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
+  evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
 """
 
 
@@ -97,6 +98,13 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
                        help='heights in the map that a camera may have [m]')
+    group.add_argument('--fuse', action='store_true',
+                       help='search each query together with the other frames of its group, of '
+                       'which odometry knows how the camera moved: made of the true poses')
+    group.add_argument('--odometry-noise', type=_deviation, nargs=2, default=(0.0, 0.0),
+                       metavar=('METRES', 'DEGREES'),
+                       help='and each step from one frame to the next is off by so much on each '
+                       'axis (standard deviations; 0 0)')
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +134,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.options import RelocalizerOptions
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
-    from cliploc_ros.evaluation.sensors import with_vertical
+    from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
     from cliploc_ros.evaluation.session import Session
     from cliploc_ros.evaluation.trials import make_queries
 
@@ -142,9 +150,15 @@ def evaluate(options: argparse.Namespace) -> int:
         raise OptionsError(f'--tune is for one method, not {len(methods)}: name it by --methods')
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)
-    queries = make_queries(recorded, landmark_map, options.frames == 'all')
+    queries = make_queries(recorded, landmark_map, every_frame=True)
     if options.gravity:
         queries = with_vertical(queries, options.gravity_noise_deg, options.seed)
+    if options.fuse:
+        noise_m, noise_deg = options.odometry_noise
+        queries = with_neighbours(queries, [frame.group for frame in recorded], noise_m,
+                                  noise_deg, options.seed)
+    if options.frames == 'main':
+        queries = tuple(query for query in queries if recorded[query.number].is_main)
     session = Session(landmark_map, queries, options.out, options.trials, options.workers)
     if options.tune:
         session.tune(methods[0], options.seed)
@@ -203,6 +217,13 @@ def _frames(options: argparse.Namespace) -> 'Frames':
     return bag_frames(options.bag, BagTopics(options.image, options.camera_info,
                                              options.ground_truth, options.rectified),
                       None if mount is None else mount_from_numbers(mount))
+
+
+def _deviation(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
+    return value
 
 
 def _angle(text: str) -> float:

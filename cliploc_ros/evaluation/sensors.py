@@ -4,11 +4,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.relocalizer import MAX_FRAMES
+from cliploc_ros.core.transforms import invert_transform, make_transform
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query
 
 
@@ -31,6 +35,55 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
         up = _turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
         found.append(replace(query, observation=replace(query.observation, up_in_camera=up)))
     return tuple(found)
+
+
+def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: float = 0.0,
+                    noise_deg: float = 0.0, seed: int = 0) -> tuple[Query, ...]:
+    """Return queries that bring the other frames of their group, joined by odometry.
+
+    Parameters
+    ----------
+    queries : sequence of Query
+        All frames.
+    groups : sequence of int
+        The group of each.
+    noise_m, noise_deg : float
+        Standard deviation of the error of each step from one frame to the next in time, along
+        each axis [m] and about each axis [deg].
+    seed : int
+        Equal seeds give equal noise.
+
+    Raises
+    ------
+    OptionsError
+        No group has a second frame.
+    """
+    found: dict[int, Query] = {}
+    for group in dict.fromkeys(groups):
+        frames = sorted((one for one, its in zip(queries, groups, strict=True) if its == group),
+                        key=lambda one: one.observation.stamp_ns)
+        rng = np.random.default_rng([seed, abs(group), 1])
+        joined = [replace(one.observation, odom_from_camera=pose) for one, pose in zip(
+            frames, _odometry(frames, noise_m, noise_deg, rng), strict=True)]
+        for row, query in enumerate(frames):
+            near = sorted(range(len(frames)), key=lambda other: abs(other - row))[1:MAX_FRAMES]
+            found[query.number] = replace(query, observation=joined[row], neighbours=tuple(
+                joined[other] for other in sorted(near)))
+    if not any(one.neighbours for one in found.values()):
+        raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
+    return tuple(found[query.number] for query in queries)
+
+
+def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
+              rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """Return each frame's odom_from_camera (4, 4), of steps that are off at random."""
+    poses = [np.eye(4)]
+    for before, after in pairwise(frames):
+        step = invert_transform(before.map_from_camera) @ after.map_from_camera
+        turn = Rotation.from_rotvec(np.radians(noise_deg) * rng.normal(size=3)).as_matrix()
+        shift = noise_m * rng.normal(size=3)
+        poses.append(poses[-1] @ step @ make_transform(turn, shift))
+    return poses
 
 
 def _turned(direction: NDArray[np.float64], angle: float, rng: np.random.Generator

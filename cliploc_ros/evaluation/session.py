@@ -133,12 +133,13 @@ class Session:
         """Return what makes this run another one than others, as JSON knows it."""
         digest = hashlib.sha256()
         for query in self.queries:
-            detections = query.observation.detections
-            for part in (query.observation.similarities, detections.bboxes_xyxy,
-                         query.map_from_camera):
-                digest.update(np.ascontiguousarray(part).tobytes())
-            digest.update(repr((query.number, detections.class_ids,
-                                query.observation.up_in_camera)).encode())
+            for one in (*query.neighbours, query.observation):
+                for part in (one.similarities, one.detections.bboxes_xyxy):
+                    digest.update(np.ascontiguousarray(part).tobytes())
+                digest.update(repr((one.detections.class_ids, one.up_in_camera,
+                                    one.odom_from_camera)).encode())
+            digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
+            digest.update(repr(query.number).encode())
         world = hashlib.sha256(repr((self.landmark_map.landmark_ids, self.landmark_map.class_ids,
                                      self.landmark_map.centers.tolist(),
                                      self.landmark_map.shapes.tolist())).encode())

@@ -33,11 +33,14 @@ class Query:
     observation : Observation
     map_from_camera : ndarray (4, 4)
         Ground truth.
+    neighbours : tuple of Observation
+        Frames around it that odometry joins with it.
     """
 
     number: int
     observation: Observation
     map_from_camera: NDArray[np.float64]
+    neighbours: tuple[Observation, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    return [_judge(method.name, trial, query, relocalizer.relocalize([query.observation]))
+    return [_judge(method.name, trial, query,
+                   relocalizer.relocalize([*query.neighbours, query.observation]))
             for query in queries]
 
 

@@ -3,7 +3,6 @@
 """Several frames joined by odometry, through the one door to the method."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,6 +17,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
 from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
+from cliploc_ros.evaluation.trials import make_queries
 
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
                                np.array([30.0, -4.0, 1.0]))
@@ -150,46 +151,27 @@ def test_bad_odometry_is_named(room, walk):
         relocalizer.relocalize([first] * (MAX_FRAMES + 1))
 
 
-def joined(frames, rng, metres, degrees):
-    """Frames in the order of time, joined by steps of odometry that are off at random."""
-    pose, poses = np.eye(4), [np.eye(4)]
-    for before, after in pairwise(frames):
-        step = invert_transform(before.map_from_camera) @ after.map_from_camera
-        step[:3, 3] += rng.normal(0, metres, 3)
-        turn = Rotation.from_rotvec(rng.normal(0, np.radians(degrees), 3))
-        step[:3, :3] = step[:3, :3] @ turn.as_matrix()
-        pose = pose @ step
-        poses.append(pose)
-    return poses
-
-
 @pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
-def test_five_real_frames(case, office_map, queries, observe, thresholds):
+def test_five_real_frames(case, office_map, queries, thresholds):
     """The 52 queries with their neighbours, 1 cm and 0.5 degrees of noise a step and axis."""
-    asked, seeds, options = thresholds['fused'][case], (0, 1, 2), RelocalizerOptions()
+    asked, options = thresholds['fused'][case], RelocalizerOptions()
     knows_up = case != 'nothing'
     if knows_up:
         options = replace(options, height_range_m=(0.8, 2.2))
     relocalizer = Relocalizer(office_map, options)
     errors, accepted, normalized, milliseconds = [], [], [], []
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        for main in queries.main_frames():
-            frames = sorted(queries.group(main.group), key=lambda frame: frame.stamp_ns)
-            observations = []
-            for frame, odom in zip(frames, joined(frames, rng, 0.01, 0.5), strict=True):
-                tilt = Rotation.from_rotvec(rng.normal(0, np.radians(1.0 / np.sqrt(2)), 3))
-                up = tilt.apply(frame.map_from_camera[2, :3]) if knows_up else None
-                observations.append(replace(observe(frame), odom_from_camera=odom,
-                                            up_in_camera=up))
-            row = frames.index(main)
-            found = relocalizer.relocalize(
-                [*observations[:row], *observations[row + 1:], observations[row]])
+    for seed in range(3):
+        frames = make_queries(queries, office_map, every_frame=True)
+        if knows_up:
+            frames = with_vertical(frames, 1.0, seed)
+        frames = with_neighbours(frames, [frame.group for frame in queries], 0.01, 0.5, seed)
+        for query in (one for one in frames if queries[one.number].is_main):
+            found = relocalizer.relocalize([*query.neighbours, query.observation])
             milliseconds.append(found.search_ms)
             accepted.append(found.accepted)
             errors.append(np.inf)
             if found.solved:
-                pose, truth = found.map_from_camera, main.map_from_camera
+                pose, truth = found.map_from_camera, query.map_from_camera
                 errors[-1] = pose_error(pose, truth)[0]
                 error = np.r_[truth[:3, 3] - pose[:3, 3], Rotation.from_matrix(
                     truth[:3, :3] @ pose[:3, :3].T).as_rotvec()]

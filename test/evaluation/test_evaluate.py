@@ -86,6 +86,44 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
         assert image.std() > 10
 
 
+def test_five_frames_at_a_time(shared_data, tmp_path):
+    """The whole of it on real data: better than one at a time, and nothing wrong is believed."""
+    office = shared_data / 'tum_fr3_office'
+    given = ('--queries', office / 'queries.npz', '--map', office / 'map.yaml', '--methods',
+             'auto', '--no-figures')
+    found = {}
+    for name, more in (('one', ()), ('five', ('--fuse', '--odometry-noise', 0.01, 0.5))):
+        done = evaluate(*given, *more, '--out', tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        found[name] = results_of(tmp_path / name)
+    assert [list(row) for row in found['one']] == [list(row) for row in found['five']]
+    success = {name: np.mean([row['solved'] and row['error_m'] <= 1.0 for row in rows])
+               for name, rows in found.items()}
+    print(f'\nwithin 1 m: {success}')
+    assert success['five'] >= max(0.90, success['one'] + 0.05)
+    assert not [row for row in found['five'] if row['accepted'] and row['error_m'] > 1.0]
+
+
+def test_frames_of_a_group_are_joined(files, recording, room, tmp_path):
+    """Twelve views of one place: each alone too poor or not, together always rich enough."""
+    recorded = changed(files, tmp_path, query_group=np.zeros(12, dtype=np.int64),
+                       is_main=np.arange(12) == 1)
+    given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
+             '--no-figures', '--frames', 'all', '--fuse')
+    for name, more in (('exact', ()), ('noisy', ('--odometry-noise', 0.02, 0.5)),
+                       ('other', ('--odometry-noise', 0.02, 0.5, '--seed', 1))):
+        done = evaluate(*given, *more, '--out', tmp_path / name)
+        assert done.returncode == 0, done.stderr
+    exact, noisy, other = (results_of(tmp_path / name) for name in ('exact', 'noisy', 'other'))
+    assert len(exact) == 12
+    assert all(row['accepted'] for row in exact)
+    errors = [np.median([row['error_m'] for row in rows]) for rows in (exact, noisy)]
+    assert errors[0] < errors[1] < 0.2
+    assert noisy != other
+    alone = evaluate(*small(files, '--methods', 'auto', '--fuse', '--out', tmp_path / 'alone'))
+    assert_error(alone, '--fuse', 'neighbouring')
+
+
 def test_trajectories_are_what_was_found(files, tmp_path):
     assert evaluate(*small(files, '--methods', 'class_bf', '--out', tmp_path,
                            '--no-figures')).returncode == 0
