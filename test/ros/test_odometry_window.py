@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the robot was at an instant, by odometry's messages as they come."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.ros.odometry_window import NoOdometryError, OdometryWindow
+
+S = 1_000_000_000
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def turned(degrees):
+    return Rotation.from_euler('z', degrees, degrees=True).as_quat()
+
+
+def drive(window, seconds, step_s=0.1, speed_m_s=1.0, turn_deg_s=30.0):
+    for moment in np.arange(*seconds, step_s):
+        assert window.add(round(moment * S), np.array([speed_m_s * moment, 0.0, 0.0]),
+                          turned(turn_deg_s * moment))
+
+
+def heading(pose):
+    return np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))
+
+
+def test_between_two_messages_it_is_in_between():
+    window = OdometryWindow(10.0)
+    drive(window, (5.0, 8.0))
+    for moment in (5.0, 6.0, 6.05, 7.123, 7.9):
+        pose = window.pose_at(round(moment * S))
+        np.testing.assert_allclose(pose[:3, 3], [moment, 0, 0], atol=1e-6)
+        assert np.cos(np.radians(heading(pose) - 30.0 * moment)) == pytest.approx(1.0, abs=1e-12)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_it_turns_the_short_way():
+    """Quaternions of opposite sign are one attitude."""
+    window = OdometryWindow(10.0)
+    window.add(0, np.zeros(3), turned(170.0))
+    window.add(S // 10, np.zeros(3), -turned(190.0))
+    assert abs(heading(window.pose_at(S // 20))) == pytest.approx(180.0, abs=1e-6)
+
+
+def test_late_messages_find_their_place():
+    window, ordered = OdometryWindow(10.0), OdometryWindow(10.0)
+    drive(ordered, (0.0, 2.0))
+    moments = np.arange(0.0, 2.0, 0.1).reshape(4, 5)[:, [2, 0, 4, 3, 1]].ravel()
+    for moment in [*moments, moments[-1]]:  # and one twice
+        window.add(round(moment * S), np.array([moment, 0.0, 0.0]), turned(30.0 * moment))
+    assert len(window) == len(ordered) == 20
+    for moment in (0.05, 0.95, 1.85):
+        np.testing.assert_allclose(window.pose_at(round(moment * S)),
+                                   ordered.pose_at(round(moment * S)), atol=1e-12)
+
+
+def test_memory_is_bounded():
+    window = OdometryWindow(2.0)
+    drive(window, (0.0, 60.0))
+    assert len(window) == 21
+    crowded = OdometryWindow(1000.0, max_poses=50)
+    drive(crowded, (0.0, 60.0))
+    assert len(crowded) == 50
+    crowded.pose_at(round(59.85 * S))
+    with pytest.raises(NoOdometryError, match='newer than the image'):
+        crowded.pose_at(round(40.0 * S))
+
+
+@pytest.mark.parametrize(('moment', 'named'), [
+    (4.0, 'oldest odometry is 1.000 s newer'), (8.5, 'newest odometry is 0.600 s older'),
+    (6.5, 'paused for 1.100 s')])
+def test_what_is_not_known_is_said(moment, named):
+    window = OdometryWindow(10.0)
+    drive(window, (5.0, 6.0))
+    drive(window, (7.0, 8.0))
+    with pytest.raises(NoOdometryError, match=named):
+        window.pose_at(round(moment * S))
+    window.clear()
+    with pytest.raises(NoOdometryError, match='no odometry yet'):
+        window.pose_at(round(6.0 * S))
+
+
+@pytest.mark.parametrize(('position', 'quat_xyzw'), [
+    ([np.nan, 0.0, 0.0], UPRIGHT), ([0.0, np.inf, 0.0], UPRIGHT),
+    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, np.nan, 1.0]),
+    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0])])
+def test_what_is_no_pose_is_left_out(position, quat_xyzw):
+    window = OdometryWindow(10.0)
+    drive(window, (0.0, 1.0))
+    assert not window.add(S, np.array(position), np.array(quat_xyzw))
+    assert len(window) == 10
+
+
+def test_a_clock_set_back_begins_anew():
+    window = OdometryWindow(5.0)
+    for restart in (98.0, 3.0):  # a bag that begins again, and a simulation
+        drive(window, (100.0, 102.0))
+        drive(window, (restart, restart + 1.0))
+        assert len(window) == 10
+        window.pose_at(round((restart + 0.55) * S))
+        with pytest.raises(NoOdometryError, match='older than the image'):
+            window.pose_at(101 * S)
+
+
+def test_odometry_that_was_reset_joins_nothing_across_it():
+    window = OdometryWindow(10.0)
+    drive(window, (50.0, 51.0))
+    window.add(51 * S, np.zeros(3), UPRIGHT)  # 51 m away
+    assert len(window) == 1
+    drive(window, (51.1, 51.3), speed_m_s=0.01)
+    with pytest.raises(NoOdometryError, match='newer than the image'):
+        window.pose_at(round(50.5 * S))
