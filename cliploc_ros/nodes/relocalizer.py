@@ -22,6 +22,7 @@ from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
 from cliploc_ros.ros.diagnostics import Health
 from cliploc_ros.ros.frame_source import Frame, FrameSource
 from cliploc_ros.ros.frames import BaseFrame
+from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.process import run_node
@@ -31,7 +32,7 @@ from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
-_VERDICTS = ('accepted', 'refused')
+_VERDICTS = ('accepted', 'refused', 'withheld')
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,7 @@ class RelocalizerNode(ManagedNode):
         self._base = BaseFrame(self)
         self._vertical = VerticalSource(self, self._base)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
-        self._initial_pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose',
-                                                   qos.POSE)
+        self._handoff = HandOff(self)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
@@ -83,6 +83,7 @@ class RelocalizerNode(ManagedNode):
 
     def open(self) -> None:
         """Be ready for requests; in continuous mode listen to frames."""
+        self._handoff.open()
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
         if self.settings['mode'] == 'continuous':
             self._listening.enter_context(self._vertical.listening(self.settings['gravity']))
@@ -90,12 +91,14 @@ class RelocalizerNode(ManagedNode):
 
     def close(self) -> None:
         """Let go the request that waits for frames, and stop to listen."""
+        self._handoff.stop()
         if self._frames is not None:
             self._frames.stop('the node was deactivated')
         self._listening.close()
 
     def release(self) -> None:
         """Let go the request that waits for frames: the process ends."""
+        self._handoff.stop()
         if self._frames is not None:
             self._frames.stop('the node is shutting down')
 
@@ -135,21 +138,30 @@ class RelocalizerNode(ManagedNode):
             # A map or weights that were missing may have been mended since.
             self.bring_up()
             assert self._frames is not None  # an active node has them
-            with self._vertical.listening(self.settings['gravity']):
+            with (self._vertical.listening(self.settings['gravity']),
+                  self._handoff.listening()):
                 with self._frames.listening():
                     frame = self._frames.wait_for_fresh(self.settings['timeout_s'])
                 depart()
-                answer = self.worker.run(lambda: self._localize(frame))
+                answer = self._handed_over(self.worker.run(lambda: self._localize(frame)))
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
             if self.context.ok():  # else the process is told to end, and rclpy stumbles over that
                 self.get_logger().error(traceback.format_exc())
             answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
-        if answer.pose is not None:
-            self._initial_pose.publish(answer.pose)
         self._conclude(answer.message)
         self.get_logger().info(answer.message)
+        return answer
+
+    def _handed_over(self, answer: Answer) -> Answer:
+        """Tell a running localizer of an accepted pose; who waits learns if that cannot be."""
+        if answer.pose is None:
+            return answer
+        try:
+            self._handoff.hand_over(answer.pose, self.settings.snapshot())
+        except HandOffError as error:
+            return Answer(None, f'withheld: {error} ({answer.message})')
         return answer
 
     def _conclude(self, verdict: str) -> None:

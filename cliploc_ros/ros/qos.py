@@ -17,6 +17,9 @@ DETECTIONS_IN = CAMERA_INFO
 # A burst of the fastest usual IMU while something else is called back.
 IMU = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                  reliability=ReliabilityPolicy.BEST_EFFORT)
+# Of odometry the newest is the one that counts.
+ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
+                  reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                             reliability=ReliabilityPolicy.RELIABLE)
 POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,

@@ -104,6 +104,13 @@ RELOCALIZER = (
     ParameterRow('base_frame', '', "Publish the pose of this frame; empty: the camera's."),
     ParameterRow('base_from_camera', [0.0] * 7, 'Mount of the camera on base_frame: x, y, z [m] '
                  'and quaternion x, y, z, w; all zeros: ask tf2.', unit='m'),
+    ParameterRow('max_speed_m_s', 0.1, 'No initialpose is published while odom tells of a faster '
+                 'robot.', unit='m/s', low=0.0, high=100.0),
+    ParameterRow('max_turn_rad_s', 0.2, 'No initialpose is published while odom tells of a faster '
+                 'turn.', unit='rad/s', low=0.0, high=100.0),
+    ParameterRow('nomotion_updates', 5, 'How often request_nomotion_update is called after an '
+                 'initialpose, where AMCL serves it, so that a standing robot converges.',
+                 low=0, high=100),
     ParameterRow('tf_timeout_s', 0.5, "How long to wait for tf2 at the image's stamp.", unit='s',
                  low=0.0, high=60.0),
 )

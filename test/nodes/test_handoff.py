@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Handing a pose over to a running localizer: a robot that stands, moves, or says nothing."""
+
+import time
+from itertools import pairwise
+
+import pytest
+from conftest import make_frame
+from nav_msgs.msg import Odometry
+from std_srvs.srv import Empty
+
+
+@pytest.fixture
+def updates(tester):
+    """Serve what AMCL serves; keep when it was called, and how many poses had come by then."""
+    calls = []
+
+    def update(request, response):
+        calls.append((time.monotonic(), len(tester.initial_poses)))
+        return response
+    service = tester.create_service(Empty, 'request_nomotion_update', update)
+    yield calls
+    tester.destroy_service(service)
+
+
+@pytest.fixture
+def odom(tester):
+    publisher = tester.create_publisher(Odometry, 'odom', 10)
+
+    def feed(frame, **speeds):
+        """Ask, and publish a frame and odometry until there is an answer."""
+        odometry = Odometry()
+        odometry.twist.twist.linear.x = speeds.get('drive', 0.0)
+        odometry.twist.twist.angular.z = speeds.get('turn', 0.0)
+        future = tester.ask()
+
+        def answered():
+            if speeds:
+                publisher.publish(odometry)
+            return future.done()
+        tester.feed_until(answered, frame)
+        return future.result()
+    yield feed
+    tester.destroy_publisher(publisher)
+
+
+def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates, odom):
+    tester.wait(lambda: tester.count_clients('/request_nomotion_update') == 1, 'the client')
+    answer = odom(make_frame(), drive=0.0)
+    assert answer.success
+    assert len(updates) == 5
+    gaps_s = [later[0] - earlier[0] for earlier, later in pairwise(updates)]
+    assert min(gaps_s) > 0.1, 'a scan lies between them'
+    assert len(tester.initial_poses) == 1
+    assert all(poses == 1 for _, poses in updates[1:]), 'the pose comes first'
+
+
+@pytest.mark.parametrize('speeds', [{'drive': 0.5}, {'drive': -0.5}, {'turn': 1.0},
+                                    {'drive': float('nan')}])
+def test_a_moving_robot_is_not_reset(relocalizer, tester, updates, odom, speeds):
+    answer = odom(make_frame(), **speeds)
+    assert not answer.success
+    assert answer.message.startswith('withheld: the robot moves at ')
+    assert 'accepted: x 0.3' in answer.message
+    tester.wait(lambda: tester.poses, 'the pose itself')
+    assert not tester.initial_poses
+    assert not updates
+
+
+def test_odometry_that_says_nothing_is_not_taken_for_rest(relocalizer, tester, odom):
+    answer = odom(make_frame())
+    assert not answer.success
+    assert 'the robot may be moving' in answer.message
+
+
+def test_without_amcl_and_odometry_the_answer_comes_at_once(relocalizer, tester):
+    tester.wait(lambda: not tester.count_publishers('/odom'), 'the odometry to be gone')
+    answer = tester.relocalize(make_frame())
+    assert answer.success
+    tester.wait(lambda: tester.initial_poses, 'an initial pose')
+
+
+def test_an_image_from_the_future_gives_no_pose_from_there(relocalizer, tester):
+    tomorrow_s = time.time() + 86400
+    assert tester.relocalize(make_frame(stamp_s=tomorrow_s)).success
+    tester.wait(lambda: tester.initial_poses and tester.poses, 'the poses')
+    assert tester.poses[0].header.stamp.sec == int(tomorrow_s)
+    assert abs(tester.initial_poses[0].header.stamp.sec - time.time()) < 60.0

@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time as TimeMsg
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from hypothesis import given
+from hypothesis import strategies as st
+from nav_msgs.msg import Odometry
+from rclpy.time import Time
+
+from cliploc_ros.ros.handoff import speeds, usable_pose
+
+# x, xy, yx, y and yaw: all that AMCL reads
+AMCL_READS = [0, 1, 6, 7, 35]
+
+
+def stamped(seconds=100, covariance=None):
+    pose = PoseWithCovarianceStamped()
+    pose.header.stamp = TimeMsg(sec=seconds)
+    pose.header.frame_id = 'map'
+    if covariance is not None:
+        pose.pose.covariance = covariance.ravel()
+    return pose
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=36, max_size=36), st.floats(0.0, 10.0))
+def test_a_covariance_stays_one_and_is_never_zero(numbers, scale):
+    root = scale * np.array(numbers).reshape(6, 6)
+    given_covariance = root @ root.T
+    covariance = np.array(usable_pose(stamped(covariance=given_covariance), Time())
+                          .pose.covariance).reshape(6, 6)
+    assert (np.diag(covariance)[[0, 1, 5]] > 0.0).all()
+    assert np.linalg.eigvalsh(covariance).min() > -1e-9
+    np.testing.assert_array_equal(covariance - np.diag(np.diag(covariance)),
+                                  given_covariance - np.diag(np.diag(given_covariance)))
+    # what was large enough is as true as it was
+    large = np.diag(given_covariance) > 1e-4
+    np.testing.assert_array_equal(np.diag(covariance)[large], np.diag(given_covariance)[large])
+
+
+def test_a_pose_without_any_scatter_gets_a_centimetre():
+    covariance = usable_pose(stamped(), Time()).pose.covariance
+    assert [covariance[i] for i in AMCL_READS] == [1e-4, 0.0, 0.0, 1e-4, 1e-5]
+
+
+@pytest.mark.parametrize(('image_s', 'now_s', 'published_s'), [
+    (100, 200, 100), (100, 100, 100), (200, 100, 100), (200, 0, 200)])
+def test_the_stamp_is_the_images_but_not_later_than_now(image_s, now_s, published_s):
+    pose = stamped(image_s)
+    usable = usable_pose(pose, Time(seconds=now_s))
+    assert usable.header.stamp.sec == published_s
+    assert usable.header.frame_id == 'map'
+    assert pose.header.stamp.sec == image_s, 'what is published elsewhere is not touched'
+
+
+def test_speeds():
+    odometry = Odometry()
+    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
+    linear.x, linear.y, angular.z = 0.3, -0.4, -2.0
+    assert speeds(odometry) == (pytest.approx(0.5), 2.0)
