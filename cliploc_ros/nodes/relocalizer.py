@@ -147,8 +147,7 @@ class RelocalizerNode(ManagedNode):
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
-            if self.context.ok():  # else the process is told to end, and rclpy stumbles over that
-                self.get_logger().error(traceback.format_exc())
+            self._report(traceback.format_exc())
             answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
         self._conclude(answer.message)
         self.get_logger().info(answer.message)

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable, Mapping
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState
 from rclpy.lifecycle import TransitionCallbackReturn as Outcome
 from rclpy.node import Node
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
 from cliploc_ros.ros.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.parameters import NodeParameters, ParameterRow, Value
@@ -115,7 +116,11 @@ class ManagedNode(LifecycleNodeMixin, Node):
     @property
     def state(self) -> str:
         """Return the lifecycle state's name."""
-        return str(self._state_machine.current_state[1])
+        try:
+            with self._state_machine:  # rclpy does not see to it that it is there still
+                return str(self._state_machine.current_state[1])
+        except InvalidHandle:
+            return 'finalized'
 
     def bring_up(self) -> None:
         """Return when the node is active; one that manages itself is made so.
@@ -125,11 +130,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
         NotActiveError
             It cannot be, or its manager does not want it to be.
         """
-        with self._transition:
-            if self._self_managed and self.state == 'unconfigured':
-                self.trigger_configure()
-            if self._self_managed and self.state == 'inactive':
-                self.trigger_activate()
+        try:
+            with self._transition, self._state_machine:
+                if self._self_managed and self.state == 'unconfigured':
+                    self.trigger_configure()
+                if self._self_managed and self.state == 'inactive':
+                    self.trigger_activate()
+        except InvalidHandle as error:
+            raise StoppedError('the node is shutting down') from error
         self.check_active()
 
     def check_active(self) -> None:
@@ -154,7 +162,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
             if self._self_managed:
                 self.bring_up()
             self._starter.cancel()
-        except NotActiveError:
+        except CliplocError:
             self._starter.timer_period_ns = int(self._pause_s * 1e9)
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
 
@@ -235,7 +243,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
         def answer(request: ChangeState.Request, response: ChangeState.Response
                    ) -> ChangeState.Response:
-            with self._transition:
+            with self._transition, self._state_machine:
                 self._self_managed = False
                 try:
                     return change(request, response)
