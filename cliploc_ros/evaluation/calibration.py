@@ -231,6 +231,20 @@ def _report(name: str, likely: NDArray[np.float64], right: NDArray[np.bool_]) ->
     return '\n'.join(lines)
 
 
+def _draw(folder: Path, judged: dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]]) -> None:
+    # late, since the fit needs no matplotlib
+    from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
+    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.trust import draw_reliability
+
+    make_folder(folder)
+    figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')
+    draw_reliability(axes, judged)
+    axes.set_title('each half as the other half has it', fontsize=9)
+    add_legend(figure)
+    print(f'wrote {save_figure(figure, folder / "reliability.png")}')
+
+
 def run(arguments: list[str]) -> int:
     """Fit, judge, print."""
     parser = argparse.ArgumentParser(prog='calibration', description=__doc__,
@@ -239,6 +253,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--map', type=Path, required=True, nargs='+', metavar='YAML',
                         help='of each query file')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--out', type=Path, metavar='DIR', help='draw a reliability diagram there')
     options = parser.parse_args(arguments)
     cases = _read(options)
     judged = cross_fitted(cases, options.seed)
@@ -246,6 +261,8 @@ def run(arguments: list[str]) -> int:
         print(_report(f'half {number}, as the other half has it', *half))
     print(_report('both', np.concatenate([half[0] for half in judged]),
                   np.concatenate([half[1] for half in judged])))
+    if options.out is not None:
+        _draw(options.out, {f'half {number}': half for number, half in enumerate(judged, start=1)})
     print('\nfitted on all, for cliploc_ros/core/confidence.py:\n'
           + ', '.join(f'{name}={value:.3g}' for name, value in fit(cases)._asdict().items()))
     return 0

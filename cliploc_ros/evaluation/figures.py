@@ -17,6 +17,7 @@ from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.output import write_file
 from cliploc_ros.evaluation.summary import Summary, find_best
 from cliploc_ros.evaluation.trials import Query, Result
+from cliploc_ros.evaluation.trust import draw_consistency, draw_reliability
 
 # Okabe and Ito's colours, which the colour-blind tell apart: one for each kind of matching, and
 # the rest for methods of other names. The algorithm is the line's style and marker.
@@ -63,6 +64,8 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
         'success_over_threshold': _success_over_threshold(summaries),
         'success_by_boxes': _success_by_boxes(summaries),
         'precision_over_recall': _precision_over_recall(summaries),
+        'reliability': _reliability(best),
+        'consistency': _consistency(summaries),
         'time_by_stage': _time_by_stage(summaries, observing_ms),
         'top_view': _top_view(landmark_map, queries,
                               [one for one in results if one.method == best.method], best.method),
@@ -71,10 +74,11 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
         figures['best_iteration'] = _best_iteration(sampled)
     if sweep:
         figures['success_over_iterations'] = _success_over_iterations(sweep)
-    return [_save(figure, folder / f'{name}.png') for name, figure in figures.items()]
+    return [save_figure(figure, folder / f'{name}.png') for name, figure in figures.items()]
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, and as SVG beside it; return the path."""
     # Without its date, an SVG of the same results is the same file.
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
     write_file(path.with_suffix('.svg'),
@@ -82,7 +86,8 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _new(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    """Return a figure and its axes, in the style of all."""
     figure = Figure(figsize=_SIZE, layout='constrained')
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel)
@@ -99,12 +104,13 @@ def _style(method: str) -> tuple[str, object, str | None]:
     return _OTHER_COLORS[sum(method.encode()) % len(_OTHER_COLORS)], '-', 'P'
 
 
-def _legend(figure: Figure) -> None:
+def add_legend(figure: Figure) -> None:
+    """Add the legend beside the axes."""
     figure.legend(loc='outside right upper', frameon=False, fontsize=8)
 
 
 def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = _new('error threshold [m]', 'success')
+    figure, axes = new_axes('error threshold [m]', 'success')
     limits = np.linspace(0.0, _MAX_ERROR_M, 401)
     for one in summaries:
         color, line, _ = _style(one.method)
@@ -112,12 +118,12 @@ def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
         axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
                   linestyle=line, linewidth=1.4, label=one.method)
     axes.set(xlim=(0, _MAX_ERROR_M), ylim=(0, 1))
-    _legend(figure)
+    add_legend(figure)
     return figure
 
 
 def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figure:
-    figure, axes = _new('iterations', f'success (within {_SUCCESS_M:g} m)')
+    figure, axes = new_axes('iterations', f'success (within {_SUCCESS_M:g} m)')
     for method, by_count in sweep.items():
         color, line, marker = _style(method)
         rates = [one.success(_SUCCESS_M) for one in by_count.values()]
@@ -128,12 +134,12 @@ def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figu
     axes.set_xticks(counts, [f'{count:,}' for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_ylim(0, 1)
-    _legend(figure)
+    add_legend(figure)
     return figure
 
 
 def _best_iteration(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = _new('iteration that found the best pose', '')
+    figure, axes = new_axes('iteration that found the best pose', '')
     found = [one.best_iterations[np.isfinite(one.errors_m)] for one in summaries]
     boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
                          patch_artist=True, medianprops={'color': 'black'})
@@ -146,7 +152,7 @@ def _best_iteration(summaries: Sequence[Summary]) -> Figure:
 
 
 def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = _new('detections in the image', f'success (within {_SUCCESS_M:g} m)')
+    figure, axes = new_axes('detections in the image', f'success (within {_SUCCESS_M:g} m)')
     boxes = summaries[0].boxes
     bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
     bins = [one for one in bins if one[2].any()]
@@ -160,12 +166,12 @@ def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
     axes.set_xticks(range(len(bins)), [f'{name}\n({int(chosen.sum())} images)'
                                        for name, (*_, chosen) in zip(names, bins, strict=True)])
     axes.set_ylim(-0.02, 1.02)
-    _legend(figure)
+    add_legend(figure)
     return figure
 
 
 def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = _new('recall: right poses that are believed',
+    figure, axes = new_axes('recall: right poses that are believed',
                         f'precision: believed poses within {_SUCCESS_M:g} m')
     for one in summaries:
         color, line, marker = _style(one.method)
@@ -180,7 +186,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
     axes.set(xlim=(-0.02, 1.02))
     axes.set_title('lines: every threshold of the confidence; markers: the options as run',
                    fontsize=9)
-    _legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -210,8 +216,26 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
     return (believed / right.sum())[last], (believed / np.arange(1, right.size + 1))[last]
 
 
+def _reliability(one: Summary) -> Figure:
+    figure, axes = new_axes('confidence', f'share of poses within {_SUCCESS_M:g} m')
+    solved = np.isfinite(one.errors_m)
+    draw_reliability(axes, {one.method: (one.confidence[solved],
+                                         one.errors_m[solved] < _SUCCESS_M)})
+    add_legend(figure)
+    return figure
+
+
+def _consistency(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = new_axes('squared error in its own covariance (NEES)',
+                            'share of believed poses below')
+    draw_consistency(axes, {one.method: one.nees[one.accepted] for one in summaries
+                            if one.nees.size and one.accepted.any()})
+    add_legend(figure)
+    return figure
+
+
 def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, float]) -> Figure:
-    figure, axes = _new('mean time [ms]', '')
+    figure, axes = new_axes('mean time [ms]', '')
     rows = np.arange(len(summaries))
     start = np.zeros(len(summaries))
     for (stage, duration), shade in zip(observing_ms.items(), ('#BBBBBB', '#888888'),
@@ -229,7 +253,7 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
         axes.set_xscale('log')
     axes.margins(x=0.28)
     if observing_ms:
-        _legend(figure)
+        add_legend(figure)
     return figure
 
 
@@ -259,7 +283,7 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
             axes.plot([x, pose[0][3]], [y, pose[1][3]], color=color, linewidth=0.9, zorder=5,
                       marker=marker, markevery=[1], markersize=4,
                       label=f'{label} ({len(chosen)})' if number == 0 else None)
-    _legend(figure)
+    add_legend(figure)
     return figure
 
 

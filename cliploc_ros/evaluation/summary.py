@@ -3,7 +3,7 @@
 """What a method's results come to, and whether two methods differ by more than noise."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
@@ -35,6 +35,8 @@ class Summary:
     coverage : ndarray (t, q)
     best_iterations, hypotheses : ndarray (t, q) of int
     boxes : ndarray (q,) of int
+    nees : ndarray (t, q)
+        Infinite where no pose was found; empty where it was not recorded.
     """
 
     method: str
@@ -47,6 +49,7 @@ class Summary:
     best_iterations: NDArray[np.int64]
     hypotheses: NDArray[np.int64]
     boxes: NDArray[np.int64]
+    nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, believed or not."""
@@ -109,7 +112,9 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     return Summary(
         method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        column('hypotheses'), column('boxes')[0])
+        column('hypotheses'), column('boxes')[0],
+        np.array([np.inf if result.nees is None else result.nees for result in results]
+                 ).reshape(-1, len(queries)))
 
 
 @dataclass(frozen=True)
