@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a map or a detector gone wrong costs: ``python -m cliploc_ros.evaluation.robustness``.
+
+Landmarks are removed, moved and mislabelled, detections dropped and invented, ever more of them;
+each time all queries are localized. Success counts poses believed or not; a wrong pose believed is
+what a robot must never get.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.cli.command import run_command
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.evaluation.calibration import without_boxes
+from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
+from cliploc_ros.evaluation.methods import AUTO, Method
+from cliploc_ros.evaluation.output import make_folder
+from cliploc_ros.evaluation.run import run_methods
+from cliploc_ros.evaluation.summary import Summary, summarize
+from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.evaluation.trust import wilson_interval
+
+_SUCCESS_M = 1.0
+_SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+_DISTANCES_M = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
+_BOX_SIDE_PX = (20.0, 200.0)
+
+World = tuple[LandmarkMap, Sequence[Query]]
+Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What goes wrong, by how much, and how that is written on an axis."""
+
+    name: str
+    label: str
+    levels: tuple[float, ...]
+    change: Change
+
+
+def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                     rng: np.random.Generator) -> World:
+    """Leave a share of the landmarks out of the map; their detections stay."""
+    count = len(landmark_map)
+    kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
+    fewer = replace(landmark_map, landmark_ids=tuple(landmark_map.landmark_ids[row]
+                                                     for row in kept),
+                    labels=tuple(landmark_map.labels[row] for row in kept),
+                    class_ids=tuple(landmark_map.class_ids[row] for row in kept),
+                    centers=landmark_map.centers[kept], semi_axes=landmark_map.semi_axes[kept],
+                    quats_xyzw=landmark_map.quats_xyzw[kept])
+    return fewer, [_with_similarities(query, np.asarray(query.observation.similarities)[:, kept])
+                   for query in queries]
+
+
+def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+                   rng: np.random.Generator) -> World:
+    """Move a third of the landmarks by a distance, each in a direction of its own."""
+    steps = rng.normal(size=landmark_map.centers.shape)
+    steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
+    steps[rng.random(len(steps)) > 1 / 3] = 0.0
+    return replace(landmark_map, centers=landmark_map.centers + steps), queries
+
+
+def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                       rng: np.random.Generator) -> World:
+    """Give a share of the landmarks each other's labels and classes."""
+    count = len(landmark_map)
+    chosen = rng.permutation(count)[:round(share * count)]
+    source = np.arange(count)
+    source[chosen] = np.roll(chosen, 1)
+    wrong = replace(landmark_map, labels=tuple(landmark_map.labels[row] for row in source),
+                    class_ids=tuple(landmark_map.class_ids[row] for row in source))
+    return wrong, [_with_similarities(query, np.asarray(query.observation.similarities)[:, source])
+                   for query in queries]
+
+
+def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                    rng: np.random.Generator) -> World:
+    """Leave a share of the boxes out."""
+    return landmark_map, [without_boxes(query, share, rng) for query in queries]
+
+
+def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                      rng: np.random.Generator) -> World:
+    """Add boxes anywhere, so many for each true one, that look like landmarks at random."""
+    return landmark_map, [_with_invented(query, share, rng) for query in queries]
+
+
+TROUBLES = (
+    Trouble('landmarks_removed', 'share of landmarks removed', _SHARES, remove_landmarks),
+    Trouble('landmarks_moved', 'a third of the landmarks moved by [m]', _DISTANCES_M,
+            move_landmarks),
+    Trouble('landmarks_mislabelled', 'share of landmarks mislabelled', _SHARES,
+            mislabel_landmarks),
+    Trouble('detections_dropped', 'share of detections dropped', _SHARES, drop_detections),
+    Trouble('detections_invented', 'invented detections for each true one', _SHARES,
+            invent_detections))
+
+
+def _with_similarities(query: Query, similarities: np.ndarray) -> Query:
+    return replace(query, observation=replace(
+        query.observation, similarities=np.ascontiguousarray(similarities)))
+
+
+def _with_invented(query: Query, share: float, rng: np.random.Generator) -> Query:
+    """Return a query with boxes whose crops look like those of its own, in another order."""
+    observation, true = query.observation, query.observation.detections
+    count = int(rng.binomial(len(true), share)) if len(true) else 0
+    camera, similarities = observation.camera, np.asarray(observation.similarities)
+    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
+    rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
+    looks = rng.permuted(similarities[rows], axis=1)
+    detections = Detections(
+        np.vstack([true.bboxes_xyxy, boxes]),
+        true.class_ids + tuple(true.class_ids[row] for row in rng.permutation(rows)),
+        np.concatenate([true.scores, true.scores[rows]]))
+    return replace(query, observation=replace(
+        observation, detections=detections,
+        similarities=np.ascontiguousarray(np.vstack([similarities, looks]))))
+
+
+def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Trouble, seed: int,
+            workers: int = 1) -> Iterator[Summary]:
+    """Localize all queries at each level of a trouble, with the default options."""
+    for level in trouble.levels:
+        # equal draws at each level: what goes wrong is only ever more
+        rng = np.random.default_rng(seed)
+        changed, asked = trouble.change(landmark_map, queries, level, rng)
+        options = RelocalizerOptions()
+        options = replace(options, k=min(options.k, len(changed)))
+        yield summarize(run_methods(changed, [Method(AUTO, options)], asked, trials=1,
+                                    workers=workers))[0]
+
+
+def draw(folder: Path, trouble: Trouble, summaries: Sequence[Summary]) -> Path:
+    """Draw success, what is believed, and what is believed and wrong, with 95 % intervals."""
+    figure, axes = new_axes(trouble.label, 'share of images')
+    counts = (('within 1 m', '#0072B2', 'o', [int((one.errors_m < _SUCCESS_M).sum())
+                                              for one in summaries]),
+              ('believed', '#009E73', 's', [int(one.accepted.sum()) for one in summaries]),
+              ('believed and wrong', '#D55E00', 'X', [one.wrongly_accepted(_SUCCESS_M)
+                                                      for one in summaries]))
+    total = summaries[0].errors_m.size
+    for label, color, marker, found in counts:
+        intervals = np.array([wilson_interval(one, total) for one in found])
+        axes.fill_between(trouble.levels, *intervals.T, color=color, alpha=0.15, linewidth=0)
+        axes.plot(trouble.levels, np.array(found) / total, color=color, marker=marker,
+                  markersize=5, linewidth=1.4, label=label)
+    axes.set_ylim(-0.02, 1.02)
+    add_legend(figure)
+    return save_figure(figure, folder / f'{trouble.name}.png')
+
+
+def run(arguments: list[str]) -> int:
+    """Measure and draw every trouble."""
+    parser = argparse.ArgumentParser(prog='robustness', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--queries', type=Path, required=True, metavar='NPZ')
+    parser.add_argument('--map', type=Path, required=True, metavar='YAML')
+    parser.add_argument('--out', type=Path, default=Path('robustness'), metavar='DIR')
+    parser.add_argument('--frames', choices=('main', 'all'), default='all')
+    parser.add_argument('--seed', type=int, default=0)
+    options = parser.parse_args(arguments)
+    make_folder(options.out)
+    landmark_map = LandmarkMap.from_file(options.map)
+    queries = make_queries(load_queries(options.queries, landmark_map.landmark_ids), landmark_map,
+                           options.frames == 'all')
+    for trouble in TROUBLES:
+        summaries = list(tqdm(measure(landmark_map, queries, trouble, options.seed),
+                              trouble.name, len(trouble.levels), disable=None))
+        print(f'{trouble.label}:')
+        for level, one in zip(trouble.levels, summaries, strict=True):
+            print(f'  {level:4.2f}: success {one.success(_SUCCESS_M):.3f}, believed '
+                  f'{one.accepted.mean():.3f}, of these wrong {one.wrongly_accepted(_SUCCESS_M)} '
+                  f'of {one.accepted.sum()}')
+        print(f'  {draw(options.out, trouble, summaries)}', flush=True)
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether maps and detections go wrong as said, and what that costs."""
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.evaluation import robustness
+from cliploc_ros.evaluation.trials import make_queries
+
+
+@pytest.fixture(scope='module')
+def questions(room, recording):
+    return make_queries(recording, room)
+
+
+@pytest.fixture
+def changed(room, questions, rng):
+    """Apply a change by so much."""
+    return lambda change, level: change(room, questions, level, rng)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+def test_landmarks_are_removed_with_their_similarities(changed, room, questions):
+    fewer, asked = changed(robustness.remove_landmarks, 0.5)
+    assert len(fewer) == len(room) - round(len(room) / 2)
+    columns = [room.landmark_ids.index(one) for one in fewer.landmark_ids]
+    np.testing.assert_array_equal(fewer.centers, room.centers[columns])
+    np.testing.assert_array_equal(asked[-1].observation.similarities,
+                                  questions[-1].observation.similarities[:, columns])
+
+
+def test_landmarks_are_moved_by_a_distance(changed, room):
+    distances = np.linalg.norm(changed(robustness.move_landmarks, 0.3)[0].centers - room.centers,
+                               axis=1)
+    assert distances.max() == pytest.approx(0.3)
+    assert 0 < (distances > 0).sum() < len(room)
+
+
+def test_landmarks_are_mislabelled(changed, room, questions):
+    wrong, asked = changed(robustness.mislabel_landmarks, 0.5)
+    assert sorted(wrong.labels) == sorted(room.labels)
+    source = [room.labels.index(one) for one in wrong.labels]
+    assert sum(row != own for own, row in enumerate(source)) == round(len(room) / 2)
+    np.testing.assert_array_equal(asked[-1].observation.similarities,
+                                  questions[-1].observation.similarities[:, source])
+
+
+def test_detections_are_dropped_and_invented(changed, questions):
+    before = sum(len(one.observation.detections) for one in questions)
+    fewer = sum(len(one.observation.detections)
+                for one in changed(robustness.drop_detections, 0.5)[1])
+    assert 0.3 * before < fewer < 0.7 * before
+    asked = changed(robustness.invent_detections, 0.5)[1]
+    more = sum(len(one.observation.detections) for one in asked)
+    assert 1.3 * before < more < 1.7 * before
+    assert all(one.observation.similarities.shape[0] == len(one.observation.detections)
+               for one in asked)
+
+
+@pytest.mark.parametrize('trouble', robustness.TROUBLES, ids=lambda trouble: trouble.name)
+def test_nothing_changed_is_nothing_lost_and_wrong_poses_are_not_believed(
+        trouble, room, questions, tmp_path):
+    summaries = list(robustness.measure(room, questions, trouble, seed=0))
+    assert len(summaries) == len(trouble.levels)
+    assert summaries[0].success(1.0) > 0.7
+    assert sum(one.wrongly_accepted() for one in summaries) <= 1
+    image = cv2.imread(str(robustness.draw(tmp_path, trouble, summaries)))
+    assert image.shape[0] > 300 and image.std() > 20
