@@ -61,7 +61,7 @@ def test_a_hundred_thousand_labels_in_little_time_and_memory(rng):
     similarities = CropSimilarities(units(rng, 12, 512), labels)
     nearest_landmarks(similarities, 10)
     least = np.inf
-    for _ in range(5):
+    for _ in range(15):
         start = time.perf_counter()
         nearest_landmarks(similarities, 10)
         least = min(least, time.perf_counter() - start)
