@@ -13,10 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.similarity import Similarities, nearest_landmarks
+from cliploc_ros.core.similarity import (
+    Similarities,
+    nearest_landmarks,
+    sampled_similarities,
+)
 from cliploc_ros.errors import OptionsError
 
 MATCHINGS = ('class', 'clip', 'hybrid')
+#: A k for each crop, see adaptive_candidates.
+ADAPTIVE = 0
+_ADAPTIVE_RANGE = 2, 8
+# In deviations of the crop's similarity to the map's labels: what is nearer to the best than this
+# may as well be the best. Of 17 rules tried it is the best one.
+_ADAPTIVE_MARGIN = 0.5
+# Of labels: so many tell a deviation to 2 %.
+_LABELS_SAMPLED = 4096
 
 
 @dataclass(frozen=True)
@@ -163,6 +175,27 @@ def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     landmarks, values = nearest_landmarks(similarities, k)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
+
+
+def adaptive_candidates(similarities: Similarities) -> Candidates:
+    """Return as many of the most similar landmarks of each detection as may as well be the best.
+
+    A crop that tells one label from all others has two candidates, one that many labels of the
+    map fit equally well has eight.
+
+    Parameters
+    ----------
+    similarities : ndarray (n, L) or CropSimilarities
+        Cosine similarity of each crop and label.
+    """
+    detections, landmarks = similarities.shape
+    least, most = _ADAPTIVE_RANGE
+    nearest = nearest_candidates(similarities, min(most, landmarks))
+    spread = sampled_similarities(similarities, np.arange(detections), _LABELS_SAMPLED)
+    best = nearest.similarities[nearest.ranks == 0]
+    margins = best - _ADAPTIVE_MARGIN * spread.std(axis=1)
+    return nearest.select((nearest.ranks < least)
+                          | (nearest.similarities >= margins[nearest.detections]))
 
 
 def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core import association
-from cliploc_ros.core.association import Candidates
+from cliploc_ros.core.association import ADAPTIVE, Candidates
 from cliploc_ros.core.culling import FEW, Tree
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -76,7 +76,8 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
-    nearest = association.nearest_candidates(similarities, options.k)
+    nearest = association.adaptive_candidates(similarities) if options.k == ADAPTIVE \
+        else association.nearest_candidates(similarities, options.k)
     return nearest.select(sound[nearest.detections])
 
 

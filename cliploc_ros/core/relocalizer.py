@@ -155,7 +155,7 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities:
+        if options.needs_similarities and options.k != association.ADAPTIVE:
             association.check_k(options.k, len(landmark_map))
         self._map = landmark_map
         landmark_map.prepare()

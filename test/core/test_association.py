@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from cliploc_ros.core.association import (
     ClassIndex,
+    adaptive_candidates,
     balanced_order,
     candidate_mask,
     class_candidates,
@@ -89,3 +90,18 @@ def test_the_index_of_classes_agrees_with_their_mask(landmarks, detections, limi
     wanted = class_candidates(mask).pairs
     assert (index.candidates(classes).pairs == wanted).all()
     assert (index.candidates(classes, limit=limit).pairs == wanted[:limit]).all()
+
+
+def test_adaptive_k_is_what_may_as_well_be_the_best():
+    """A crop that knows its landmark, one that three fit equally well, one that all fit."""
+    similarities = np.full((3, 20), 0.2, dtype=np.float32)
+    similarities[0, 4] = 0.3
+    similarities[1, [2, 5, 7]] = 0.3, 0.3, 0.299
+    candidates = adaptive_candidates(similarities)
+    assert np.bincount(candidates.detections).tolist() == [2, 3, 8]
+    first = candidates.select(candidates.ranks == 0)
+    assert first.landmarks.tolist() == [4, 2, 0]
+
+
+def test_adaptive_k_fits_the_smallest_map():
+    assert len(adaptive_candidates(np.full((2, 1), 0.2, dtype=np.float32))) == 2

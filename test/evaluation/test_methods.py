@@ -45,7 +45,7 @@ def test_named_sets_of_options(tmp_path):
     ('wide: {kk: 9}', "mine.yaml: wide: 'kk' is none of base, matching"),
     ('wide: {k: many}', "mine.yaml: wide: k: 'many' is no int"),
     ('wide: {k: true}', 'mine.yaml: wide: k: True is no int'),
-    ('wide: {k: 0}', 'mine.yaml: wide: k: 0 must lie within'),
+    ('wide: {k: -1}', 'mine.yaml: wide: k: -1 must lie within'),
     ('wide: 3', 'mine.yaml: wide: is not a mapping'),
     ('wide: {base: best}', "'best' is none of"),
     ('a@b: {k: 2}', 'must hold neither'),
