@@ -20,6 +20,8 @@ from cliploc_ros.core.compiled import compiled
 
 _UPPER = np.triu_indices(3)
 
+_OUTLINE_POINTS = 64
+
 
 def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float64]
                    ) -> NDArray[np.float64]:
@@ -126,3 +128,11 @@ def ellipses_in_pixels(ellipses: NDArray[np.float64], camera: Camera) -> NDArray
     scaled = ellipses * (fx, fy, fx * fx, fx * fy, fy * fy)
     scaled[:, :2] += (camera.cx, camera.cy)
     return scaled
+
+
+def outline_points(ellipse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (n, 2) on an ellipse cx, cy, exx, exy, eyy."""
+    cx, cy, exx, exy, eyy = ellipse
+    root = np.linalg.cholesky(np.array([[exx, exy], [exy, eyy]]))
+    angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE_POINTS, endpoint=False)
+    return np.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T + (cx, cy))

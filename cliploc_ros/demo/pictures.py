@@ -13,12 +13,11 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from cliploc_ros.core.ellipsoid import project_ellipsoids
+from cliploc_ros.core.ellipsoid import outline_points, project_ellipsoids
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.transforms import invert_transform
 from cliploc_ros.demo.review import Review
 from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
-from cliploc_ros.evaluation.map_view import outline_points
 
 _DPI = 110
 _BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'

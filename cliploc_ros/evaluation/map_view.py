@@ -9,11 +9,11 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from cliploc_ros.core.ellipsoid import outline_points
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 #: Sets writing off from what it stands on.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-_OUTLINE_POINTS = 64
 _MOST_NAMES = 100
 # Landmarks above each other share one place for their names.
 _SAME_PLACE_M = 0.14
@@ -59,11 +59,3 @@ def _places(landmark_map: LandmarkMap) -> list[tuple[NDArray[np.float64], list[s
         else:
             places.append((center, [int(row)]))
     return [(place, [landmark_map.landmark_ids[row] for row in rows]) for place, rows in places]
-
-
-def outline_points(ellipse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points (n, 2) on an ellipse cx, cy, exx, exy, eyy, see cliploc_ros.core.ellipsoid."""
-    cx, cy, exx, exy, eyy = ellipse
-    root = np.linalg.cholesky(np.array([[exx, exy], [exy, eyy]]))
-    angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE_POINTS, endpoint=False)
-    return np.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T + (cx, cy))

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -19,7 +20,8 @@ from cliploc_ros.core.transforms import move_covariance
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
-from cliploc_ros.ros.diagnostics import Health
+from cliploc_ros.ros.debug_image import View
+from cliploc_ros.ros.diagnostics import Health, StageTimes
 from cliploc_ros.ros.frame_source import Frame, FrameSource
 from cliploc_ros.ros.frames import BaseFrame
 from cliploc_ros.ros.handoff import HandOff, HandOffError
@@ -29,6 +31,7 @@ from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
 from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.visualization import Visualization
 from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
@@ -53,6 +56,7 @@ class RelocalizerNode(ManagedNode):
         self._vertical = VerticalSource(self, self._base)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._handoff = HandOff(self)
+        self._visualization = Visualization(self)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
@@ -74,11 +78,13 @@ class RelocalizerNode(ManagedNode):
         if values['base_frame'] and not any(values['base_from_camera']):
             self._base.listen()
         self._localizer = load_localizer(self, values)
+        self._visualization.set_map(self._localizer.landmark_map)
         return self._localizer.description
 
     def unload(self) -> None:
         """Let go map and network."""
         self._localizer = None
+        self._visualization.set_map(None)
         self._base.forget()
 
     def open(self) -> None:
@@ -116,6 +122,7 @@ class RelocalizerNode(ManagedNode):
         if self._localizer is None:
             raise NotActiveError(f'the node is {self.state}')
         self._localizer = self._localizer.reloaded(self, self.settings.snapshot())
+        self._visualization.set_map(self._localizer.landmark_map)
         return self._localizer.description
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -201,13 +208,26 @@ class RelocalizerNode(ManagedNode):
         camera_from_base = self._base.camera_from_base(
             values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
             header.stamp, values['tf_timeout_s'])
+        views: list[View] | None = [] if self._visualization.wants_view else None
         found, times = localizer.localize(
-            frame, values, self._up_in_camera(frame, values, camera_from_base))
+            frame, values, self._up_in_camera(frame, values, camera_from_base), views)
         self.stages.add(times.ms)
         self.check_active()
         bases = [hypothesis.map_from_camera @ camera_from_base
                  for hypothesis in found.hypotheses]
         self._hypotheses.publish(pose_array_msg(header, bases))
+        self._visualization.show(header, localizer.landmark_map, found)
+        answer = self._answer(header, found, times, bases, camera_from_base)
+        for view in views or []:  # who waits for the answer does not wait for its picture
+            self.worker.submit(partial(
+                self._visualization.show_view, frame.image.header, view, localizer.landmark_map,
+                found, answer.message))
+        return answer
+
+    def _answer(self, header: Header, found: Relocalization, times: StageTimes,
+                bases: list[NDArray[np.float64]], camera_from_base: NDArray[np.float64]
+                ) -> Answer:
+        """Publish what was found if it is accepted, and say it in a line."""
         if not found.accepted:
             return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]')
         assert found.covariance is not None  # what is accepted has one
@@ -216,9 +236,8 @@ class RelocalizerNode(ManagedNode):
                                         move_covariance(found.covariance, lever))
         self._pose.publish(pose)
         x, y, z = bases[0][:3, 3]
-        return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {localizer.map_frame} '
+        return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
                             f'[{_summary(found)}; {times}]')
-
 
     def _up_in_camera(self, frame: Frame, values: Mapping[str, Any],
                       camera_from_base: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -21,6 +21,7 @@ from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
 )
+from cliploc_ros.ros.debug_image import View
 from cliploc_ros.ros.diagnostics import StageTimes
 from cliploc_ros.ros.frame_source import Frame
 from cliploc_ros.ros.map_parameters import load_map
@@ -49,6 +50,11 @@ class Localizer:
         self._relocalizer = relocalizer
         self._options = options
         relocalizer.warm_up()
+
+    @property
+    def landmark_map(self) -> LandmarkMap:
+        """Return the map."""
+        return self._map
 
     @property
     def map_frame(self) -> str:
@@ -80,7 +86,8 @@ class Localizer:
         return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
     def localize(self, frame: Frame, values: Mapping[str, Any],
-                 up_in_camera: NDArray[np.float64] | None = None
+                 up_in_camera: NDArray[np.float64] | None = None,
+                 views: list[View] | None = None
                  ) -> tuple[Relocalization, StageTimes]:
         """Find where the camera was when it took a frame.
 
@@ -91,6 +98,8 @@ class Localizer:
             Of the relocalizer's parameters, as they are now.
         up_in_camera : ndarray (3,) or None
             The vertical, where it is known.
+        views : list of View or None
+            Takes what was seen, for pictures of it.
 
         Raises
         ------
@@ -110,6 +119,8 @@ class Localizer:
         observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
             else self._observer.observe(image, camera, detections, stamp)
         times.mark('CLIP')
+        if views is not None:
+            views.append(View(image, observation))
         found = self._with_options(values).relocalize(
             [replace(observation, up_in_camera=up_in_camera)])
         times.mark('search')

@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What RViz shows: landmarks as ellipsoids with their labels, matches as lines."""
+
+import colorsys
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point
+from numpy.typing import NDArray
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+
+#: The most landmarks that are shown: RViz draws no more at a pleasant rate.
+MAX_SHOWN = 5000
+_TEXT_HEIGHT_M = 0.08
+_LINE_WIDTH_M = 0.01
+_ACCEPTED = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.9)
+_REFUSED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=0.9)
+
+
+def landmark_markers(landmark_map: LandmarkMap) -> MarkerArray:
+    """Return an ellipsoid and a text for each landmark, one colour for each class."""
+    header = Header(frame_id=landmark_map.frame_id)
+    markers = [Marker(header=header, action=Marker.DELETEALL)]
+    rows = zip(landmark_map.centers[:MAX_SHOWN], landmark_map.semi_axes, landmark_map.quats_xyzw,
+               landmark_map.labels, landmark_map.class_ids, strict=False)
+    for number, (center, semi_axes, quat_xyzw, label, class_id) in enumerate(rows):
+        ellipsoid = Marker(header=header, ns='landmarks', id=number, type=Marker.SPHERE,
+                           color=class_color(class_id))
+        _place(ellipsoid, center)
+        q = ellipsoid.pose.orientation
+        q.x, q.y, q.z, q.w = map(float, quat_xyzw)
+        scale = ellipsoid.scale
+        scale.x, scale.y, scale.z = map(float, 2.0 * semi_axes)
+        text = Marker(header=header, ns='labels', id=number, type=Marker.TEXT_VIEW_FACING,
+                      text=label, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
+        _place(text, center + np.array([0.0, 0.0, semi_axes.max() + _TEXT_HEIGHT_M]))
+        text.scale.z = _TEXT_HEIGHT_M
+        markers += [ellipsoid, text]
+    return MarkerArray(markers=markers)
+
+
+def no_markers() -> MarkerArray:
+    """Return what takes all markers away."""
+    return MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
+
+
+def match_markers(header: Header, camera_position: NDArray[np.float64],
+                  centers: Sequence[NDArray[np.float64]], accepted: bool) -> MarkerArray:
+    """Return lines from a camera to the landmarks that it saw.
+
+    Parameters
+    ----------
+    header : Header
+        Stamp of the image, frame of the map.
+    camera_position : ndarray (3,)
+        [m].
+    centers : sequence of ndarray (3,)
+        Of the landmarks [m].
+    accepted : bool
+        Green if so, else red.
+    """
+    lines = Marker(header=header, ns='matches', type=Marker.LINE_LIST,
+                   color=_ACCEPTED if accepted else _REFUSED)
+    lines.pose.orientation.w = 1.0
+    lines.scale.x = _LINE_WIDTH_M
+    lines.points = [_point(end) for center in centers for end in (camera_position, center)]
+    if not lines.points:
+        lines.action = Marker.DELETEALL
+    return MarkerArray(markers=[lines])
+
+
+def class_color(class_id: str) -> ColorRGBA:
+    """Return the colour of a class: always the same, and others for most others."""
+    hue = zlib.crc32(class_id.encode()) / 2**32
+    r, g, b = colorsys.hsv_to_rgb(hue, 0.7, 0.95)
+    return ColorRGBA(r=r, g=g, b=b, a=0.6)
+
+
+def _place(marker: Marker, position: NDArray[np.float64]) -> None:
+    marker.pose.position = _point(position)
+    marker.pose.orientation.w = 1.0
+
+
+def _point(position: NDArray[np.float64]) -> Point:
+    x, y, z = map(float, position)
+    return Point(x=x, y=y, z=z)

@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room, see_room
+
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.ros.debug_image import View, draw_view
+
+BOX, ELLIPSE, UNMATCHED = (86, 180, 233), (230, 159, 0), (255, 255, 255)
+
+
+@pytest.fixture(scope='module')
+def room():
+    return make_room()
+
+
+@pytest.fixture(scope='module')
+def found(room):
+    relocalizer = Relocalizer(room, RelocalizerOptions(matching='class', algorithm='bf'))
+    found = relocalizer.relocalize([Observation(CAMERA, see_room(room))])
+    assert found.accepted and len(found.matches) == len(room)
+    return found
+
+
+def grey_view(room, **fields):
+    image = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
+    return View(image, replace(Observation(CAMERA, see_room(room)), **fields))
+
+
+def pixels_of(canvas, color):
+    return np.argwhere((canvas == color).all(axis=2))[:, ::-1]
+
+
+def test_boxes_and_outlines_are_where_they_were_seen(room, found):
+    view = grey_view(room)
+    canvas = draw_view(view, found, room, 'accepted')
+    assert (view.image_rgb == 128).all(), 'the image itself stays'
+    box = view.observation.detections.bboxes_xyxy[0]
+    middle = (box[:2] + box[2:]) / 2
+    outline = pixels_of(canvas, ELLIPSE)
+    inside = outline[(np.abs(outline - middle) <= (box[2:] - box[:2]) / 2 + 3).all(axis=1)]
+    # the outline of a perfect pose touches its box
+    assert np.abs(inside.min(axis=0) - box[:2]).max() < 4
+    assert np.abs(inside.max(axis=0) - box[2:]).max() < 4
+    assert len(pixels_of(canvas, BOX)) > 100
+    assert len(pixels_of(canvas, UNMATCHED)) == 0
+
+
+def test_what_is_not_matched_is_white(room, found):
+    canvas = draw_view(grey_view(room), replace(found, matches=found.matches[:1]), room, '')
+    assert len(pixels_of(canvas, UNMATCHED)) > 100
+
+
+@pytest.mark.parametrize('similarities', [None, np.full((12, 12), 0.3, np.float32)])
+def test_nothing_found_is_drawn_too(room, similarities):
+    view = grey_view(room, similarities=similarities)
+    verdict = 'refused: ' + 50 * 'nothing at all ' + 'ellipsoïde'
+    canvas = draw_view(view, Relocalization(False, 'nothing'), room, verdict)
+    assert len(pixels_of(canvas, (213, 94, 0))) > 500, 'the verdict is red'
+
+
+def test_similarities_are_written(room, found):
+    blind, seeing = (draw_view(grey_view(room, similarities=similarities), found, room, '')
+                     for similarities in (None, np.full((12, 12), 0.3, np.float32)))
+    assert len(pixels_of(seeing, BOX)) > len(pixels_of(blind, BOX)) + 100
+
+
+def test_boxes_beyond_all_measure_do_no_harm(room, found):
+    view = grey_view(room)
+    boxes = view.observation.detections.bboxes_xyxy.copy()
+    boxes[:, 2:] = 1e300
+    detections = replace(view.observation.detections, bboxes_xyxy=boxes)
+    draw_view(View(view.image_rgb, replace(view.observation, detections=detections)), found,
+              room, 'x')
+    small = View(np.zeros((1, 1, 3), np.uint8), view.observation)
+    assert draw_view(small, found, room, 'accepted: ' + 99 * 'x').shape == (1, 1, 3)

@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+from scene import make_room
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.ros.markers import (
+    MAX_SHOWN,
+    class_color,
+    landmark_markers,
+    match_markers,
+    no_markers,
+)
+
+
+def test_every_landmark_is_an_ellipsoid_with_its_label():
+    room = make_room()
+    first, *markers = landmark_markers(room).markers
+    assert first.action == Marker.DELETEALL, 'what was shown before goes'
+    ellipsoids, texts = markers[::2], markers[1::2]
+    assert [text.text for text in texts] == list(room.labels)
+    assert len({(marker.ns, marker.id) for marker in markers}) == 2 * len(room)
+    for row, (ellipsoid, text) in enumerate(zip(ellipsoids, texts, strict=True)):
+        assert (ellipsoid.type, text.type) == (Marker.SPHERE, Marker.TEXT_VIEW_FACING)
+        assert ellipsoid.header.frame_id == text.header.frame_id == 'map'
+        position, q = ellipsoid.pose.position, ellipsoid.pose.orientation
+        np.testing.assert_array_equal([position.x, position.y, position.z], room.centers[row])
+        np.testing.assert_array_equal([q.x, q.y, q.z, q.w], room.quats_xyzw[row])
+        # RViz takes diameters
+        np.testing.assert_array_equal(
+            [ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z], 2 * room.semi_axes[row])
+        assert text.pose.position.z > room.centers[row][2] + room.semi_axes[row].max()
+        assert ellipsoid.color == class_color(room.class_ids[row])
+    assert len({(color.r, color.g, color.b) for color in map(class_color, 'abc')}) == 3
+
+
+def test_a_large_map_is_shown_in_part():
+    many = MAX_SHOWN + 10
+    ones = np.ones((many, 3))
+    large = LandmarkMap('map', tuple(map(str, range(many))), ('mug',) * many, ('cup',) * many,
+                        ones, ones, np.tile([0.0, 0.0, 0.0, 1.0], (many, 1)))
+    assert len(landmark_markers(large).markers) == 1 + 2 * MAX_SHOWN
+
+
+def test_matches_are_lines_from_the_camera():
+    header = Header(frame_id='map')
+    camera, centers = np.array([1.0, 2.0, 3.0]), [np.zeros(3), np.array([4.0, 5.0, 6.0])]
+    lines, = match_markers(header, camera, centers, True).markers
+    assert (lines.type, lines.action, lines.header) == (Marker.LINE_LIST, Marker.ADD, header)
+    assert [(point.x, point.y, point.z) for point in lines.points] == [
+        (1.0, 2.0, 3.0), (0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+    refused, = match_markers(header, camera, centers, False).markers
+    assert lines.color.g > lines.color.r and refused.color.r > refused.color.g
+    nothing, = match_markers(header, camera, [], False).markers
+    assert nothing.action == Marker.DELETEALL
+
+
+def test_nothing_is_shown_of_no_map():
+    marker, = no_markers().markers
+    assert marker.action == Marker.DELETEALL
