@@ -23,10 +23,11 @@ from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
 from cliploc_ros.ros.debug_image import View
 from cliploc_ros.ros.diagnostics import Health, StageTimes
 from cliploc_ros.ros.frame_source import Frame, FrameSource
-from cliploc_ros.ros.frames import BaseFrame
+from cliploc_ros.ros.frames import BaseFrame, FrameError
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.localizer import Localizer, load_localizer
+from cliploc_ros.ros.odom_frame import OdomFrame
 from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
@@ -55,6 +56,7 @@ class RelocalizerNode(ManagedNode):
         self._base = BaseFrame(self)
         self._vertical = VerticalSource(self, self._base)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
+        self._odom_frame = OdomFrame(self, self._base)
         self._handoff = HandOff(self)
         self._visualization = Visualization(self)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
@@ -75,7 +77,8 @@ class RelocalizerNode(ManagedNode):
     def load(self) -> str:
         """Load map and network."""
         values: Mapping[str, Any] = self.settings.snapshot()
-        if values['base_frame'] and not any(values['base_from_camera']):
+        if values['publish_tf'] or (values['base_frame']
+                                    and not any(values['base_from_camera'])):
             self._base.listen()
         self._localizer = load_localizer(self, values)
         self._visualization.set_map(self._localizer.landmark_map)
@@ -90,6 +93,8 @@ class RelocalizerNode(ManagedNode):
     def open(self) -> None:
         """Be ready for requests; in continuous mode listen to frames."""
         self._handoff.open()
+        if self.settings['publish_tf']:
+            self._odom_frame.open()
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
         if self.settings['mode'] == 'continuous':
             self._listening.enter_context(self._vertical.listening(self.settings['gravity']))
@@ -98,6 +103,7 @@ class RelocalizerNode(ManagedNode):
     def close(self) -> None:
         """Let go the request that waits for frames, and stop to listen."""
         self._handoff.stop()
+        self._odom_frame.close()
         if self._frames is not None:
             self._frames.stop('the node was deactivated')
         self._listening.close()
@@ -235,6 +241,10 @@ class RelocalizerNode(ManagedNode):
         pose = pose_with_covariance_msg(header, bases[0],
                                         move_covariance(found.covariance, lever))
         self._pose.publish(pose)
+        try:
+            self._odom_frame.update(header, bases[0], self.settings.snapshot())
+        except FrameError as error:
+            self.get_logger().warning(f'publish_tf: {error}', throttle_duration_sec=_LOG_PERIOD_S)
         x, y, z = bases[0][:3, 3]
         return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
                             f'[{_summary(found)}; {times}]')

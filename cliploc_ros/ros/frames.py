@@ -9,9 +9,13 @@ from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.time import Time as RclTime
 
 from cliploc_ros.core.transforms import invert_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
+
+# An image so much older than another tells that time jumped; tf2 keeps ten seconds.
+_JUMP_BACK_NS = 10_000_000_000
 
 
 class FrameError(CliplocError):
@@ -28,6 +32,7 @@ class BaseFrame:
         self._node = node
         self._buffer: Any = None
         self._listener: Any = None
+        self._newest_ns = 0
 
     def camera_from_base(self, base_frame: str, mount: list[float], camera_frame: str,
                          stamp: Time, timeout_s: float) -> NDArray[np.float64]:
@@ -56,12 +61,29 @@ class BaseFrame:
         if any(mount):
             return invert_transform(transform_from_pose(np.array(mount[:3]),
                                                         np.array(mount[3:])))
+        return self.lookup(camera_frame, base_frame, stamp, timeout_s)
+
+    def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float
+               ) -> NDArray[np.float64]:
+        """Return target_from_source (4, 4) as tf2 has it at a time.
+
+        Raises
+        ------
+        FrameError
+            tf2 is not installed or has no such transform in time.
+        """
         self.listen()
+        at = RclTime.from_msg(stamp)
+        if at.nanoseconds < self._newest_ns - _JUMP_BACK_NS:
+            # simulated time began anew; tf2 would refuse what comes now as too old
+            self._buffer.clear()
+            self._newest_ns = 0
+        self._newest_ns = max(at.nanoseconds, self._newest_ns)
         try:
-            found = self._buffer.lookup_transform(camera_frame, base_frame, stamp,
+            found = self._buffer.lookup_transform(target_frame, source_frame, at,
                                                   Duration(seconds=timeout_s)).transform
         except Exception as error:  # tf2 raises many types, all of which mean: not now
-            raise FrameError(f"no transform from '{base_frame}' to '{camera_frame}': {error}; "
+            raise FrameError(f"no transform from '{source_frame}' to '{target_frame}': {error}; "
                              'publish it, or set base_from_camera') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
@@ -79,8 +101,8 @@ class BaseFrame:
         try:
             from tf2_ros import Buffer, TransformListener
         except ImportError as error:
-            raise FrameError('base_frame is set, but tf2_ros is not installed: install it, or '
-                             'set base_from_camera') from error
+            raise FrameError('a transform is needed, but tf2_ros is not installed: install it, '
+                             'or set base_from_camera') from error
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self._node)
 
@@ -89,3 +111,4 @@ class BaseFrame:
         if self._listener is not None:
             self._listener.unregister()
         self._buffer = self._listener = None
+        self._newest_ns = 0

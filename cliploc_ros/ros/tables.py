@@ -112,6 +112,10 @@ RELOCALIZER = (
     ParameterRow('nomotion_updates', 5, 'How often request_nomotion_update is called after an '
                  'initialpose, where AMCL serves it, so that a standing robot converges.',
                  low=0, high=100),
+    ParameterRow('publish_tf', False, 'Broadcast the transform from odom_frame to the map (REP '
+                 '105) after each accepted pose; only if no other localizer does.',
+                 read_only=True),
+    ParameterRow('odom_frame', 'odom', 'What publish_tf ties to the map.'),
     ParameterRow('tf_timeout_s', 0.5, "How long to wait for tf2 at the image's stamp.", unit='s',
                  low=0.0, high=60.0),
 )
@@ -130,6 +134,8 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     parse_class_map(str(values['class_map']))
     if values['gravity'] == 'base_frame' and not values['base_frame']:
         raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
+    if values['publish_tf'] and not values['base_frame']:
+        raise OptionsError('publish_tf: needs the parameter base_frame')
     given: dict[str, Any] = {name: values[name] for name in names}
     budget_ms, timeout_s = values['time_budget_ms'], values['timeout_s']
     assert isinstance(budget_ms, float) and isinstance(timeout_s, float)
