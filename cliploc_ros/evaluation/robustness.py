@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from cliploc_ros.cli.command import run_command
@@ -22,7 +24,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.evaluation.calibration import without_boxes
-from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
+from cliploc_ros.evaluation.figures import save_figure
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.run import run_methods
@@ -34,6 +36,7 @@ _SUCCESS_M = 1.0
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 _DISTANCES_M = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
 _BOX_SIDE_PX = (20.0, 200.0)
+_PANEL_SIZE = 2.6, 3.2  # of one trouble in the figure [inch]
 
 World = tuple[LandmarkMap, Sequence[Query]]
 Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
@@ -145,9 +148,19 @@ def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Troubl
                                     workers=workers))[0]
 
 
-def draw(folder: Path, trouble: Trouble, summaries: Sequence[Summary]) -> Path:
+def draw(folder: Path, found: Sequence[tuple[Trouble, Sequence[Summary]]]) -> Path:
     """Draw success, what is believed, and what is believed and wrong, with 95 % intervals."""
-    figure, axes = new_axes(trouble.label, 'share of images')
+    figure = Figure(figsize=(_PANEL_SIZE[0] * len(found), _PANEL_SIZE[1]), layout='constrained')
+    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for axes, (trouble, summaries) in zip(panels, found, strict=True):
+        _draw_panel(axes, trouble, summaries)
+    panels[0].set(ylabel='share of images', ylim=(-0.02, 1.02))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                  frameon=False, fontsize=9)
+    return save_figure(figure, folder / 'robustness.png')
+
+
+def _draw_panel(axes: Axes, trouble: Trouble, summaries: Sequence[Summary]) -> None:
     counts = (('within 1 m', '#0072B2', 'o', [int((one.errors_m < _SUCCESS_M).sum())
                                               for one in summaries]),
               ('believed', '#009E73', 's', [int(one.accepted.sum()) for one in summaries]),
@@ -159,9 +172,9 @@ def draw(folder: Path, trouble: Trouble, summaries: Sequence[Summary]) -> Path:
         axes.fill_between(trouble.levels, *intervals.T, color=color, alpha=0.15, linewidth=0)
         axes.plot(trouble.levels, np.array(found) / total, color=color, marker=marker,
                   markersize=5, linewidth=1.4, label=label)
-    axes.set_ylim(-0.02, 1.02)
-    add_legend(figure)
-    return save_figure(figure, folder / f'{trouble.name}.png')
+    axes.set_xlabel(trouble.label)
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
 
 
 def run(arguments: list[str]) -> int:
@@ -178,6 +191,7 @@ def run(arguments: list[str]) -> int:
     landmark_map = LandmarkMap.from_file(options.map)
     queries = make_queries(load_queries(options.queries, landmark_map.landmark_ids), landmark_map,
                            options.frames == 'all')
+    found = []
     for trouble in TROUBLES:
         summaries = list(tqdm(measure(landmark_map, queries, trouble, options.seed),
                               trouble.name, len(trouble.levels), disable=None))
@@ -186,7 +200,8 @@ def run(arguments: list[str]) -> int:
             print(f'  {level:4.2f}: success {one.success(_SUCCESS_M):.3f}, believed '
                   f'{one.accepted.mean():.3f}, of these wrong {one.wrongly_accepted(_SUCCESS_M)} '
                   f'of {one.accepted.sum()}')
-        print(f'  {draw(options.out, trouble, summaries)}', flush=True)
+        found.append((trouble, summaries))
+    print(f'wrote {draw(options.out, found)}')
     return 0
 
 

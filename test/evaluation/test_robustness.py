@@ -70,5 +70,5 @@ def test_nothing_changed_is_nothing_lost_and_wrong_poses_are_not_believed(
     assert len(summaries) == len(trouble.levels)
     assert summaries[0].success(1.0) > 0.7
     assert sum(one.wrongly_accepted() for one in summaries) <= 1
-    image = cv2.imread(str(robustness.draw(tmp_path, trouble, summaries)))
+    image = cv2.imread(str(robustness.draw(tmp_path, [(trouble, summaries)] * 2)))
     assert image.shape[0] > 300 and image.std() > 20
