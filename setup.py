@@ -25,7 +25,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        (f'share/{PACKAGE}/config', files('config', '*.yaml') + files('config', '*.rviz')),
+        (f'share/{PACKAGE}/config', files('config', '*.*')),
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',

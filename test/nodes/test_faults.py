@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What happens on a robot all the same: processes die, time jumps, cameras are fast."""
+
+import array
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from conftest import PROJECT, class_matching, make_frame
+from geometry_msgs.msg import PoseArray
+from rosgraph_msgs.msg import Clock
+
+from cliploc_ros.ros.conversions import stamp_ns
+
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+# How long the fast camera runs [s]; a minute shows more than a test run has time for.
+FAST_CAMERA_S = float(os.environ.get('CLIPLOC_FAST_CAMERA_S', '8'))
+
+
+def test_a_detector_that_is_killed_and_restarted_while_a_request_waits(start, tester, room_map):
+    start('nodes.relocalizer', parameters=class_matching(room_map, timeout_s=60.0)
+          ).wait_for_output('ready after')
+    tester.connect()
+    tester.destroy_publisher(tester.detections)
+    try:
+        first = start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'})
+        first.wait_for_output('ready after')
+        future = tester.ask()
+        tester.wait(lambda: tester.images.get_subscription_count() == 2, 'both to listen')
+        first.stop(signal.SIGKILL)
+        second = start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'})
+        stamps = iter(range(1, 100_000))
+
+        def answered():
+            tester.publish(make_frame(stamp_s=float(next(stamps)))[:2])
+            return future.done()
+        tester.wait(answered, 'an answer from the new detector')
+        # noise shows nothing, and that is what is said
+        assert future.result().message.startswith('refused: ')
+        assert second.alive
+    finally:
+        tester.detections = tester.create_publisher(
+            type(make_frame()[2]), 'detections', 10)
+
+
+def test_simulated_time_that_jumps_back_an_hour(own_relocalizer, tester):
+    process = own_relocalizer('--ros-args', '-p', 'use_sim_time:=true', mode='continuous')
+    clock = tester.create_publisher(Clock, '/clock', 10)
+    try:
+        for now_s in (10_000, 6_400, 10_000):
+            frame, tick = make_frame(stamp_s=now_s - 0.5), Clock()
+            tick.clock.sec = now_s
+            tester.forget()
+
+            def answered(future=None, tick=tick):
+                clock.publish(tick)
+                return future is not None and future.done()
+            future = tester.ask()
+            tester.feed_until(lambda f=future, a=answered: a(f), frame)
+            assert future.result().success
+            tester.wait(lambda: tester.initial_poses, 'an initial pose')
+            assert stamp_ns(tester.initial_poses[-1].header.stamp) == round((now_s - 0.5) * 1e9)
+    finally:
+        tester.destroy_publisher(clock)
+    assert process.alive
+    assert 'Traceback' not in process.output()
+
+
+@pytest.fixture
+def fast_frame():
+    """A frame of 1920 x 1080 that shows the room; a function that dates it."""
+    image, info, detections = make_frame()
+    x, y = 1920 / image.width, 1080 / image.height
+    image.width, image.height, image.step = 1920, 1080, 1920 * 3
+    image.data = array.array('B', bytes(image.step * image.height))
+    info.width, info.height = 1920, 1080
+    info.k = np.array(info.k) * np.repeat([x, y, 1.0], 3)
+    for detection in detections.detections:
+        box = detection.bbox
+        box.center.position.x, box.size_x = x * box.center.position.x, x * box.size_x
+        box.center.position.y, box.size_y = y * box.center.position.y, y * box.size_y
+
+    def at(now_ns):
+        for message in (image, info, detections):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
+        return detections, info, image
+    return at
+
+
+def test_a_fast_camera_leaves_no_backlog(own_relocalizer, tester, fast_frame):
+    process = own_relocalizer(mode='continuous')
+    latencies_s, memory_mib = [], []
+    subscription = tester.create_subscription(
+        PoseArray, 'relocalizer/hypotheses', lambda msg: latencies_s.append(
+            (time.time_ns() - stamp_ns(msg.header.stamp)) / 1e9), 10)
+    tester.feed_until(lambda: len(latencies_s) > 5, fast_frame(time.time_ns()), 'the first poses')
+    latencies_s.clear()
+    start, sent = time.monotonic(), 0
+    while (elapsed_s := time.monotonic() - start) < FAST_CAMERA_S:
+        if elapsed_s >= sent / 30:
+            tester.publish(fast_frame(time.time_ns()))
+            sent += 1
+        tester.spin()
+        memory_mib.append(process.memory_mib())
+    tester.destroy_subscription(subscription)
+    half = len(memory_mib) // 2
+    growth = max(memory_mib[half:]) / max(memory_mib[:half]) - 1
+    print(f'\n1080p at {sent / elapsed_s:.0f} Hz for {elapsed_s:.0f} s: '
+          f'{len(latencies_s)} results, latency median {1e3 * np.median(latencies_s):.0f} ms, p99 '
+          f'{1e3 * np.percentile(latencies_s, 99):.0f} ms; memory {memory_mib[-1]:.0f} MiB, '
+          f'{100 * growth:+.1f} % in the second half')
+    assert len(latencies_s) > 2 * FAST_CAMERA_S
+    # a backlog would grow with the time; the newest frame is never old
+    assert np.percentile(latencies_s[len(latencies_s) // 2:], 90) < 1.0
+    assert growth < 0.1
+    assert process.stop()[0] == 0
