@@ -6,6 +6,11 @@ One core, beside a plain loop over OpenCV and NumPy that does the same, and maps
 in one run. With --queries and --map also the time that every sample of each recorded query takes.
 """
 
+import os
+
+# As in the nodes: read when NumPy is loaded.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 import argparse
 import sys
 import time
