@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,7 +37,8 @@ _SUCCESS_M = 1.0
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 _DISTANCES_M = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
 _BOX_SIDE_PX = (20.0, 200.0)
-_PANEL_SIZE = 2.6, 3.2  # of one trouble in the figure [inch]
+_PANEL_SIZE = 2.6, 3.4  # of one trouble in the figure [inch]
+_LABEL_WIDTH = 22
 
 World = tuple[LandmarkMap, Sequence[Query]]
 Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
@@ -172,7 +174,7 @@ def _draw_panel(axes: Axes, trouble: Trouble, summaries: Sequence[Summary]) -> N
         axes.fill_between(trouble.levels, *intervals.T, color=color, alpha=0.15, linewidth=0)
         axes.plot(trouble.levels, np.array(found) / total, color=color, marker=marker,
                   markersize=5, linewidth=1.4, label=label)
-    axes.set_xlabel(trouble.label)
+    axes.set_xlabel(fill(trouble.label, _LABEL_WIDTH))
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
 
