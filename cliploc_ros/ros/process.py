@@ -3,6 +3,7 @@
 """The life of a node's process: the only caller of rclpy.init."""
 
 import atexit
+import ctypes
 import os
 import signal
 import sys
@@ -21,6 +22,7 @@ from cliploc_ros.ros.requests import MAX_REQUESTS
 # For the requests that may wait, for transitions, frames, parameters and the rest. Threads are
 # made when they are first needed.
 _THREADS = MAX_REQUESTS + 8
+_M_ARENA_MAX = -8  # malloc.h
 # For callbacks to end before their node does.
 _GRACE_S = 1.0
 
@@ -45,6 +47,7 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
     # Two networks share a robot's cores, each in a process of its own: a thread of PyTorch that
     # waits by spinning, as they do, slows the other one tenfold. Read when PyTorch is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
+    _bound_arenas()
     try:
         rclpy.init(args=sys.argv)
     except Exception as error:  # rcl raises its own types for arguments and for missing folders
@@ -74,6 +77,13 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
             node.destroy_node()
         rclpy.try_shutdown()
     _leave()
+
+
+def _bound_arenas() -> None:
+    """Let the threads share their heaps: what each of twenty keeps for later adds up."""
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
+    if mallopt is not None:  # glibc
+        mallopt(_M_ARENA_MAX, 2)
 
 
 def _leave() -> NoReturn:

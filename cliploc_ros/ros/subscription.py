@@ -71,6 +71,9 @@ class AdaptiveSubscription:
         return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
 
     def _create(self) -> Subscription:
+        # rclpy keeps a dead reference to everything that ever was in a group
+        entities = (self._group or self._node.default_callback_group).entities
+        entities.difference_update([entity for entity in entities if entity() is None])
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
                              durability=self._profile.durability, reliability=self._reliability)
         return self._node.create_subscription(
