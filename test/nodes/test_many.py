@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 from cliploc_ros.ros.conversions import stamp_ns
 
 # A soak takes 10,000 and half an hour; the first tenth is for what is loaded when first needed.
-REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '60'))
+REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '40'))
 
 
 def test_no_request_is_lost_or_answered_twice_and_memory_stays(own_relocalizer, tester):
