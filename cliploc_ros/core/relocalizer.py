@@ -186,7 +186,8 @@ class Relocalizer:
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
 
-    def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
+    def relocalize(self, observations: Sequence[Observation],
+                   searched: list[Searched] | None = None) -> Relocalization:
         """Find where the camera was when it saw the last of some frames.
 
         Several frames are one question: hypotheses come from each of them, and are scored on and
@@ -197,6 +198,9 @@ class Relocalizer:
         observations : sequence of Observation
             One frame, or up to MAX_FRAMES of one moving camera that odom_from_camera joins; the
             last is the one whose pose is wanted.
+        searched : list of Searched, optional
+            What was found in the first of these frames when they were asked about before, in
+            their order; what is found in the others is appended. They have all of the time.
 
         Returns
         -------
@@ -212,9 +216,11 @@ class Relocalizer:
         """
         start = time.perf_counter()
         cameras = _cameras_from_last(observations)
-        share = _SEARCH_SHARE * self._options.time_budget_s / len(observations)
-        frames = [self._search_frame(observation, start + share * (number + 1))
-                  for number, observation in enumerate(observations)]
+        frames = [] if searched is None else searched
+        new = observations[len(frames):]
+        share = _SEARCH_SHARE * self._options.time_budget_s / max(1, len(new))
+        for number, observation in enumerate(new):
+            frames.append(self._search_frame(observation, start + share * (number + 1)))
         return self._conclude(observations, frames, cameras, start)
 
     def _search_frame(self, observation: Observation, deadline: float) -> Searched:

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer node: from image and detections to the robot's pose, when asked."""
 
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NoReturn
 
@@ -22,12 +23,14 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
 from cliploc_ros.ros.debug_image import View
 from cliploc_ros.ros.diagnostics import Health, StageTimes
-from cliploc_ros.ros.frame_source import Frame, FrameSource
+from cliploc_ros.ros.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.frames import BaseFrame, FrameError
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.odom_frame import OdomFrame
+from cliploc_ros.ros.odometry import CameraPlace, OdometrySource
+from cliploc_ros.ros.odometry_window import NoOdometryError
 from cliploc_ros.ros.process import run_node
 from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
@@ -45,6 +48,10 @@ class Answer:
 
     pose: PoseWithCovarianceStamped | None
     message: str
+    #: Whether the next frame may change it, together with those before.
+    is_open: bool = False
+    #: Whether it comes from any frame.
+    has_frame: bool = True
 
 
 class RelocalizerNode(ManagedNode):
@@ -57,7 +64,8 @@ class RelocalizerNode(ManagedNode):
         self._vertical = VerticalSource(self, self._base)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._odom_frame = OdomFrame(self, self._base)
-        self._handoff = HandOff(self)
+        self._odometry = OdometrySource(self, self._base)
+        self._handoff = HandOff(self, self._odometry)
         self._visualization = Visualization(self)
         self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
@@ -97,8 +105,7 @@ class RelocalizerNode(ManagedNode):
             self._odom_frame.open()
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
         if self.settings['mode'] == 'continuous':
-            self._listening.enter_context(self._vertical.listening(self.settings['gravity']))
-            self._listening.enter_context(self._frames.listening())
+            self._listen(self._listening, self._frames)
 
     def close(self) -> None:
         """Let go the request that waits for frames, and stop to listen."""
@@ -132,16 +139,42 @@ class RelocalizerNode(ManagedNode):
         return self._localizer.description
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        answer = self._flights.board()
+        answer = self._request()
         response.success = answer.pose is not None
         response.message = answer.message
         return response
 
     def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
-        self._flights.board()
+        self._request()
         return response
 
-    def _wake_up(self, depart: Callable[[], None]) -> Answer:
+    def _request(self) -> Answer:
+        """Answer from the next fresh frame; while odometry joins them, from those after, too."""
+        start, timeout_s = time.monotonic(), self.settings['timeout_s']
+        with ExitStack() as listening:
+            if self.active and self._frames is not None:
+                self._listen(listening, self._frames)
+            answer, frames = self._flights.board(timeout_s), 1
+            while answer.is_open or not answer.has_frame:
+                left_s = start + timeout_s - time.monotonic()
+                if left_s <= 0.0:
+                    break
+                later = self._flights.board(left_s)
+                if later.has_frame:
+                    answer, frames = later, frames + 1
+        if frames > 1:
+            answer = replace(answer, message=f'{answer.message} [{frames} frames in '
+                                             f'{time.monotonic() - start:.1f} s]')
+            self.get_logger().info(answer.message)
+        return answer
+
+    def _listen(self, listening: ExitStack, frames: FrameSource) -> None:
+        """Listen to all that an answer is made from; frames are the last to begin."""
+        listening.enter_context(self._vertical.listening(self.settings['gravity']))
+        listening.enter_context(self._odometry.listening())
+        listening.enter_context(frames.listening())
+
+    def _wake_up(self, depart: Callable[[], None], timeout_s: float) -> Answer:
         """Localize from the next fresh frame, and tell a running localizer of success.
 
         Called once for all requests that wait at the same time: those that come after depart
@@ -151,19 +184,26 @@ class RelocalizerNode(ManagedNode):
             # A map or weights that were missing may have been mended since.
             self.bring_up()
             assert self._frames is not None  # an active node has them
-            with (self._vertical.listening(self.settings['gravity']),
-                  self._handoff.listening()):
-                with self._frames.listening():
-                    frame = self._frames.wait_for_fresh(self.settings['timeout_s'])
+            with ExitStack() as listening:
+                self._listen(listening, self._frames)
+                frame = self._frames.wait_for_fresh(timeout_s)
                 depart()
                 answer = self._handed_over(self.worker.run(lambda: self._localize(frame)))
+                if answer.is_open:
+                    answer = replace(answer, is_open=self._odometry.follows(
+                        frame.image.header.stamp))
+        except NoFrameError as error:
+            answer = Answer(None, str(error), has_frame=False)
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
             self._report(traceback.format_exc())
             answer = Answer(None, f'internal error: {error} (the traceback is in the log)')
+        if not answer.has_frame and timeout_s < self.settings['timeout_s']:
+            return answer  # who waits had an answer before
         self._conclude(answer.message)
-        self.get_logger().info(answer.message)
+        if not answer.is_open:
+            self.get_logger().info(answer.message)
         return answer
 
     def _handed_over(self, answer: Answer) -> Answer:
@@ -216,7 +256,8 @@ class RelocalizerNode(ManagedNode):
             header.stamp, values['tf_timeout_s'])
         views: list[View] | None = [] if self._visualization.wants_view else None
         found, times = localizer.localize(
-            frame, values, self._up_in_camera(frame, values, camera_from_base), views)
+            frame, values, self._up_in_camera(frame, values, camera_from_base), views,
+            self._place(frame, values, camera_from_base))
         self.stages.add(times.ms)
         self.check_active()
         bases = [hypothesis.map_from_camera @ camera_from_base
@@ -235,7 +276,8 @@ class RelocalizerNode(ManagedNode):
                 ) -> Answer:
         """Publish what was found if it is accepted, and say it in a line."""
         if not found.accepted:
-            return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]')
+            return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]',
+                          is_open=self.settings['fuse_frames'] > 1)
         assert found.covariance is not None  # what is accepted has one
         lever = found.hypotheses[0].map_from_camera[:3, :3] @ camera_from_base[:3, 3]
         pose = pose_with_covariance_msg(header, bases[0],
@@ -260,6 +302,23 @@ class RelocalizerNode(ManagedNode):
             self.get_logger().warning(f'localizing without a vertical: {error}',
                                       throttle_duration_sec=_LOG_PERIOD_S)
             return None
+
+
+    def _place(self, frame: Frame, values: Mapping[str, Any],
+               camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
+        """Return where odometry has the camera; without that the frame is asked about alone."""
+        if values['fuse_frames'] == 1:
+            return None
+        header = frame.image.header
+        try:
+            return self._odometry.camera_place(values, camera_from_base, header.frame_id,
+                                               header.stamp)
+        except NoOdometryError as error:
+            self.get_logger().debug(f'one frame alone: {error}')
+        except FrameError as error:
+            self.get_logger().warning(f'one frame alone: {error}',
+                                      throttle_duration_sec=_LOG_PERIOD_S)
+        return None
 
 
 def _summary(found: Relocalization) -> str:

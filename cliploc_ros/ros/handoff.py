@@ -4,8 +4,7 @@
 
 import math
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -19,7 +18,7 @@ from std_srvs.srv import Empty
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.subscription import AdaptiveSubscription
+from cliploc_ros.ros.odometry import OdometrySource
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
 # degree. AMCL draws its particles from x, y and yaw; without any scatter they would all be one.
@@ -41,38 +40,18 @@ class HandOff:
     Parameters
     ----------
     node : Node
+    odometry : OdometrySource
+        Tells whether the robot moves, while somebody listens to it.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, odometry: OdometrySource) -> None:
         self._node = node
+        self._odometry = odometry
         self._publisher = node.create_publisher(PoseWithCovarianceStamped, 'initialpose',
                                                 qos.POSE)
-        self._group = ReentrantCallbackGroup()
         self._updater = node.create_client(Empty, 'request_nomotion_update',
-                                           callback_group=self._group)
-        self._heard = threading.Condition()
-        self._odometry: Odometry | None = None
-        self._listeners = 0
-        self._subscription: AdaptiveSubscription | None = None
+                                           callback_group=ReentrantCallbackGroup())
         self._stopped = threading.Event()
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen to odometry for the length of a with statement."""
-        with self._heard:
-            self._listeners += 1
-            if self._subscription is None:
-                self._odometry = None
-                self._subscription = AdaptiveSubscription(
-                    self._node, Odometry, 'odom', self._on_odometry, qos.ODOM, self._group)
-        try:
-            yield
-        finally:
-            with self._heard:
-                self._listeners -= 1
-                if self._listeners == 0:
-                    self._subscription.destroy()
-                    self._subscription = None
 
     def open(self) -> None:
         """Be ready to hand over."""
@@ -107,23 +86,14 @@ class HandOff:
                 lambda _, done=answered: done.set())
             answered.wait(_UPDATE_PATIENCE_S)
 
-    def _on_odometry(self, msg: Odometry) -> None:
-        with self._heard:
-            self._odometry = msg
-            self._heard.notify_all()
-
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float) -> None:
         """Raise unless odometry says that the robot rests; without odometry it is believed to."""
-        topic = self._node.resolve_topic_name('odom')
-        with self._heard:
-            if self._node.count_publishers(topic):
-                self._heard.wait_for(lambda: self._odometry is not None, _ODOM_PATIENCE_S)
-            elif self._odometry is None:
-                return
-            odometry = self._odometry
+        odometry = self._odometry.recent(_ODOM_PATIENCE_S)
         if odometry is None:
-            raise HandOffError(f'{topic} has a publisher that says nothing, so the robot may be '
-                               'moving: initialpose is withheld')
+            if not self._odometry.is_published:
+                return
+            raise HandOffError(f'{self._odometry.topic} has a publisher that says nothing, so the '
+                               'robot may be moving: initialpose is withheld')
         speed_m_s, turn_rad_s = speeds(odometry)
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '

@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ from cliploc_ros.ros.conversions import (
 from cliploc_ros.ros.debug_image import View
 from cliploc_ros.ros.diagnostics import StageTimes
 from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.frame_window import FrameWindow
 from cliploc_ros.ros.map_parameters import load_map
+from cliploc_ros.ros.odometry import CameraPlace
 from cliploc_ros.ros.tables import parse_class_map, relocalizer_options
 
 
@@ -49,6 +52,7 @@ class Localizer:
         self._observer = observer
         self._relocalizer = relocalizer
         self._options = options
+        self._window = FrameWindow()
         relocalizer.warm_up()
 
     @property
@@ -87,9 +91,9 @@ class Localizer:
 
     def localize(self, frame: Frame, values: Mapping[str, Any],
                  up_in_camera: NDArray[np.float64] | None = None,
-                 views: list[View] | None = None
+                 views: list[View] | None = None, place: CameraPlace | None = None
                  ) -> tuple[Relocalization, StageTimes]:
-        """Find where the camera was when it took a frame.
+        """Find where the camera was, by a frame and those before that odometry joins to it.
 
         Parameters
         ----------
@@ -100,6 +104,8 @@ class Localizer:
             The vertical, where it is known.
         views : list of View or None
             Takes what was seen, for pictures of it.
+        place : CameraPlace or None
+            Where odometry has the camera; None: the frame is asked about alone.
 
         Raises
         ------
@@ -121,16 +127,32 @@ class Localizer:
         times.mark('CLIP')
         if views is not None:
             views.append(View(image, observation))
-        found = self._with_options(values).relocalize(
-            [replace(observation, up_in_camera=up_in_camera)])
+        found = self._relocalize(replace(observation, up_in_camera=up_in_camera), place, values)
         times.mark('search')
         return found, times
+
+    def _relocalize(self, observation: Observation, place: CameraPlace | None,
+                    values: Mapping[str, Any]) -> Relocalization:
+        """Ask about a frame, together with those before that are still of use."""
+        relocalizer = self._with_options(values)
+        if place is None:
+            return relocalizer.relocalize([observation])
+        frames = self._window.join(
+            replace(observation, odom_from_camera=place.odom_from_camera), place.run,
+            values['fuse_frames'], values['fuse_window_s'])
+        searched = [one for one in takewhile(lambda one: one is not None,
+                                             (frame.searched for frame in frames)) if one]
+        found = relocalizer.relocalize([frame.observation for frame in frames], searched)
+        for frame, one in zip(frames, searched, strict=True):
+            frame.searched = one
+        return found
 
     def _with_options(self, values: Mapping[str, Any]) -> Relocalizer:
         """Return the relocalizer for the options as they are now."""
         options = relocalizer_options(values)
         if options != self._options:
             self._relocalizer, self._options = Relocalizer(self._map, options), options
+            self._window.forget_searches()
         return self._relocalizer
 
 

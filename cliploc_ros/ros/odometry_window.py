@@ -14,6 +14,8 @@ from cliploc_ros.errors import CliplocError
 
 _NS_PER_S = 1_000_000_000
 _UNIT_TOLERANCE = 0.01
+# No robot is so far from where it began; beyond, sums lose millimetres.
+_FARTHEST_M = 1e7
 # Between two messages further apart nobody knows how the robot moved: wheels take 20 ms, visual
 # odometry 100.
 _MAX_GAP_NS = _NS_PER_S // 2
@@ -22,6 +24,8 @@ _MAX_LATE_NS = _NS_PER_S
 # A robot that seems faster did not move: its odometry was reset.
 _MAX_SPEED_M_S = 20.0
 _SLACK_M = 0.1
+_MAX_TURN_RAD_S = 10.0
+_SLACK_RAD = 0.1
 
 
 class NoOdometryError(CliplocError):
@@ -49,6 +53,8 @@ class OdometryWindow:
         self._length_ns = round(length_s * _NS_PER_S)
         self._max_poses = max_poses
         self._poses: list[_Pose] = []
+        #: Of which run of odometry the poses are: those of two runs have nothing in common.
+        self.run = 0
 
     def __len__(self) -> int:
         """Return how many poses are kept."""
@@ -57,6 +63,16 @@ class OdometryWindow:
     def clear(self) -> None:
         """Forget all poses: those that come are of another run."""
         self._poses.clear()
+        self.run += 1
+
+    def is_ahead(self, stamp_ns: int) -> bool:
+        """Return whether an instant lies so little behind the newest pose that one may follow."""
+        return bool(self._poses) and 0 < stamp_ns - self._poses[-1].stamp_ns <= _MAX_GAP_NS
+
+    def spans(self, stamp_ns: int, slack_ns: int) -> bool:
+        """Return whether an instant lies among the poses, or so near them."""
+        return bool(self._poses) and (self._poses[0].stamp_ns - slack_ns <= stamp_ns
+                                      <= self._poses[-1].stamp_ns + slack_ns)
 
     def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
             ) -> bool:
@@ -74,12 +90,13 @@ class OdometryWindow:
         """
         values = np.concatenate([position, quat_xyzw])
         length = float(np.linalg.norm(quat_xyzw))
-        if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE:
+        if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE \
+                or np.abs(position).max() > _FARTHEST_M:
             return False
         pose = _Pose(stamp_ns, np.asarray(position, dtype=np.float64), quat_xyzw / length)
         poses = self._poses
         if poses and (stamp_ns < poses[-1].stamp_ns - _MAX_LATE_NS or _jumps(poses, pose)):
-            poses.clear()
+            self.clear()
         row = bisect_left(poses, stamp_ns, key=lambda one: one.stamp_ns)
         if row < len(poses) and poses[row].stamp_ns == stamp_ns:
             poses[row] = pose
@@ -128,4 +145,6 @@ def _jumps(poses: list[_Pose], pose: _Pose) -> bool:
         return False
     seconds = (pose.stamp_ns - newest.stamp_ns) / _NS_PER_S
     distance = float(np.linalg.norm(pose.position - newest.position))
-    return distance > _MAX_SPEED_M_S * seconds + _SLACK_M
+    turned = 2.0 * np.arccos(min(1.0, abs(float(newest.quat_xyzw @ pose.quat_xyzw))))
+    return bool(distance > _MAX_SPEED_M_S * seconds + _SLACK_M
+                or turned > _MAX_TURN_RAD_S * seconds + _SLACK_RAD)

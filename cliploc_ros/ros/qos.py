@@ -17,8 +17,8 @@ DETECTIONS_IN = CAMERA_INFO
 # A burst of the fastest usual IMU while something else is called back.
 IMU = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                  reliability=ReliabilityPolicy.BEST_EFFORT)
-# Of odometry the newest is the one that counts.
-ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
+# The same of the fastest usual odometry.
+ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                   reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                             reliability=ReliabilityPolicy.RELIABLE)

@@ -23,16 +23,16 @@ class Flights[T]:
     ----------
     fly : callable
         Makes the answer. It takes a function to call when it departs: who boards later is not
-        taken along.
+        taken along; and how long it may wait for that [s].
     """
 
-    def __init__(self, fly: Callable[[Callable[[], None]], T]) -> None:
+    def __init__(self, fly: Callable[[Callable[[], None], float], T]) -> None:
         self._fly = fly
         self._lock = threading.Lock()
         self._boarding: Future[T] | None = None
 
-    def board(self) -> T:
-        """Return the answer of the next flight, and fly it if nobody does yet."""
+    def board(self, timeout_s: float) -> T:
+        """Return the answer of the next flight, and fly it, in that time, if nobody does yet."""
         with self._lock:
             flight = self._boarding
             if flight is None:
@@ -40,7 +40,7 @@ class Flights[T]:
         if flight is not None:
             return flight.result()
         try:
-            own.set_result(self._fly(self._depart))
+            own.set_result(self._fly(self._depart, timeout_s))
         except BaseException as error:
             own.set_exception(error)
         finally:

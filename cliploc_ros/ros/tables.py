@@ -8,6 +8,7 @@ from typing import Any
 
 from cliploc_ros.core.association import MATCHINGS
 from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
+from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.parameters import ParameterRow, Value
 from cliploc_ros.ros.vertical import SOURCES
@@ -86,6 +87,10 @@ RELOCALIZER = (
                  high=1000),
     ParameterRow('min_confidence', 0.99, 'A pose that is within 1 m with less probability is '
                  'refused.', low=0.0, high=1.0),
+    ParameterRow('fuse_frames', 5, 'The most frames that are asked about together where odom '
+                 'joins them; 1: each alone.', low=1, high=MAX_FRAMES),
+    ParameterRow('fuse_window_s', 5.0, 'Older frames are not asked about any more.', unit='s',
+                 low=0.1, high=60.0),
     ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
                  "'tvmonitor=tv, pottedplant=potted plant'."),
     ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),

@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that looks about until it knows where it is: frames joined by odometry on the wire."""
+
+import time
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from conftest import RELIABLE, make_frame, transform_of, wait_for
+from nav_msgs.msg import Odometry
+from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from std_msgs.msg import Header
+
+from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.transforms import (
+    invert_transform,
+    make_transform,
+    transform_from_pose,
+)
+from cliploc_ros.ros.conversions import pose_to_msg
+
+ROOM = make_room()
+# The camera looks along the base's x axis, and turns about the base's z axis.
+MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
+BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
+MAP_FROM_BASE = MAP_FROM_CAMERA @ invert_transform(BASE_FROM_CAMERA)
+ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
+                               np.array([3.0, -4.0, 1.0]))
+START_S = 100.0
+# Of each view only so many boxes, those nearest to its middle: one less than is believed.
+BOXES = 3
+PARAMETERS = {'base_frame': 'base_link', 'base_from_camera': MOUNT, 'algorithm': 'auto',
+              'min_inliers': BOXES + 1, 'timeout_s': 20.0}
+
+
+def make_stamp(seconds):
+    return Time(sec=int(seconds), nanosec=round((seconds % 1) * 1e9))
+
+
+def turned(yaw_deg):
+    """Where the robot's base is when it has turned on the spot."""
+    turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
+    return MAP_FROM_BASE @ make_transform(turn, np.zeros(3))
+
+
+def look(yaw_deg, stamp_s):
+    """The messages of a frame of a robot that turned."""
+    camera_from_map = invert_transform(turned(yaw_deg) @ BASE_FROM_CAMERA)
+    in_front = np.nonzero(ROOM.centers @ camera_from_map[2, :3] + camera_from_map[2, 3] > 1.0)[0]
+    outlines = project_ellipsoids(camera_from_map, ROOM.centers[in_front], ROOM.shapes[in_front])
+    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    aside = np.abs(0.5 * (boxes[:, 0] + boxes[:, 2]) - CAMERA.cx)
+    middle = np.sort(np.argsort(aside)[:BOXES])
+    return make_frame(Detections(boxes[middle], tuple(ROOM.class_ids[in_front[row]]
+                                                      for row in middle),
+                                 np.full(len(middle), 0.9)), stamp_s)
+
+
+def swept(now_s, turn_deg_s):
+    """The yaw of a robot that looks to and fro over 48 degrees."""
+    return abs((turn_deg_s * (now_s - START_S) + 48.0) % 96.0 - 48.0) - 24.0
+
+
+class Robot:
+    """Says all the while where it is, and turns on the spot while it is asked."""
+
+    def __init__(self, tester):
+        self._tester = tester
+        self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
+        self._now_s = START_S
+
+    def close(self):
+        self._tester.destroy_publisher(self._odom)
+
+    def step(self, turn_deg_s, change):
+        """Turn for 0.12 s, with an image between two messages of odometry."""
+        for tick in range(6):
+            odometry = Odometry(child_frame_id='base_link', header=Header(
+                frame_id='odom', stamp=make_stamp(self._now_s)))
+            odometry.pose.pose = pose_to_msg(ODOM_FROM_MAP
+                                             @ turned(swept(self._now_s, turn_deg_s)))
+            change(odometry, self._now_s)
+            self._odom.publish(odometry)
+            self._now_s = START_S + 0.02 * round((self._now_s - START_S) / 0.02 + 1)
+            if tick == 2:
+                stamp_s = self._now_s - 0.01
+                self._tester.publish(look(swept(stamp_s, turn_deg_s), stamp_s))
+        for _ in range(8):
+            self._tester.spin()
+
+    def ask(self, turn_deg_s, change=lambda odometry, now_s: None):
+        """Ask, and turn until there is an answer; return it."""
+        future = self._tester.ask()
+        wait_for(future.done, 'an answer', work=lambda: self.step(turn_deg_s, change))
+        return future.result()
+
+
+@pytest.fixture
+def robot(tester):
+    robot = Robot(tester)
+    yield robot
+    robot.close()
+
+
+@pytest.fixture(scope='module')
+def looking(start_shared, tester, room_map):
+    """A relocalizer of the robot's camera, ready to be asked."""
+    process = start_shared('nodes.relocalizer', parameters={
+        'map_file': room_map, 'matching': 'class', **PARAMETERS})
+    process.wait_for_output('ready after')
+    tester.connect()
+    yield process
+    assert process.alive and 'Traceback' not in process.output()
+
+
+def test_continuous_mode_joins_frames(own_relocalizer, tester, robot):
+    # first of all: those below share one process
+    process = own_relocalizer(mode='continuous', **PARAMETERS)
+    wait_for(lambda: tester.poses or not process.alive, 'a pose',
+             work=lambda: robot.step(20.0, lambda odometry, now_s: None))
+    error = error_of(tester.poses[0], 20.0)
+    assert np.linalg.norm(error[:3]) < 0.05
+    assert not tester.initial_poses
+
+
+def test_no_view_alone_is_enough(looking, tester):
+    for yaw_deg in np.arange(-24.0, 25.0, 4.0):
+        answer = tester.relocalize(look(yaw_deg, 10.0))
+        assert not answer.success and 'frames' not in answer.message, answer.message
+
+
+def error_of(pose, turn_deg_s):
+    """The error of a pose published: of x, y, z [m] and about the map's axes [rad]."""
+    stamp_s = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec
+    found, truth = transform_of(pose.pose.pose), turned(swept(stamp_s, turn_deg_s))
+    return np.r_[truth[:3, 3] - found[:3, 3],
+                 Rotation.from_matrix(truth[:3, :3] @ found[:3, :3].T).as_rotvec()]
+
+
+def test_a_robot_that_turns_wakes_up(looking, tester, robot):
+    answer = robot.ask(turn_deg_s=20.0)
+    assert answer.success, answer.message
+    assert ' frames in ' in answer.message
+    tester.wait(lambda: tester.poses and tester.initial_poses, 'the pose')
+    error = error_of(tester.poses[-1], 20.0)
+    covariance = np.array(tester.poses[-1].pose.covariance).reshape(6, 6)
+    print(f'\n{answer.message}: {np.linalg.norm(error[:3]):.4f} m, '
+          f'{np.degrees(np.linalg.norm(error[3:])):.3f} deg')
+    assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < np.radians(1.0)
+    assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.95, 6)
+    assert np.sqrt(np.diag(covariance)[:3]).max() < 0.5
+
+
+def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
+    assert tester.set_parameter('timeout_s', 2.0).successful
+    start = time.monotonic()
+    answer = robot.ask(turn_deg_s=0.0)
+    took_s = time.monotonic() - start
+    assert tester.set_parameter('timeout_s', PARAMETERS['timeout_s']).successful
+    assert not answer.success
+    assert answer.message.startswith('refused: ') and ' frames in ' in answer.message
+    assert 1.5 < took_s < 10.0
+    assert not tester.poses and not tester.initial_poses
+
+
+def jump(odometry, now_s):
+    """Odometry that is reset twice a second, to a place and a heading that mean nothing."""
+    run = int(2.0 * now_s)
+    odometry.pose.pose = pose_to_msg(
+        make_transform(Rotation.from_euler('z', 2.4 * run).as_matrix(),
+                       np.array([7.0 * (run % 5), -3.0 * run, 0.0]))
+        @ transform_of(odometry.pose.pose))
+
+
+def go_back(odometry, now_s):
+    """A clock that is set back now and then."""
+    if int(10.0 * now_s) % 5 == 0:
+        odometry.header.stamp = make_stamp(now_s - 50.0)
+
+
+def break_off(odometry, now_s):
+    """Every third message is no pose."""
+    if round(50.0 * now_s) % 3 == 0:
+        odometry.pose.pose.position.x = np.nan
+        odometry.pose.pose.orientation.w = np.inf
+
+
+@pytest.mark.parametrize('change', [jump, go_back, break_off])
+def test_bad_odometry_does_no_harm(looking, tester, robot, change):
+    """At worst the robot is not sure; what is accepted is right."""
+    assert tester.set_parameter('timeout_s', 5.0).successful
+    answer = robot.ask(20.0, change)
+    assert tester.set_parameter('timeout_s', PARAMETERS['timeout_s']).successful
+    assert answer.success or answer.message.startswith('refused: '), answer.message
+    if change is break_off:
+        assert answer.success, answer.message
+    if answer.success:
+        tester.wait(lambda: tester.poses, 'the pose')
+        error = error_of(tester.poses[-1], 20.0)
+        assert np.linalg.norm(error[:3]) < 0.1 and np.linalg.norm(error[3:]) < np.radians(2.0)
+
+
+def test_frames_can_be_kept_apart(looking, tester, robot):
+    assert tester.set_parameter('fuse_frames', 1).successful
+    answer = robot.ask(20.0)
+    assert tester.set_parameter('fuse_frames', 5).successful
+    assert not answer.success and ' frames in ' not in answer.message
