@@ -28,9 +28,9 @@ def make_room() -> LandmarkMap:
         rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
 
 
-def see_room(room: LandmarkMap) -> Detections:
+def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     """What a perfect detector sees of the room, one box for each landmark in its order."""
-    outlines = project_ellipsoids(invert_transform(MAP_FROM_CAMERA), room.centers, room.shapes)
+    outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers, room.shapes)
     boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
     return Detections(boxes, room.class_ids, np.full(len(room), 0.9))
 

@@ -93,7 +93,8 @@ class YoloDetector:
     Ultralytics' checkpoints are pickles, which can run code of their own. They are read in
     ultralytics' restricted mode (``weights_only=True`` and a list of known classes), which
     refuses that. An ultralytics without this mode, or a PyTorch before 2.6, falls back to plain
-    pickles: then a warning says to load only files from a source that you trust.
+    pickles: then only a file that the options name by its path is loaded, and a warning says to
+    load none from a source that you do not trust.
 
     Parameters
     ----------
@@ -200,11 +201,18 @@ def import_ultralytics() -> Any:
     ultralytics_logger.handlers.clear()
     ultralytics_logger.propagate = True
     ultralytics_logger.setLevel(logging.WARNING)
-    if not (getattr(ultralytics.utils, 'SAFE_LOAD', False)
-            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint')):
+    if not _is_restricted(ultralytics):
         logger.warning('ultralytics %s with torch %s runs code that weights may hold: load only '
                        'files that you trust', ultralytics.__version__, torch.__version__)
     return ultralytics
+
+
+def _is_restricted(ultralytics: Any) -> bool:
+    """Return whether weights are read as weights only, and what else they hold is refused."""
+    import torch
+
+    return (getattr(ultralytics.utils, 'SAFE_LOAD', False)
+            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
 
 
 def _resolve_file(options: YoloOptions) -> Path:
@@ -215,10 +223,12 @@ def _resolve_file(options: YoloOptions) -> Path:
         return file
     name = options.model if options.model.endswith('.pt') else f'{options.model}.pt'
     folder = resolve_cache_dir(options.cache_dir) / 'weights'
+    if not _is_restricted(import_ultralytics()):
+        raise ModelError(f'this ultralytics or PyTorch would run code that {name} may hold: '
+                         'update them, or set the model to the path of a file that you trust')
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
-    import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
 
     if name not in GITHUB_ASSETS_NAMES:

@@ -67,6 +67,10 @@ class Process:
         """Return how many files, sockets and the like are open."""
         return len(list(Path(f'/proc/{self._popen.pid}/fd').iterdir()))
 
+    def threads(self):
+        """Return how many threads run."""
+        return len(list(Path(f'/proc/{self._popen.pid}/task').iterdir()))
+
     def wait_for_import(self, library):
         """Wait until a part of a library is in memory: its loading has begun."""
         maps = Path(f'/proc/{self._popen.pid}/maps')
