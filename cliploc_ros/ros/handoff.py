@@ -79,7 +79,7 @@ class HandOff:
         self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'])
         self._publisher.publish(usable_pose(pose, self._node.get_clock().now()))
         for _ in range(values['nomotion_updates']):
-            if self._stopped.wait(_UPDATE_PERIOD_S) or not self._updater.service_is_ready():
+            if not self._updater.service_is_ready() or self._stopped.wait(_UPDATE_PERIOD_S):
                 return
             answered = threading.Event()
             self._updater.call_async(Empty.Request()).add_done_callback(
