@@ -213,7 +213,8 @@ class RelocalizerNode(ManagedNode):
         try:
             self._handoff.hand_over(answer.pose, self.settings.snapshot())
         except HandOffError as error:
-            return Answer(None, f'withheld: {error} ({answer.message})')
+            return Answer(None, f'withheld: {error} ({answer.message})',
+                          is_open=self.settings['fuse_frames'] > 1)
         return answer
 
     def _conclude(self, verdict: str) -> None:

@@ -78,6 +78,21 @@ def test_the_last_frame_is_the_one_asked_about(room, walk):
         assert pose_error(found.map_from_camera, walk[last]) < (0.01, 0.2)
 
 
+def test_what_was_searched_before_is_not_searched_again(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    frames, searched = [see(room, pose) for pose in walk], []
+    for count in range(1, 5):
+        at_once = relocalizer.relocalize(frames[:count])
+        bit_by_bit = relocalizer.relocalize(frames[:count], searched)
+        assert len(searched) == count
+        np.testing.assert_array_equal(bit_by_bit.map_from_camera, at_once.map_from_camera)
+        np.testing.assert_array_equal(bit_by_bit.covariance, at_once.covariance)
+        assert (bit_by_bit.confidence, bit_by_bit.tried) == (at_once.confidence, at_once.tried)
+    impatient = Relocalizer(room, replace(OPTIONS, time_budget_s=1e-6))
+    assert impatient.relocalize(frames).coverage < 1.0
+    assert impatient.relocalize(frames, searched).coverage == 1.0
+
+
 def test_one_frame_needs_no_odometry_and_is_not_changed_by_it(room, walk):
     relocalizer, frame = Relocalizer(room, OPTIONS), see(room, walk[1])
     without = relocalizer.relocalize([replace(frame, odom_from_camera=None)])

@@ -167,6 +167,17 @@ def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
     assert not tester.poses and not tester.initial_poses
 
 
+def test_a_robot_that_stops_in_time_is_handed_over(looking, tester, robot):
+    def drive_on(odometry, now_s):
+        odometry.twist.twist.angular.z = 0.0 if tester.poses else 0.5
+    answer = robot.ask(20.0, drive_on)
+    assert answer.success, answer.message
+    tester.wait(lambda: tester.initial_poses, 'the initial pose')
+    assert len(tester.initial_poses) == 1
+    assert len(tester.poses) > 1, 'accepted before, but moving'
+    assert np.linalg.norm(error_of(tester.initial_poses[0], 20.0)) < 0.05
+
+
 def jump(odometry, now_s):
     """Odometry that is reset twice a second, to a place and a heading that mean nothing."""
     run = int(2.0 * now_s)

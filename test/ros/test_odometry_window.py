@@ -85,7 +85,7 @@ def test_what_is_not_known_is_said(moment, named):
 @pytest.mark.parametrize(('position', 'quat_xyzw'), [
     ([np.nan, 0.0, 0.0], UPRIGHT), ([0.0, np.inf, 0.0], UPRIGHT),
     ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, np.nan, 1.0]),
-    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0])])
+    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0]), ([1e300, 0.0, 0.0], UPRIGHT)])
 def test_what_is_no_pose_is_left_out(position, quat_xyzw):
     window = OdometryWindow(10.0)
     drive(window, (0.0, 1.0))
@@ -107,8 +107,29 @@ def test_a_clock_set_back_begins_anew():
 def test_odometry_that_was_reset_joins_nothing_across_it():
     window = OdometryWindow(10.0)
     drive(window, (50.0, 51.0))
+    run = window.run
     window.add(51 * S, np.zeros(3), UPRIGHT)  # 51 m away
-    assert len(window) == 1
+    assert len(window) == 1 and window.run == run + 1
     drive(window, (51.1, 51.3), speed_m_s=0.01)
     with pytest.raises(NoOdometryError, match='newer than the image'):
         window.pose_at(round(50.5 * S))
+
+
+def test_odometry_that_was_reset_where_it_began_is_told_by_its_heading():
+    window = OdometryWindow(10.0)
+    drive(window, (50.0, 53.0), speed_m_s=0.0)
+    window.add(round(53.0 * S), np.zeros(3), turned(89.0))
+    assert len(window) == 31
+    window.add(round(53.02 * S), np.zeros(3), UPRIGHT)
+    assert len(window) == 1
+
+
+def test_it_tells_what_it_may_know_of():
+    window = OdometryWindow(10.0)
+    assert not window.spans(0, S) and not window.is_ahead(0)
+    drive(window, (5.0, 7.0))
+    for moment, spans, is_ahead in ((3.9, False, False), (4.1, True, False), (6.0, True, False),
+                                    (6.9, True, False), (7.3, True, True), (7.5, True, False),
+                                    (8.0, False, False)):
+        assert window.spans(round(moment * S), S) == spans
+        assert window.is_ahead(round(moment * S)) == is_ahead
