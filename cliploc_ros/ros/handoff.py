@@ -76,6 +76,10 @@ class HandOff:
         HandOffError
             The robot moves, or nobody can tell; nothing was published.
         """
+        if not values['base_frame']:
+            self._node.get_logger().warning(
+                "initialpose carries the camera's pose, for base_frame is empty: set it to what "
+                'AMCL calls base_frame_id, where AMCL listens', once=True)
         self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'])
         self._publisher.publish(usable_pose(pose, self._node.get_clock().now()))
         for _ in range(values['nomotion_updates']):
