@@ -1,36 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Many requests, and several robots on one network."""
-
-import os
+"""Several robots on one network."""
 
 from conftest import class_matching, make_frame
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_srvs.srv import Trigger
-
-from cliploc_ros.ros.conversions import stamp_ns
-
-# A soak takes 10,000 and half an hour; the first tenth is for what is loaded when first needed.
-REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '40'))
-
-
-def test_no_request_is_lost_or_answered_twice_and_memory_stays(own_relocalizer, tester):
-    process = own_relocalizer()
-    memory_mib, descriptors = [], []
-    for number in range(REQUESTS):
-        tester.forget()
-        assert tester.relocalize(make_frame(stamp_s=float(number))).success
-        tester.wait(lambda: tester.initial_poses, 'an initial pose')
-        stamps_s = {stamp_ns(pose.header.stamp) // 10**9 for pose in tester.initial_poses}
-        assert (len(tester.initial_poses), stamps_s) == (1, {number})
-        memory_mib.append(process.memory_mib())
-        descriptors.append(process.descriptors())
-    warm = REQUESTS // 10
-    growth = memory_mib[-1] / memory_mib[warm] - 1
-    print(f'\n{REQUESTS} requests: {memory_mib[warm]:.0f} to {memory_mib[-1]:.0f} MiB '
-          f'({100 * growth:+.2f} %), {descriptors[warm]} to {descriptors[-1]} file descriptors')
-    assert growth < 0.02
-    assert descriptors[-1] <= descriptors[warm] + 2
 
 
 def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_map, tmp_path):
