@@ -304,7 +304,6 @@ class RelocalizerNode(ManagedNode):
                                       throttle_duration_sec=_LOG_PERIOD_S)
             return None
 
-
     def _place(self, frame: Frame, values: Mapping[str, Any],
                camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
         """Return where odometry has the camera; without that the frame is asked about alone."""
@@ -323,8 +322,9 @@ class RelocalizerNode(ManagedNode):
 
 
 def _summary(found: Relocalization) -> str:
-    return (f'score {found.score:.2f}, {len(found.matches)} inliers, '
-            f'{found.tried} hypotheses, {100 * found.coverage:.3g} % of the search')
+    return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
+            f'{len(found.matches)} inliers, {found.tried} hypotheses, '
+            f'{100 * found.coverage:.3g} % of the search')
 
 
 def main() -> NoReturn:
