@@ -76,7 +76,9 @@ class DemoOptions:
         """Return the relocalizer's parameters that are not its defaults."""
         matching, _, algorithm = self.method.partition('_')
         parameters: dict[str, object] = {'map_file': self.assets / 'map.yaml',
-                                         'matching': matching, 'algorithm': algorithm}
+                                         'matching': matching, 'algorithm': algorithm,
+                                         # searches that the clock cuts are not to be repeated
+                                         'time_budget_ms': 10_000.0}
         if matching != 'class':
             parameters |= {'clip_model': self.assets / 'clip.json',
                            'clip_pretrained': self.assets / 'clip.safetensors'}

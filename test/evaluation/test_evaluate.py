@@ -28,6 +28,7 @@ ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
+           'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')
 TIMEOUT_S = 300.0  # with networks, on a machine that does other things too
 
@@ -226,7 +227,7 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag):
     assert results == results_of(walk / 'from_saved')
     # a bag's quaternions are rounded once more
     for one, other in zip(results, results_of(walk / 'from_tum'), strict=True):
-        for name in ('error_m', 'error_deg'):
+        for name in ('error_m', 'error_deg', 'nees', 'confidence'):
             assert one.pop(name) == pytest.approx(other.pop(name), abs=1e-6)
         assert one == other
     results = results_of(walk / 'from_bag')

@@ -39,4 +39,3 @@ def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['nodes']
     assert np.mean(errors_m < 0.5) >= limits['success_at_half_a_metre']
     assert wrong <= limits['accepted_wrong_by_1m']
-    assert sum(not answer.success for answer, _ in answers.values()) >= limits['refused']

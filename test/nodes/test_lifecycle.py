@@ -3,6 +3,7 @@
 """Both nodes are managed: every transition over the real services, in any order."""
 
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -31,6 +32,14 @@ class Manager:
         self._get = tester.create_client(GetState, f'/{name}/get_state')
         for client in (self._change, self._get):
             tester.wait(client.service_is_ready, client.srv_name)
+        # ready here is not yet ready there: the first answers may be lost
+        asked = []
+
+        def answered():
+            if not asked or time.monotonic() > asked[-1][0] + 2.0:
+                asked.append((time.monotonic(), self._get.call_async(GetState.Request())))
+            return any(future.done() for _, future in asked)
+        tester.wait(answered, 'a state')
 
     def change(self, transition_id):
         request = ChangeState.Request(transition=Transition(id=transition_id))

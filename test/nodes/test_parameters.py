@@ -33,7 +33,7 @@ def write_dump(values, name, path):
 
 def test_a_dump_starts_the_same_relocalizer(start, tester, room_map, tmp_path):
     first = start('nodes.relocalizer', '--ros-args', '--params-file', room_map, parameters={
-        **class_matching("''"), 'timeout_s': 3, 'random_seed': -1,
+        **class_matching("''"), 'timeout_s': 3, 'random_seed': -1, 'base_frame': 'base_link',
         'base_from_camera': '[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]'})
     first.wait_for_output('12 landmarks')
     tester.connect()
@@ -75,7 +75,7 @@ def test_tools_see_what_a_parameter_allows(own_relocalizer, tester):
     timeout, k, matching = described
     assert timeout.description == 'How long a request waits for fresh frames. [s]'
     assert timeout.floating_point_range[0].to_value == 3600.0
-    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (1, 1000)
+    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (0, 1000)
     assert (timeout.read_only, k.read_only, matching.read_only) == (False, False, True)
 
 
