@@ -27,6 +27,10 @@ from cliploc_ros.core.transforms import make_transform
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 
 
+def _unit_rows(rows):
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
 def make_world(count, seed=0, classes=12):
     """A map around a camera at its origin, and what this sees of it."""
     rng = np.random.default_rng(seed)
@@ -34,7 +38,7 @@ def make_world(count, seed=0, classes=12):
     names = tuple(f'class {number}' for number in rng.integers(0, classes, count))
     landmark_map = LandmarkMap('map', tuple(map(str, range(count))), names, names, centers,
                                rng.uniform(0.1, 0.4, (count, 3)),
-                               Rotation.random(count, rng=seed).as_quat())
+                               _unit_rows(np.random.default_rng(seed).normal(size=(count, 4))))
     boxes = ellipse_bboxes(project_ellipsoids(np.eye(4), centers, landmark_map.shapes))
     seen = np.nonzero((np.abs(boxes) < 0.6).all(axis=1))[0][:10]
     pixels = 500 * (boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))) + [320, 240, 320, 240]

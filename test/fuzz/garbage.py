@@ -23,7 +23,7 @@ from vision_msgs.msg import (
 from cliploc_ros.messages import _CHANNELS
 
 #: So many cases a property by default; CLIPLOC_FUZZ_CASES=10000 asks for more.
-CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '500')), deadline=None,
+CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '200')), deadline=None,
                  derandomize=True)
 
 uint32 = st.integers(0, 2**32 - 1)

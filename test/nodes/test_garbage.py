@@ -8,7 +8,7 @@ import numpy as np
 from conftest import make_frame
 from vision_msgs.msg import BoundingBox2D, Detection2D, ObjectHypothesis, ObjectHypothesisWithPose
 
-CASES = int(os.environ.get('CLIPLOC_FUZZ_CASES', '500'))
+CASES = int(os.environ.get('CLIPLOC_FUZZ_CASES', '300'))
 
 
 def garble(frame, rng):
