@@ -15,7 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 # What each transition makes of each state where it is possible.
 #: Transitions in any order; 100 take two minutes a node.
-MANY = int(os.environ.get('CLIPLOC_TRANSITIONS', '50'))
+MANY = int(os.environ.get('CLIPLOC_TRANSITIONS', '30'))
 TRANSITIONS = {('unconfigured', 'configure'): 'inactive', ('inactive', 'activate'): 'active',
                ('active', 'deactivate'): 'inactive', ('inactive', 'cleanup'): 'unconfigured'}
 IDS = {'configure': Transition.TRANSITION_CONFIGURE, 'activate': Transition.TRANSITION_ACTIVATE,
@@ -97,7 +97,7 @@ def test_many_transitions_in_any_order_leak_nothing(manage, tmp_path, name):
         assert manager.state == state
         if state == 'unconfigured' and possible:
             measured.append((process.memory_mib(), process.descriptors()))
-    assert len(measured) >= MANY // 20
+    assert len(measured) >= 3
     # the first round loads PyTorch itself, which stays
     (before_mib, before_fds), (after_mib, after_fds) = measured[1], measured[-1]
     print(f'\n{name} after {len(measured)} cleanups: {before_mib:.0f} to {after_mib:.0f} MiB, '
