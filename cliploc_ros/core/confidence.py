@@ -32,6 +32,8 @@ _AGREEING_TRACE = 1.0 + 2.0 * np.cos(np.radians(45.0))
 # Of a box's edge, as a share of its mean side, and on the plane z = 1.
 _EDGE_DEVIATION = (0.2, 0.003)
 _BARE_INLIERS = 3
+# The log odds that a vertical said to be known is right: one mount of a hundred is wrong.
+_TILTED_PENALTY = 4.6
 # No recording is long enough to claim more.
 _MOST_CONFIDENCE = 0.9999
 # Of labels: so many tell the mean and the deviation of a crop's similarities to 2 %.
@@ -169,7 +171,8 @@ def _told(view: View, map_from_camera: NDArray[np.float64], matches: Sequence[Ma
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
-                calibration: Calibration = DEFAULT) -> NDArray[np.float64]:
+                calibration: Calibration = DEFAULT, upright: NDArray[np.bool_] | None = None
+                ) -> NDArray[np.float64]:
     """Return how likely each hypothesis is within 1 m of the truth.
 
     Parameters
@@ -178,6 +181,8 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     poses : ndarray (m, 4, 4)
         The same hypotheses' map_from_camera.
     calibration : Calibration, optional
+    upright : ndarray (m,) of bool, optional
+        Which of them were found by a known vertical; where none is known, all.
 
     Returns
     -------
@@ -185,6 +190,8 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
         0 to 1; what is left to 1 says that another pose is right, or none of these.
     """
     utilities = np.array([_utility(one, calibration) for one in supports])
+    if upright is not None:
+        utilities[~upright] -= _TILTED_PENALTY
     shares = np.exp(np.append(utilities, calibration.none_right)
                     - max(utilities.max(), calibration.none_right))
     shares = shares[:-1] / shares.sum()

@@ -41,6 +41,8 @@ class Searched(NamedTuple):
     progress : Progress
     samples : ndarray (t, 3) or None
         What was tried; None: all samples of the first candidates, as far as progress reaches.
+    tilted : Leaders or None
+        Where the vertical is known, the best that did not ask for it.
     """
 
     scene: Scene
@@ -48,6 +50,7 @@ class Searched(NamedTuple):
     leaders: Leaders
     progress: Progress
     samples: NDArray[np.int64] | None
+    tilted: Leaders | None = None
 
 
 class Finalist(NamedTuple):

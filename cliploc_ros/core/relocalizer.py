@@ -4,7 +4,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +18,14 @@ from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.confidence import Support, View, confidences, support
 from cliploc_ros.core.ellipsoid import project_ellipsoids
 from cliploc_ros.core.finalists import (
+    Finalist,
     Searched,
     covariance_of,
     find_finalists,
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fusion import choose_distinct, make_rig, refine_all, verify_rig
+from cliploc_ros.core.fusion import Rig, choose_distinct, make_rig, refine_all, verify_rig
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Observation
@@ -232,7 +233,9 @@ class Relocalizer:
             return Searched(scene, vertical, leaders, Progress(0, 1.0), None)
         progress, samples = self._search(scene, vertical, leaders, deadline)
         progress = progress._replace(coverage=progress.coverage * share)
-        return Searched(scene, vertical, leaders, progress, samples)
+        tilted, tried = self._search_tilted(scene, vertical, deadline)
+        progress = progress._replace(tried=progress.tried + tried)
+        return Searched(scene, vertical, leaders, progress, samples, tilted)
 
     def _vertical(self, observation: Observation) -> NDArray[np.float64]:
         """Return the vertical as make_rig takes it; the paper's algorithms know of none."""
@@ -269,12 +272,21 @@ class Relocalizer:
             seed = options.random_seed if options.random_seed >= 0 else None
             samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
             search = search_samples(scene, samples, leaders, prior)
-        progress = Progress(0, 1.0)
-        for step in search:
-            progress = step
-            if time.perf_counter() > deadline:
-                break
-        return progress, samples
+        return _run(search, deadline), samples
+
+    def _search_tilted(self, scene: Scene, vertical: NDArray[np.float64], deadline: float
+                       ) -> tuple[Leaders, int]:
+        """Search poses that do not ask for the vertical; return how many were tried, too.
+
+        Where what is said to be the vertical is wrong, as by a wrong mount, what the boxes say by
+        themselves must be among the rivals of what it leads to.
+        """
+        leaders = Leaders.none_yet()
+        if not vertical[6] > 0.0:
+            return leaders, 0
+        search = search_progressively(scene, compatible_pairs(scene), leaders,
+                                      self._prior(vertical), self._options.iterations)
+        return leaders, _run(search, deadline).tried
 
     def _conclude(self, observations: Sequence[Observation], frames: Sequence[Searched],
                   cameras: NDArray[np.float64], start: float) -> Relocalization:
@@ -289,12 +301,15 @@ class Relocalizer:
         coverage = min(one.progress.coverage for one in frames)
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]))
-        finalists = find_finalists(frames, rig, self._options.refine, _REFINED,
-                                   start + _REFINED_SHARE * self._options.time_budget_s)
+        deadline = start + _REFINED_SHARE * self._options.time_budget_s
+        finalists = find_finalists(frames, rig, self._options.refine, _REFINED, deadline)
         if not finalists:
             return Relocalization(False, 'no pose explains any three detections', tried=tried,
                                   coverage=coverage, search_ms=_elapsed_ms(start),
                                   stamp_ns=stamp_ns)
+        upright = np.arange(len(finalists) + MAX_DISTINCT) < len(finalists)
+        finalists += self._tilted_rivals(finalists, frames, rig, deadline)
+        upright = upright[:len(finalists)]
         best, explained = finalists[0], [matches_of(rig, one) for one in finalists]
         covariance = covariance_of(frames, rig, best, explained[0])
         poses = np.array([one.map_from_camera for one in finalists])
@@ -303,7 +318,7 @@ class Relocalizer:
         last_from_cameras = np.linalg.inv(cameras)
         supports = [support(views, pose @ last_from_cameras, matches)
                     for pose, matches in zip(poses, explained, strict=True)]
-        likely = confidences(supports, poses)
+        likely = confidences(supports, poses, upright=upright)
         evidence = Evidence(
             supports[0].inliers, likely[0], max(likely[1:], default=0.0), coverage,
             # those that boxes contradict were looked at too
@@ -316,6 +331,17 @@ class Relocalizer:
                                likely * evidence.found, supports))
         return Relocalization(not reason, reason, hypotheses, explained[0][-1], covariance,
                               tried, best.iteration, coverage, _elapsed_ms(start), stamp_ns)
+
+    def _tilted_rivals(self, finalists: Sequence[Finalist], frames: Sequence[Searched], rig: Rig,
+                       deadline: float) -> list[Finalist]:
+        """Return the best poses elsewhere that did not ask for a known vertical."""
+        if not frames[-1].vertical[6] > 0.0:
+            return []
+        tilted = [one._replace(leaders=one.tilted or Leaders.none_yet()) for one in frames]
+        return [one for one in find_finalists(tilted, rig, self._options.refine, MAX_DISTINCT,
+                                              deadline)
+                if not any(same_place(one.rotation, one.translation, other.rotation,
+                                      other.translation) for other in finalists)]
 
 
 def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
@@ -336,6 +362,16 @@ def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float6
     for row, odom_from_camera in enumerate(joined[:-1]):
         cameras[row] = invert_transform(odom_from_camera) @ joined[-1]
     return cameras
+
+
+def _run(search: Iterator[Progress], deadline: float) -> Progress:
+    """Run a search until its end or until a deadline; return how far it came."""
+    progress = Progress(0, 1.0)
+    for step in search:
+        progress = step
+        if time.perf_counter() > deadline:
+            break
+    return progress
 
 
 def _sample_size(vertical: NDArray[np.float64]) -> int:

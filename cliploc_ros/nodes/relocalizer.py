@@ -299,7 +299,7 @@ class RelocalizerNode(ManagedNode):
         try:
             return self._vertical.up_in_camera(values, camera_from_base, header.frame_id,
                                                header.stamp)
-        except NoVerticalError as error:
+        except (NoVerticalError, FrameError) as error:
             self.get_logger().warning(f'localizing without a vertical: {error}',
                                       throttle_duration_sec=_LOG_PERIOD_S)
             return None

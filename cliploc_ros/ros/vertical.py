@@ -158,6 +158,9 @@ class VerticalSource:
         with self._lock:
             frame = self._imu_frame
             near = [one for one in self._samples if abs(one.stamp_ns - at_ns) <= _WINDOW_NS]
+        if near and not frame:
+            raise NoVerticalError("the IMU's messages have no frame_id, so nobody can say how it "
+                                  'is mounted')
         if not near:
             topic = self._node.resolve_topic_name('imu')
             raise NoVerticalError(f'no usable message of {topic} is within '

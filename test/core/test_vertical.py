@@ -77,6 +77,23 @@ def test_success_with_what_is_known(case, office_map, queries, observe, threshol
     assert not (accepted & (errors > 1.0)).any()
 
 
+@pytest.mark.parametrize('tilt_deg', [45.0, 90.0, 180.0])
+def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
+    """As by a wrong mount: what boxes say without it is among the rivals."""
+    relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
+    accepted, wrong = 0, 0
+    for frame in queries.main_frames():
+        up = frame.map_from_camera[2, :3]
+        axis = np.cross(up, rng.normal(size=3))
+        up = Rotation.from_rotvec(np.radians(tilt_deg) * axis / np.linalg.norm(axis)).apply(up)
+        found = relocalizer.relocalize([replace(observe(frame), up_in_camera=up)])
+        if found.accepted:
+            accepted += 1
+            wrong += pose_error(found.map_from_camera, frame.map_from_camera)[0] > 1.0
+    print(f'\nvertical off by {tilt_deg:g} deg: {accepted} of 52 accepted, {wrong} wrong')
+    assert wrong == 0
+
+
 def test_two_objects_and_the_vertical_fix_a_pose(room):
     """But are refused, for four are asked; and without a vertical there is none."""
     options = RelocalizerOptions(matching='class')

@@ -81,6 +81,7 @@ def test_an_imu_that_nobody_places_is_an_error(source):
 @pytest.mark.parametrize(('messages', 'named'), [
     ([], 'no usable message of /imu'),
     ([imu(seconds=51.0)], 'within 100 ms'),
+    ([imu(frame_id='')], 'no frame_id'),
     ([imu((0.0, 0.0, 11.0))], 'being moved: it measures 11.00'),
     ([imu((0.0, 0.0, 0.0))], 'being moved'),
     ([imu((float('nan'), 0.0, 9.81))], 'no usable message'),
