@@ -99,7 +99,10 @@ def test_heights_and_verticals_reach_the_search(localizer, values):
     blind, _ = localizer.localize(make_frame(), values)
     upright, _ = localizer.localize(make_frame(), values, MAP_FROM_CAMERA[2, :3])
     assert blind.accepted and upright.accepted
-    assert upright.tried < blind.tried  # pairs, not triples
+    # tilts are what a vertical makes sure
+    assert np.trace(upright.covariance[3:5, 3:5]) < np.trace(blind.covariance[3:5, 3:5])
+    askew, _ = localizer.localize(make_frame(), values, -MAP_FROM_CAMERA[2, :3])
+    assert not askew.accepted
     values['height_range_m'] = [height + 5.0, height + 6.0]
     outside, _ = localizer.localize(make_frame(), values)
     assert not outside.accepted
