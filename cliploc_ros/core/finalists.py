@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance import Match
 from cliploc_ros.core.ellipsoid import project_ellipsoids
+from cliploc_ros.core.frame_search import Searched
 from cliploc_ros.core.fusion import Rig, choose_distinct, refine_all, verify_rig
-from cliploc_ros.core.scoring import Scene, Workspace
-from cliploc_ros.core.search import MAX_DISTINCT, Leaders, Progress, same_place
+from cliploc_ros.core.scoring import Workspace
+from cliploc_ros.core.search import MAX_DISTINCT, same_place
 from cliploc_ros.core.transforms import invert_transform, make_transform, move_covariance
 from cliploc_ros.core.uncertainty import (
     box_scatter,
@@ -26,31 +27,6 @@ from cliploc_ros.core.uncertainty import (
 
 # Between so many a time limit is looked at.
 _REFINED_AT_ONCE = 4
-
-
-class Searched(NamedTuple):
-    """A frame, and what the search among its samples found.
-
-    Parameters
-    ----------
-    scene : Scene
-    vertical : ndarray (7,)
-        See make_rig.
-    leaders : Leaders
-        The best, as poses of this frame's camera.
-    progress : Progress
-    samples : ndarray (t, 3) or None
-        What was tried; None: all samples of the first candidates, as far as progress reaches.
-    tilted : Leaders or None
-        Where the vertical is known, the best that did not ask for it.
-    """
-
-    scene: Scene
-    vertical: NDArray[np.float64]
-    leaders: Leaders
-    progress: Progress
-    samples: NDArray[np.int64] | None
-    tilted: Leaders | None = None
 
 
 class Finalist(NamedTuple):

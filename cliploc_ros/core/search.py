@@ -29,12 +29,14 @@ DISTINCT_ANGLE_DEG = 20.0
 # 1 + 2 cos(angle) is the trace of a rotation.
 _DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
 
-
-#: A sample whose own three pairs overlap less than this in sum is not verified, where every
-#: sample is tried: a better one of the same place comes.
-MIN_SAMPLED_IOU = 0.9
-# The same of two pairs, see search_vertically: of noisy verticals these are looser.
-MIN_SAMPLED_PAIR_IOU = 0.2
+# A sample whose own three pairs overlap less than this in sum is not verified, where every
+# sample is tried: a better one of the same place comes.
+_MIN_SAMPLED_IOU = 0.9
+# The same of two pairs: of noisy verticals these are looser.
+_MIN_SAMPLED_PAIR_IOU = 0.2
+# How search_progressively goes through samples of each size.
+_ORDERED = {3: (enumerate_compatible_triples, _MIN_SAMPLED_IOU),
+            2: (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU)}
 # Scores nearer than this are equal, but for rounding: the hypothesis found first stays.
 _TIE = 1e-9
 # A block of a search takes about so long, so that time limits hold: this many samples at first.
@@ -159,7 +161,8 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
 
 
 def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
-                         prior: Prior | None = None, limit: float = inf) -> Iterator[Progress]:
+                         prior: Prior | None = None, limit: float = inf,
+                         size: int = SAMPLE_SIZE) -> Iterator[Progress]:
     """Try every sample of compatible candidates, those of the first candidates first.
 
     All samples among the first n candidates are tried before one with the next: what PROSAC draws
@@ -176,6 +179,10 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         Poses that it rules out are left.
     limit : float, optional
         The most samples to try.
+    size : int, optional
+        Of a sample: three; or two, which fix a pose where the prior's verticals are known to be
+        equal (see cliploc_ros.core.two_point). Then the third column of the leaders' samples
+        is -1.
 
     Yields
     ------
@@ -184,55 +191,17 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     """
     bench = set_up(scene, prior)
     count = len(scene.pairs)
-    cursor = np.array([2, 0, 1], dtype=np.int64)  # newest, first, second
+    fill_block, least_iou = _ORDERED[size]
+    cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
     pace, tried = _Pace(limit), 0
     while cursor[0] < count and not pace.at_end:
         block = pace.begin()
-        found = enumerate_compatible_triples(compatible, cursor, block)
-        _try_samples(bench, block, found, tried, MIN_SAMPLED_IOU, leaders)
+        found = fill_block(compatible, cursor, block)
+        _try_samples(bench, block, found, tried, least_iou, leaders)
         tried += found
         pace.end(found)
-        done = comb(int(cursor[0]), 3) if cursor[0] < count else comb(count, 3)
-        yield Progress(tried, done / max(comb(count, 3), 1), min(int(cursor[0]), count))
-
-
-def search_vertically(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
-                      prior: Prior, limit: float = inf) -> Iterator[Progress]:
-    """Try every pair of compatible candidates with a known vertical, the first candidates first.
-
-    Two correspondences and the vertical fix a pose (see cliploc_ros.core.two_point). Of the
-    leaders' samples the third column is -1; the reach of the progress counts candidates of which
-    all pairs were tried.
-
-    Parameters
-    ----------
-    scene : Scene
-    compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.compatibility.
-    leaders : Leaders
-        Changed in place.
-    prior : Prior
-        Its verticals are held equal; poses outside of its heights are left.
-    limit : float, optional
-        The most samples to try.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
-    """
-    bench = set_up(scene, prior)
-    count = len(scene.pairs)
-    cursor = np.array([1, 0], dtype=np.int64)  # newest, first
-    pace, tried = _Pace(limit), 0
-    while cursor[0] < count and not pace.at_end:
-        block = pace.begin()
-        found = enumerate_compatible_pairs(compatible, cursor, block)
-        _try_samples(bench, block, found, tried, MIN_SAMPLED_PAIR_IOU, leaders)
-        tried += found
-        pace.end(found)
-        done = comb(int(cursor[0]), 2) if cursor[0] < count else comb(count, 2)
-        yield Progress(tried, done / max(comb(count, 2), 1), min(int(cursor[0]), count))
+        reach = min(int(cursor[0]), count)
+        yield Progress(tried, comb(reach, size) / max(comb(count, size), 1), reach)
 
 
 class _Pace:

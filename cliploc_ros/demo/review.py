@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance import Match
 from cliploc_ros.core.camera import Camera
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.relocalizer import Relocalization
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp

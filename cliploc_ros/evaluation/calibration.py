@@ -22,7 +22,8 @@ from cliploc_ros.cli.command import run_command
 from cliploc_ros.core.confidence import DEFAULT, Calibration, Support, confidences
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search import MAX_DISTINCT
 from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.datasets.queries import load_queries

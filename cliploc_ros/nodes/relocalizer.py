@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 
-from cliploc_ros.core.relocalizer import Relocalization
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.transforms import move_covariance
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.finalists import Searched
+from cliploc_ros.core.frame_search import Searched
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.transforms import pose_error
 

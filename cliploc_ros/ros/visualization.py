@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.relocalizer import Relocalization
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.debug_image import View, draw_view
 from cliploc_ros.ros.markers import landmark_markers, match_markers, no_markers

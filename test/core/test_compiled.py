@@ -62,7 +62,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.sampling import draw_prosac
 from cliploc_ros.core.scoring import make_scene
 from cliploc_ros.core.screening import Prior
-from cliploc_ros.core.search import Leaders, search_samples, search_vertically
+from cliploc_ros.core.search import Leaders, search_progressively, search_samples
 room = make_room()
 Relocalizer(room, RelocalizerOptions()).warm_up()
 rows = slice(0, 6)
@@ -73,10 +73,10 @@ scene = make_scene(CAMERA.normalize_bboxes(seen.bboxes_xyxy[rows]), room.centers
 samples = draw_prosac(scene.pairs, 100, np.random.default_rng(0))
 up = (0.0, -1.0, 0.0)
 prior = Prior(tuple(MAP_FROM_CAMERA[:3, :3].T @ up), up)
-for search, given in ((search_samples, (samples,)), (search_vertically,
-                                                     (compatible_pairs(scene),))):
-    leaders = Leaders.none_yet()
-    list(search(scene, *given, leaders, prior))
+by_samples, by_pairs = Leaders.none_yet(), Leaders.none_yet()
+list(search_samples(scene, samples, by_samples, prior))
+list(search_progressively(scene, compatible_pairs(scene), by_pairs, prior, size=2))
+for leaders in (by_samples, by_pairs):
     ranked = leaders.ranked()
     np.savetxt(sys.stdout, np.c_[leaders.scores, leaders.iterations, leaders.samples,
                                  leaders.translations][ranked])

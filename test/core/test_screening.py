@@ -28,7 +28,6 @@ from cliploc_ros.core.search import (
     search_exhaustively,
     search_progressively,
     search_samples,
-    search_vertically,
 )
 from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
 
@@ -156,7 +155,7 @@ def test_a_prior_rules_poses_out(scene, prior, remains):
 
 def test_pairs_and_a_vertical_find_the_pose(scene):
     leaders = Leaders.none_yet()
-    steps = list(search_vertically(scene, compatible_pairs(scene), leaders, upright()))
+    steps = list(search_progressively(scene, compatible_pairs(scene), leaders, upright(), size=2))
     best = leaders.ranked()[0]
     pose = invert_transform(make_transform(leaders.rotations[best], leaders.translations[best]))
     assert pose_error(pose, MAP_FROM_CAMERA)[0] < 0.2
@@ -168,8 +167,8 @@ def test_pairs_and_a_vertical_find_the_pose(scene):
 
 def test_pairs_mind_the_height(scene):
     leaders = Leaders.none_yet()
-    list(search_vertically(scene, compatible_pairs(scene), leaders,
-                           upright(min_height=HEIGHT + 0.5)))
+    list(search_progressively(scene, compatible_pairs(scene), leaders,
+                              upright(min_height=HEIGHT + 0.5), size=2))
     for row in leaders.ranked():
         pose = invert_transform(make_transform(leaders.rotations[row],
                                                leaders.translations[row]))

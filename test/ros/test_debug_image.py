@@ -8,7 +8,8 @@ from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.ros.debug_image import View, draw_view
 
 BOX, ELLIPSE, UNMATCHED = (86, 180, 233), (230, 159, 0), (255, 255, 255)
