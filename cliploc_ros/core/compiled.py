@@ -18,13 +18,14 @@ import numpy as np
 
 try:
     from numba import njit
+    from numba.core.caching import NullCache
 except ImportError:
     njit = None
 
 logger = logging.getLogger(__name__)
 _kernels: list[Any] = []
-# What numba raises for a cache that was cut off by a power cut, or a disk that is full.
-_CACHE_ERRORS = (OSError, EOFError, pickle.UnpicklingError)
+# What numba raises for a cache that was cut off by a power cut.
+_DAMAGE = (EOFError, pickle.UnpicklingError)
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,7 +56,7 @@ def _interpreted(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def warm_up(run: Callable[[], object]) -> None:
-    """Run what calls the kernels, and mend their cache on disk where it is damaged.
+    """Run what calls the kernels; mend their cache on disk, or do without it.
 
     Parameters
     ----------
@@ -66,11 +67,21 @@ def warm_up(run: Callable[[], object]) -> None:
         try:
             run()
             return
-        except _CACHE_ERRORS as error:
-            logger.warning('compiled kernels could not be cached or read: %r; compiling anew',
-                           error)
+        except _DAMAGE as error:
+            logger.warning('cached kernels could not be read: %r; compiling anew', error)
             _forget_cache()
+        except OSError as error:  # as on a full disk: every kernel would fail, and each request
+            logger.warning('compiled kernels are not cached, so each start will take a minute '
+                           'until there is room in their folder or NUMBA_CACHE_DIR names '
+                           'another: %s', error)
+            _do_without_cache()
     run()
+
+
+def _do_without_cache() -> None:
+    """Let this process neither read nor write kernels on disk."""
+    for kernel in _kernels:
+        kernel._cache = NullCache()
 
 
 def _forget_cache() -> None:

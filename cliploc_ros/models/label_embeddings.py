@@ -73,7 +73,8 @@ class LabelCache:
             self._write(file, key, labels, embeddings)
         except OSError as error:
             logger.warning('label embeddings are not cached, so the next start will be slow '
-                           'again: cannot write %s (%s)', file, error.strerror or error)
+                           'again: cannot write %s (%s); make room there, or let cache_dir name '
+                           'a folder that can be written', file, error.strerror or error)
 
     def _write(
         self, file: Path, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]

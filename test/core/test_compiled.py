@@ -31,8 +31,8 @@ def warm_cache(tmp_path_factory):
     return folder
 
 
-def run(folder):
-    return subprocess.run([sys.executable, '-c', WARM_UP], capture_output=True, text=True,
+def run(folder, code=WARM_UP):
+    return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           cwd=PROJECT, check=False,
                           env=os.environ | {'NUMBA_CACHE_DIR': str(folder)})
 
@@ -47,6 +47,29 @@ def test_a_damaged_cache_is_mended(warm_cache, ending, size):
     assert done.stdout == 'warm\n', done.stderr
     # and is whole again
     assert 'compiling anew' not in run(warm_cache).stderr
+
+
+FULL_DISK = """
+import logging, resource
+from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.cubic import largest_cubic_root
+from cliploc_ros.core.ellipse import unit_circle_overlap
+logging.basicConfig()
+def run():
+    return largest_cubic_root(0.0, 0.0, -8.0), unit_circle_overlap(0.0, 0.0, 1.0, 1.0)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # writing fails as on a full disk
+warm_up(run)
+print(*run())
+"""
+
+
+def test_a_full_disk_costs_only_the_cache(tmp_path):
+    done = run(tmp_path, FULL_DISK)
+    assert np.array(done.stdout.split(), float) == pytest.approx([2.0, np.pi]), done.stderr
+    assert done.stderr.count('WARNING') == 1, 'not one for each kernel'
+    assert 'NUMBA_CACHE_DIR' in done.stderr
+    assert run(tmp_path, FULL_DISK.replace('(100, 100)', '(-1, -1)')).stderr == ''
+    assert list(tmp_path.rglob('*.nbc'))
 
 
 SEARCH = """

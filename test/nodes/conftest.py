@@ -38,11 +38,11 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 class Process:
     """A module of the package in its own process, with its output in a file."""
 
-    def __init__(self, module, arguments, log, **environment):
+    def __init__(self, module, arguments, log, within=(), **environment):
         self.log = log
         with log.open('w') as output:
             self._popen = subprocess.Popen(
-                [sys.executable, '-m', f'cliploc_ros.{module}', *map(str, arguments)],
+                [*within, sys.executable, '-m', f'cliploc_ros.{module}', *map(str, arguments)],
                 stdout=output, stderr=subprocess.STDOUT, cwd=PROJECT,
                 env=os.environ | environment)
 
@@ -52,6 +52,10 @@ class Process:
 
     def output(self):
         return self.log.read_text()
+
+    def sees(self, path):
+        """Return where a path of the process, which may have disks of its own, is for others."""
+        return Path(f'/proc/{self._popen.pid}/root{path}')
 
     def wait_for_output(self, text):
         wait_for(lambda: text in self.output() or not self.alive,

@@ -10,8 +10,10 @@ import time
 import numpy as np
 import pytest
 from conftest import PROJECT, class_matching, make_frame
+from disks import small_disk
 from geometry_msgs.msg import PoseArray
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
 from cliploc_ros.ros.conversions import stamp_ns
 
@@ -67,6 +69,33 @@ def test_simulated_time_that_jumps_back_an_hour(own_relocalizer, tester):
         tester.destroy_publisher(clock)
     assert process.alive
     assert 'Traceback' not in process.output()
+
+
+def test_a_disk_full_at_the_embedding_cache(start, tester, room_map, tmp_path):
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    # log and home are on the full disk, too
+    process = start(
+        'nodes.relocalizer', within=[*small_disk(disk), 'sh', '-c',
+                                     'mkdir -p "$HOME"; cat /dev/zero > "$HOME/filler"; exec "$@"',
+                                     'sh'],
+        parameters={'map_file': room_map, 'k': 12, 'clip_model': ASSETS / 'clip.json',
+                    'clip_pretrained': ASSETS / 'clip.safetensors'},
+        HOME=str(disk / 'home'), ROS_LOG_DIR=str(disk / 'home'), XDG_CACHE_HOME='')
+    process.wait_for_output('ready after')
+    cache = disk / 'home/.cache/cliploc_ros/labels'
+    assert f'cannot write {cache}/labels-' in process.output()
+    assert 'No space left on device' in process.output()
+    assert list(process.sees(cache).glob('*')) == []
+    tester.connect()
+    assert tester.relocalize(make_frame()).success
+    process.sees(disk / 'home/filler').unlink()
+    answer = tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request())
+    assert answer.success, answer.message
+    assert [file.suffix for file in process.sees(cache).iterdir()] == ['.npz']
+    assert process.output().count('cannot write') == 1
+    assert tester.relocalize(make_frame(stamp_s=101.0)).success
+    assert process.stop()[0] == 0
 
 
 @pytest.fixture
