@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as a whole: versions, imports, licence lines, executables and interfaces."""
 
+import ast
 import importlib
 import importlib.metadata
 import os
@@ -73,6 +74,24 @@ def test_core_imports_neither_ros_nor_torch():
         "print(sorted({'rclpy', 'torch', 'ultralytics', 'open_clip'} & set(sys.modules)))\n"
     )
     assert run_python(code, cwd=PROJECT).strip() == '[]'
+
+
+def imported(path: Path) -> set[str]:
+    """Return the packages that a file imports anywhere in it."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom)]
+    return {name.partition('.')[0] for name in names}
+
+
+def test_every_ros_package_that_is_imported_is_declared():
+    sources = [*MODULES, *(PROJECT / 'launch').glob('*.py')]
+    used = {name for path in sources for name in imported(path)
+            if re.search('^(launch|rclpy|tf2)|_(msgs|srvs|interfaces)$', name)}
+    manifest = ElementTree.parse(PROJECT / 'package.xml')
+    declared = {entry.text for entry in manifest.findall('exec_depend')}
+    # on Jazzy the Python half of tf2_ros is a package of its own
+    assert {{'tf2_ros': 'tf2_ros_py'}.get(name, name) for name in used} <= declared
 
 
 @pytest.mark.parametrize('path', [*SOURCES, *SCRIPTS, *INTERFACES], ids=relative)

@@ -84,11 +84,7 @@ class RelocalizerNode(ManagedNode):
 
     def load(self) -> str:
         """Load map and network."""
-        values: Mapping[str, Any] = self.settings.snapshot()
-        if values['publish_tf'] or (values['base_frame']
-                                    and not any(values['base_from_camera'])):
-            self._base.listen()
-        self._localizer = load_localizer(self, values)
+        self._localizer = load_localizer(self, self.settings.snapshot())
         self._visualization.set_map(self._localizer.landmark_map)
         return self._localizer.description
 
@@ -96,11 +92,13 @@ class RelocalizerNode(ManagedNode):
         """Let go map and network."""
         self._localizer = None
         self._visualization.set_map(None)
-        self._base.forget()
 
     def open(self) -> None:
         """Be ready for requests; in continuous mode listen to frames."""
         self._handoff.open()
+        if self.settings['publish_tf'] or (self.settings['base_frame']
+                                           and not any(self.settings['base_from_camera'])):
+            self.worker.run(self._base.listen)
         if self.settings['publish_tf']:
             self._odom_frame.open()
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
@@ -114,6 +112,7 @@ class RelocalizerNode(ManagedNode):
         if self._frames is not None:
             self._frames.stop('the node was deactivated')
         self._listening.close()
+        self.worker.submit(self._base.forget)  # after a search that may be under way
 
     def release(self) -> None:
         """Let go the request that waits for frames: the process ends."""

@@ -13,7 +13,12 @@ from conftest import make_frame, transform_of
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
 
-from cliploc_ros.core.transforms import pose_error, transform_from_pose
+from cliploc_ros.core.transforms import (
+    invert_transform,
+    move_covariance,
+    pose_error,
+    transform_from_pose,
+)
 
 
 def test_the_map_can_come_as_parameters(start, tester, room_map):
@@ -69,17 +74,26 @@ def test_continuous_mode_publishes_without_being_asked(own_relocalizer, tester):
     assert process.stop()[0] == 0
 
 
-def test_the_mount_moves_the_pose(own_relocalizer, tester):
-    own_relocalizer(base_frame='base_link',
-                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
+def test_the_mount_moves_the_pose_and_its_covariance(own_relocalizer, tester):
+    own_relocalizer()
     assert tester.relocalize(make_frame()).success
-    tester.wait(lambda: tester.poses, 'a pose')
-    base = MAP_FROM_CAMERA @ transform_from_pose(np.array([0, 0, -1.0]), np.array([0, 0, 0, 1.0]))
-    assert pose_error(transform_of(tester.poses[0].pose.pose), base) < (0.08, 1.0)
+    mount = [0.1, 0.0, 1.0, 0.0, 0.6, 0.0, 0.8]
+    assert tester.set_parameter('base_from_camera', mount).successful
+    assert tester.set_parameter('base_frame', 'base_link').successful
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: len(tester.poses) == 2, 'the poses of camera and base')
+    camera, base = (transform_of(pose.pose.pose) for pose in tester.poses)
+    camera_from_base = invert_transform(
+        transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
+    assert pose_error(base, MAP_FROM_CAMERA @ camera_from_base) < (0.08, 1.0)
+    of_camera, of_base = (np.array(pose.pose.covariance).reshape(6, 6) for pose in tester.poses)
+    moved = move_covariance(of_camera, base[:3, 3] - camera[:3, 3])
+    assert np.abs(moved - of_camera).max() > 1e-6
+    np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
 
 
 def test_no_mount_is_an_answer_not_an_end(own_relocalizer, tester):
-    # without tf2_ros it is not even configured
+    # without tf2_ros it is not even activated
     process = own_relocalizer(expect='', base_frame='base_link', tf_timeout_s=0.1)
     answer = tester.relocalize(make_frame())
     assert not answer.success

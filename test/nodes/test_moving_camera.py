@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for.
+
+Runs where tf2_ros is installed; elsewhere its absence is what is named.
+"""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from conftest import make_frame, transform_of
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from scene import MAP_FROM_CAMERA
+
+from cliploc_ros.core.transforms import invert_transform, pose_error, transform_from_pose
+from cliploc_ros.ros.odom_frame import transform_msg
+
+HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
+
+
+def base_from_camera(height_m):
+    """A camera on a lift, looking aside."""
+    return transform_from_pose(np.array([0.1, 0.2, height_m]), np.array([0.0, 0.6, 0.0, 0.8]))
+
+
+@pytest.fixture
+def lift(tester):
+    """Tell tf2 how high the camera was: heights [m] by time [s]."""
+    if not HAS_TF2:
+        yield None
+        return
+    from tf2_msgs.msg import TFMessage
+    publisher = tester.create_publisher(TFMessage, '/tf', 100)
+
+    def tell(heights_m):
+        transforms = []
+        for at_s, height_m in heights_m.items():
+            header = make_frame(stamp_s=at_s)[0].header
+            camera, header.frame_id = header.frame_id, 'base_link'
+            transforms.append(transform_msg(header, camera, base_from_camera(height_m)))
+        publisher.publish(TFMessage(transforms=transforms))
+    yield tell
+    tester.destroy_publisher(publisher)
+
+
+def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift):
+    process = own_relocalizer(expect='', base_frame='base_link', tf_timeout_s=0.5)
+    if not HAS_TF2:
+        print('\ntf2_ros is not installed here: moving cameras were not run')
+        process.wait_for_output('tf2_ros is not installed')
+        assert 'or set base_from_camera' in tester.answer(tester.ask()).message
+        return
+    frame = make_frame(stamp_s=100.5)
+    future = tester.ask()
+
+    def answered():
+        lift({100.0: 1.0, 101.0: 2.0, 103.0: 9.0})
+        return future.done()
+    tester.feed_until(answered, frame)
+    assert future.result().success, future.result().message
+    tester.wait(lambda: tester.poses and tester.initial_poses, 'the poses')
+    truth = MAP_FROM_CAMERA @ invert_transform(base_from_camera(1.5))
+    for pose in (tester.poses[0], tester.initial_poses[0]):
+        assert pose_error(transform_of(pose.pose.pose), truth) < (0.08, 1.0)
+    # nobody has told of that time, and nobody will
+    answer = tester.relocalize(make_frame(stamp_s=104.0))
+    assert not answer.success
+    assert "no transform from 'base_link' to 'camera_optical_frame'" in answer.message
+    assert process.alive
+
+
+def test_an_inactive_relocalizer_hears_no_transforms(own_relocalizer, tester):
+    process = own_relocalizer(expect='', base_frame='base_link')
+    if not HAS_TF2:
+        process.wait_for_output('tf2_ros is not installed')
+        return
+    tester.wait(lambda: tester.count_subscribers('/tf') == 1, 'it to listen')
+    request = ChangeState.Request(
+        transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert tester.call(ChangeState, '/relocalizer/change_state', request).success
+    tester.wait(lambda: tester.count_subscribers('/tf') == 0, 'it to rest')
