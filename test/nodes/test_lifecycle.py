@@ -143,8 +143,20 @@ def test_sigterm_while_weights_load(start, tmp_path):
         assert 'Traceback' not in process.output()
 
 
+def processor_share(process, tester, seconds=3.0):
+    """The share of a core that a process uses while a camera publishes at 30 Hz."""
+    frame = make_frame()
+    begun, used_s, sent = time.monotonic(), process.cpu_s(), 0
+    while (elapsed_s := time.monotonic() - begun) < seconds:
+        if elapsed_s >= sent / 30.0:
+            tester.publish(frame)
+            sent += 1
+        tester.spin()
+    return (process.cpu_s() - used_s) / elapsed_s
+
+
 def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
-    _, manager = manage('relocalizer', **class_matching(room_map))
+    process, manager = manage('relocalizer', **class_matching(room_map, mode='continuous'))
     tester.connect()
     assert 'the node is unconfigured' in tester.answer(tester.ask()).message
     manager.do('configure')
@@ -155,6 +167,9 @@ def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
     manager.do('deactivate')
     tester.answer(tester.ask_reinitialize())
     assert 'the node is inactive' in tester.answer(tester.ask()).message
+    share = processor_share(process, tester)
+    print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
+    assert share < 0.05
 
 
 def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
@@ -206,7 +221,7 @@ def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
 
 
 def test_an_inactive_detector_costs_nothing(manage, tester):
-    _, manager = manage('detector', **with_networks('detector', ''))
+    process, manager = manage('detector', **with_networks('detector', ''))
     with tester.hearing_detections() as detected:
         manager.do('configure')
         assert tester.images.get_subscription_count() == 0
@@ -214,3 +229,6 @@ def test_an_inactive_detector_costs_nothing(manage, tester):
         tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
         manager.do('deactivate')
         tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
+    share = processor_share(process, tester)
+    print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
+    assert share < 0.05
