@@ -5,62 +5,81 @@
 # ros2 launch cliploc_ros relocalization.launch.py map:=office.yaml \
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
-ARGUMENTS = {
-    'map': ('', 'map file'),
-    'image': ('image', "the camera driver's topic; image/compressed hangs below it"),
-    'camera_info': ('camera_info', "the camera driver's topic"),
-    'image_transport': ('raw', 'raw or compressed'),
-    'namespace': ('', 'of both nodes; one for each camera'),
-    'base_frame': ('', "frame whose pose is published; empty: the camera's"),
-    'gravity': ('none', 'what tells the vertical: none, base_frame or imu'),
-    'matching': ('hybrid', 'hybrid, clip or class; class needs no CLIP'),
-    'mode': ('on_request', 'on_request or continuous'),
-    'model': ('yolov8x.pt', 'YOLO weights'),
-    'clip_model': ('ViT-L-14', 'open_clip architecture'),
-    'clip_pretrained': ('openai', 'tag or file'),
+# Topics and services, each remapped by the argument of its name.
+NAMES = {
+    'image': "the camera driver's topic; image/compressed hangs below it",
+    'camera_info': "the camera driver's topic",
+    'detections': 'from the detector to the relocalizer',
+    'odom': 'tells whether the robot moves; without it, it is taken to stand',
+    'imu': 'with gravity:=imu',
+    'initialpose': 'what AMCL listens to',
+    'request_nomotion_update': 'what AMCL serves',
+    'reinitialize_global_localization': "what Nav2's behaviour tree calls",
+}
+# Where one is not given the file `parameters` decides, and then the node's own default.
+DETECTOR_PARAMETERS = {
+    'model': 'YOLO weights',
+    'image_transport': 'raw or compressed',
+    'autostart': 'false: a lifecycle manager configures and activates',
+    'use_sim_time': 'true: take the time from /clock',
+}
+RELOCALIZER_PARAMETERS = {
+    'map': 'map file, the parameter map_file',
+    'base_frame': "frame whose pose is published; else the camera's",
+    'gravity': 'what tells the vertical: none, base_frame or imu',
+    'matching': 'hybrid, clip or class; class needs no CLIP',
+    'mode': 'on_request or continuous',
+    'clip_model': 'open_clip architecture',
+    'clip_pretrained': 'tag or file',
+    'image_transport': 'raw or compressed',
+    'autostart': 'false: a lifecycle manager configures and activates',
+    'use_sim_time': 'true: take the time from /clock',
+}
+OTHERS = {
+    'parameters': ('', "file of the nodes' parameters; arguments that are given go before it"),
+    'namespace': ('', 'of both nodes: one for each robot, and for each camera'),
+    'tf': ('/tf', 'tf: in the namespace, as Nav2 has it for one robot of several'),
     'detector': ('true', 'false: somebody else publishes detections'),
-    'autostart': ('true', 'false: a lifecycle manager configures and activates'),
-    'use_sim_time': ('false', 'take the time from /clock'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
-_DETECTOR_ARGUMENTS = ('model', 'image_transport', 'autostart', 'use_sim_time')
-_RELOCALIZER_ARGUMENTS = ('image_transport', 'base_frame', 'gravity', 'matching', 'mode',
-                          'clip_model', 'clip_pretrained', 'autostart', 'use_sim_time')
 _TRUTH_VALUES = ('autostart', 'use_sim_time')
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return both nodes, with what people most often set as arguments."""
-    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
-
-    def node(executable: str, names: tuple[str, ...], extra: dict | None = None, **keywords):
-        defaults = PathJoinSubstitution(
-            [FindPackageShare('cliploc_ros'), 'config', f'{executable}.yaml'])
-        changes = {name: ParameterValue(given[name],
-                                        value_type=bool if name in _TRUTH_VALUES else str)
-                   for name in names} | (extra or {})
-        return Node(
-            package='cliploc_ros', executable=executable, name=executable,
-            namespace=given['namespace'], output='screen',
-            parameters=[ParameterFile(defaults), changes],
-            remappings=[('image', given['image']),
-                        ('image/compressed', [given['image'], '/compressed']),
-                        ('camera_info', given['camera_info'])],
-            ros_arguments=['--log-level', given['log_level']], **keywords)
-
+    arguments = {name: (name, text) for name, text in NAMES.items()} | {
+        name: ('', text) for name, text in (DETECTOR_PARAMETERS | RELOCALIZER_PARAMETERS).items()}
     declared = [DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, (default, text) in ARGUMENTS.items()]
-    return LaunchDescription([
-        *declared,
-        node('detector', _DETECTOR_ARGUMENTS, condition=IfCondition(given['detector'])),
-        node('relocalizer', _RELOCALIZER_ARGUMENTS,
-             {'map_file': ParameterValue(given['map'], value_type=str)}),
-    ])
+                for name, (default, text) in (arguments | OTHERS).items()]
+    return LaunchDescription([*declared, OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes, with those parameters that are given."""
+    given = {name for name, value in context.launch_configurations.items() if value}
+    return [_node('detector', given & DETECTOR_PARAMETERS.keys(), given,
+                  condition=IfCondition(LaunchConfiguration('detector'))),
+            _node('relocalizer', given & RELOCALIZER_PARAMETERS.keys(), given)]
+
+
+def _node(name: str, parameters: set[str], given: set[str], **keywords) -> Node:
+    files = [ParameterFile(LaunchConfiguration('parameters'))] if 'parameters' in given else []
+    changes = {'map_file' if one == 'map' else one: ParameterValue(
+        LaunchConfiguration(one), value_type=bool if one in _TRUTH_VALUES else str)
+        for one in sorted(parameters)}
+    tf, image = LaunchConfiguration('tf'), LaunchConfiguration('image')
+    return Node(
+        package='cliploc_ros', executable=name, name=name, output='screen',
+        namespace=LaunchConfiguration('namespace'),
+        parameters=[*files, *([changes] if changes else [])],
+        remappings=[*((topic, LaunchConfiguration(topic)) for topic in NAMES),
+                    ('image/compressed', [image, '/compressed']),
+                    ('/tf', tf), ('/tf_static', [tf, '_static'])],
+        ros_arguments=['--log-level', LaunchConfiguration('log_level')], **keywords)

@@ -95,6 +95,9 @@ class HandOff:
         odometry = self._odometry.recent(_ODOM_PATIENCE_S)
         if odometry is None:
             if not self._odometry.is_published:
+                self._node.get_logger().warning(
+                    f'nobody publishes {self._odometry.topic}: the robot is taken to stand',
+                    once=True)
                 return
             raise HandOffError(f'{self._odometry.topic} has a publisher that says nothing, so the '
                                'robot may be moving: initialpose is withheld')

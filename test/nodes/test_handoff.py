@@ -79,6 +79,7 @@ def test_without_amcl_and_odometry_the_answer_comes_at_once(relocalizer, tester)
     answer = tester.relocalize(make_frame())
     assert answer.success
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
+    assert 'nobody publishes /odom: the robot is taken to stand' in relocalizer.output()
 
 
 def test_an_image_from_the_future_gives_no_pose_from_there(relocalizer, tester):
