@@ -81,11 +81,16 @@ class DetectorNode(ManagedNode):
                 self._heard_at = time.monotonic()  # from now on images are missed
                 raw = self.settings['image_transport'] == 'raw'
                 self._subscription = AdaptiveSubscription(
-                    self, Image if raw else CompressedImage, 'image' if raw else
-                    'image/compressed', self._on_image, qos.IMAGE)
+                    self, Image if raw else CompressedImage, self._topic, self._on_image,
+                    qos.IMAGE)
             elif not wanted and self._subscription is not None:
                 self._subscription.destroy()
                 self._subscription = None
+
+    @property
+    def _topic(self) -> str:
+        raw = self.settings['image_transport'] == 'raw'
+        return self.resolve_topic_name('image' if raw else 'image/compressed')
 
     def _on_image(self, msg: Image | CompressedImage) -> None:
         self._received += 1
@@ -116,15 +121,20 @@ class DetectorNode(ManagedNode):
 
     def examine(self, health: Health) -> None:
         """Say whether images come, how many are worked on, and where."""
-        silent_s = time.monotonic() - self._heard_at
-        if self._subscription is not None and silent_s > self.settings['stale_after_s']:
-            health.warn(f'no image for {silent_s:.1f} s')
+        now, waiting = time.monotonic(), self._images.waiting
+        silent_s = now - self._heard_at
+        if self.count_publishers(self._topic) == 0:
+            health.warn(f'no image: nobody publishes {self._topic}; remap it, or start its '
+                        'publisher')
+        elif self._subscription is not None and silent_s > self.settings['stale_after_s']:
+            health.warn(f'no image on {self._topic} for {silent_s:.1f} s')
         if self._last_error:
             health.warn(self._last_error)
         rates = self._rates.update({'image': self._received, 'detections': self._published})
         health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
         health.values |= {'listened to': self._subscription is not None,
-                          'images dropped': self._images.dropped}
+                          'images dropped': self._images.dropped,
+                          'queue age [s]': f'{now - waiting.received_at if waiting else 0.0:.2f}'}
         if self._detector is not None:
             health.values['device'] = self._detector.device
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
@@ -20,7 +20,7 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.transforms import move_covariance
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import pose_array_msg, pose_with_covariance_msg
+from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.debug_image import View
 from cliploc_ros.ros.diagnostics import Health, StageTimes
 from cliploc_ros.ros.frame_source import Frame, FrameSource, NoFrameError
@@ -67,7 +67,6 @@ class RelocalizerNode(ManagedNode):
         self._odometry = OdometrySource(self, self._base)
         self._handoff = HandOff(self, self._odometry)
         self._visualization = Visualization(self)
-        self._hypotheses = self.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
         self._listening = ExitStack()
@@ -260,11 +259,8 @@ class RelocalizerNode(ManagedNode):
             self._place(frame, values, camera_from_base))
         self.stages.add(times.ms)
         self.check_active()
-        bases = [hypothesis.map_from_camera @ camera_from_base
-                 for hypothesis in found.hypotheses]
-        self._hypotheses.publish(pose_array_msg(header, bases))
-        self._visualization.show(header, localizer.landmark_map, found)
-        answer = self._answer(header, found, times, bases, camera_from_base)
+        self._visualization.show(header, localizer.landmark_map, found, camera_from_base)
+        answer = self._answer(header, found, times, camera_from_base)
         for view in views or []:  # who waits for the answer does not wait for its picture
             self.worker.submit(partial(
                 self._visualization.show_view, frame.image.header, view, localizer.landmark_map,
@@ -272,22 +268,22 @@ class RelocalizerNode(ManagedNode):
         return answer
 
     def _answer(self, header: Header, found: Relocalization, times: StageTimes,
-                bases: list[NDArray[np.float64]], camera_from_base: NDArray[np.float64]
-                ) -> Answer:
+                camera_from_base: NDArray[np.float64]) -> Answer:
         """Publish what was found if it is accepted, and say it in a line."""
         if not found.accepted:
             return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]',
                           is_open=self.settings['fuse_frames'] > 1)
         assert found.covariance is not None  # what is accepted has one
-        lever = found.hypotheses[0].map_from_camera[:3, :3] @ camera_from_base[:3, 3]
-        pose = pose_with_covariance_msg(header, bases[0],
-                                        move_covariance(found.covariance, lever))
+        map_from_camera = found.hypotheses[0].map_from_camera
+        map_from_base = map_from_camera @ camera_from_base
+        pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
+            found.covariance, map_from_base[:3, 3] - map_from_camera[:3, 3]))
         self._pose.publish(pose)
         try:
-            self._odom_frame.update(header, bases[0], self.settings.snapshot())
+            self._odom_frame.update(header, map_from_base, self.settings.snapshot())
         except FrameError as error:
             self.get_logger().warning(f'publish_tf: {error}', throttle_duration_sec=_LOG_PERIOD_S)
-        x, y, z = bases[0][:3, 3]
+        x, y, z = map_from_base[:3, 3]
         return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
                             f'[{_summary(found)}; {times}]')
 

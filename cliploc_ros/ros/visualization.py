@@ -6,6 +6,7 @@ import array
 import threading
 
 import numpy as np
+from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
@@ -16,12 +17,13 @@ from visualization_msgs.msg import MarkerArray
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_array_msg
 from cliploc_ros.ros.debug_image import View, draw_view
 from cliploc_ros.ros.markers import landmark_markers, match_markers, no_markers
 
 
 class Visualization:
-    """Publishes `~/landmarks`, `~/matches` and `~/debug_image`.
+    """Publishes `~/landmarks`, `~/matches`, `~/hypotheses` and `~/debug_image`.
 
     Parameters
     ----------
@@ -33,6 +35,7 @@ class Visualization:
         self._lock = threading.Lock()
         self._map: LandmarkMap | None = None
         self._shown: LandmarkMap | None = None
+        self._hypotheses = node.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._matches = node.create_publisher(MarkerArray, '~/matches', qos.POSE)
         self._debug_image = node.create_publisher(Image, '~/debug_image', qos.POSE)
         self._landmarks = node.create_publisher(
@@ -50,8 +53,9 @@ class Visualization:
             self._map = landmark_map
         self._show_map()
 
-    def show(self, header: Header, landmark_map: LandmarkMap, found: Relocalization) -> None:
-        """Show which landmarks were seen.
+    def show(self, header: Header, landmark_map: LandmarkMap, found: Relocalization,
+             camera_from_base: NDArray[np.float64]) -> None:
+        """Show which landmarks were seen, and the poses that they speak for.
 
         Parameters
         ----------
@@ -59,7 +63,13 @@ class Visualization:
             Stamp of the image, frame of the map.
         landmark_map : LandmarkMap
         found : Relocalization
+        camera_from_base : ndarray (4, 4)
+            How the camera is mounted on what the hypotheses are shown of.
         """
+        if self._hypotheses.get_subscription_count() > 0:
+            self._hypotheses.publish(pose_array_msg(header, [
+                hypothesis.map_from_camera @ camera_from_base
+                for hypothesis in found.hypotheses]))
         if self._matches.get_subscription_count() == 0:
             return
         position = np.zeros(3) if found.map_from_camera is None else found.map_from_camera[:3, 3]

@@ -84,6 +84,12 @@ class LatestOnly[T]:
         self._items: list[T] = []
         self.dropped = 0
 
+    @property
+    def waiting(self) -> T | None:
+        """Return the item that waits."""
+        with self._lock:
+            return self._items[0] if self._items else None
+
     def offer(self, item: T) -> None:
         """Give an item to be worked on, in place of one that still waits."""
         with self._lock:

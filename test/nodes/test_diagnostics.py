@@ -80,8 +80,13 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
                                                        'detection mean [ms]': '.'})
         assert detected
         assert values['device'] in ('cpu', 'cuda:0')
-        status.wait(WARN, 'no image for')
+        assert {'images dropped', 'queue age [s]', 'waiting last [ms]', 'memory [MiB]'} <= set(
+            values)
+        status.wait(WARN, 'no image on /image for')
         bad = make_frame()[0]
         bad.encoding = 'yuv422'
         status.wait(WARN, "encoding 'yuv422' is none of", (bad,))
         status.wait(OK, 'active', (image,))
+    tester.destroy_publisher(tester.images)
+    status.wait(WARN, 'nobody publishes /image')
+    tester.images = tester.create_publisher(type(image), 'image', 10)
