@@ -3,8 +3,23 @@
 """What the package raises for input that its user can mend."""
 
 
+# Of a longer message the middle is left out: what is wrong is named first, and what to do last.
+_HEAD, _TAIL = 700, 250
+
+
 class CliplocError(Exception):
-    """Bad input. The message names the thing to mend; no traceback is needed to act on it."""
+    """Bad input. The message names the thing to mend; no traceback is needed to act on it.
+
+    It may quote what a stranger wrote, and goes to logs, answers and diagnostics: as text it is
+    one line, and short.
+    """
+
+    def __str__(self) -> str:
+        """Return the message as one line of bounded length."""
+        text = super().__str__()
+        if len(text) > _HEAD + _TAIL:
+            text = f'{text[:_HEAD]} ... {text[-_TAIL:]}'
+        return ''.join(char if char.isprintable() else ' ' for char in text)
 
 
 class MapError(CliplocError):

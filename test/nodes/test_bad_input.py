@@ -74,6 +74,21 @@ def test_bad_frames(relocalizer, tester, name):
     assert tester.relocalize(make_frame(stamp_s=101.0)).success
 
 
+def test_what_strangers_write_is_quoted_in_a_line(relocalizer, tester):
+    """Answer, log and diagnostics: a message of a megabyte must not become many."""
+    frame = make_frame()
+    frame[0].encoding = '[FATAL] all is lost\n' * 50_000
+    answer = tester.relocalize(frame)
+    assert not answer.success
+    assert answer.message.startswith("image encoding '[FATAL] all is lost ")
+    assert 'bgra8' in answer.message
+    assert len(answer.message) < 1000
+    assert '\n' not in answer.message
+    tester.wait(lambda: 'image encoding' in relocalizer.output(), 'the log')
+    assert max(map(len, relocalizer.output().splitlines())) < 2000
+    assert not [line for line in relocalizer.output().splitlines() if line.startswith('[FATAL]')]
+
+
 @pytest.mark.parametrize(('topics', 'reason'), [
     ((), 'no image'),
     (('camera_info', 'detections'), 'no image'),
