@@ -101,7 +101,8 @@ class HandOff:
                 return
             raise HandOffError(f'{self._odometry.topic} has a publisher that says nothing, so the '
                                'robot may be moving: initialpose is withheld')
-        speed_m_s, turn_rad_s = speeds(odometry)
+        # np.maximum passes NaN on, which no limit allows
+        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), self._odometry.speeds_by_poses())
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                'rad/s: initialpose is withheld, ask again when it stands')

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topic `odom`: how fast the robot is, and where its camera was when it took an image."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from cliploc_ros.core.transforms import invert_transform
+from cliploc_ros.core.transforms import invert_transform, pose_error
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.frames import BaseFrame
@@ -28,6 +29,9 @@ _LENGTH_S = 30.0
 _PATIENCE_S = 0.2
 # What so nearly covers an image may cover the next one: odometry has just begun, or it pauses.
 _NEARLY_NS = 2_000_000_000
+# Over a shorter time the noise of poses would be taken for a speed.
+_MOMENT_NS = 300_000_000
+_MOMENT_PATIENCE_S = 0.5
 # How long a publisher that has just been found may need for its first message.
 _DISCOVERY_S = 1.0
 
@@ -123,6 +127,31 @@ class OdometrySource:
             if self.is_published:
                 self._heard.wait_for(is_recent, patience_s)
             return self._newest if is_recent() else None
+
+    def speeds_by_poses(self) -> tuple[float, float]:
+        """Return how fast the poses of the last moment drove [m/s] and turned [rad/s].
+
+        Many sources of poses leave the twist empty. Where poses do not tell, it is 0; what has
+        just begun is waited for.
+        """
+        with self._heard:
+            self._heard.wait_for(lambda: self._last_moment() is not None, _MOMENT_PATIENCE_S)
+            moment = self._last_moment()
+        if moment is None:
+            return 0.0, 0.0
+        distance_m, angle_deg = pose_error(*moment)
+        seconds = _MOMENT_NS / 1e9
+        return distance_m / seconds, math.radians(angle_deg) / seconds
+
+    def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the robot a moment ago, and now; None where that is not known."""
+        if self._newest is None:
+            return None
+        now_ns = stamp_ns(self._newest.header.stamp)
+        try:
+            return self._window.pose_at(now_ns - _MOMENT_NS), self._window.pose_at(now_ns)
+        except NoOdometryError:
+            return None
 
     def follows(self, stamp: Time) -> bool:
         """Return whether odometry tells of about the time of an image, and so of the next."""

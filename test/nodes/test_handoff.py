@@ -31,12 +31,16 @@ def odom(tester):
     def feed(frame, **speeds):
         """Ask, and publish a frame and odometry until there is an answer."""
         odometry = Odometry()
+        odometry.header.frame_id, odometry.child_frame_id = 'odom', 'base_link'
         odometry.twist.twist.linear.x = speeds.get('drive', 0.0)
         odometry.twist.twist.angular.z = speeds.get('turn', 0.0)
         future = tester.ask()
 
         def answered():
             if speeds:
+                now_s = time.monotonic()
+                odometry.header.stamp = make_frame(stamp_s=now_s)[0].header.stamp
+                odometry.pose.pose.position.x = speeds.get('poses', 0.0) * now_s
                 publisher.publish(odometry)
             return future.done()
         tester.feed_until(answered, frame)
@@ -57,7 +61,7 @@ def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates
 
 
 @pytest.mark.parametrize('speeds', [{'drive': 0.5}, {'drive': -0.5}, {'turn': 1.0},
-                                    {'drive': float('nan')}])
+                                    {'drive': float('nan')}, {'poses': 0.5}])
 def test_a_moving_robot_is_not_reset(relocalizer, tester, updates, odom, speeds):
     answer = odom(make_frame(), **speeds)
     assert not answer.success

@@ -34,7 +34,7 @@ START_S = 100.0
 # Of each view only so many boxes, those nearest to its middle: one less than is believed.
 BOXES = 3
 PARAMETERS = {'base_frame': 'base_link', 'base_from_camera': MOUNT, 'algorithm': 'auto',
-              'min_inliers': BOXES + 1, 'timeout_s': 20.0}
+              'min_inliers': BOXES + 1, 'timeout_s': 20.0, 'max_turn_rad_s': 1.0}
 
 
 def make_stamp(seconds):
@@ -189,7 +189,7 @@ def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
 
 def test_a_robot_that_stops_in_time_is_handed_over(looking, tester, robot):
     def drive_on(odometry, now_s):
-        odometry.twist.twist.angular.z = 0.0 if tester.poses else 0.5
+        odometry.twist.twist.angular.z = 0.0 if tester.poses else 2.0
     answer = robot.ask(20.0, drive_on)
     assert answer.success, answer.message
     tester.wait(lambda: tester.initial_poses, 'the initial pose')

@@ -131,3 +131,16 @@ def test_it_listens_only_while_it_is_asked(source, make_node, spin_until):
     assert source._subscription is None and source.recent(0.0) is None
     talk(source, 10.0)
     assert place(source, 10.0).run != run, 'nobody knows what happened in between'
+
+
+def test_poses_tell_how_fast_the_robot_is_where_the_twist_is_empty(source):
+    talk(source, *np.arange(9.5, 10.05, 0.05))
+    assert source.speeds_by_poses() == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
+
+
+@pytest.mark.parametrize('moments', [[], [10.0], [9.9, 10.0], [9.0, 10.0]])
+def test_too_few_poses_tell_no_speed(source, moments):
+    talk(source, *moments)
+    start = time.monotonic()
+    assert source.speeds_by_poses() == (0.0, 0.0)
+    assert time.monotonic() - start < 1.0
