@@ -4,6 +4,8 @@
 
 import importlib.machinery
 import importlib.util
+import re
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
@@ -55,3 +57,24 @@ def test_config_files_hold_every_default(name):
     tree = yaml.safe_load((PROJECT / f'config/{name}.yaml').read_text())
     rows = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}[name]
     assert tree['/**']['ros__parameters'] == {row.name: row.default for row in rows}
+
+
+def test_nav2s_example_is_of_parameters_that_there_are():
+    text = (PROJECT / 'doc/nav2.md').read_text()
+    example = re.search(r'    /\*\*:\n(?: {6}.*\n)+', text).group()
+    values = yaml.safe_load(example)['/**']['ros__parameters']
+    rows = {row.name: row for row in RELOCALIZER}
+    for name, value in values.items():
+        assert rows[name].validated(value) == value
+    relocalizer_options({row.name: row.default for row in RELOCALIZER} | values)
+
+
+def test_rviz_shows_what_is_published():
+    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
+    published = {topic.text for topic in policy.findall(
+        './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
+    tree = yaml.safe_load((PROJECT / 'config/relocalization.rviz').read_text())
+    shown = {display['Name']: display['Topic']['Value']
+             for display in tree['Visualization Manager']['Displays'] if 'Topic' in display}
+    assert set(shown) == {'Landmarks', 'Matches', 'Hypotheses', 'Accepted pose', 'Debug image'}
+    assert set(shown.values()) <= published

@@ -89,8 +89,10 @@ class OdomFrame:
         transform = self._transform
         if transform is None:
             return
-        until = self._node.get_clock().now() + Duration(seconds=_PERIOD_S)
-        transform.header.stamp = until.to_msg()
+        until = (self._node.get_clock().now() + Duration(seconds=_PERIOD_S)).to_msg()
+        if transform.header.stamp == until:
+            return  # simulated time stands still; tf2 warns of a stamp that comes twice
+        transform.header.stamp = until
         self._broadcaster.sendTransform(transform)
 
 

@@ -9,7 +9,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-from conftest import make_frame, transform_of
+from conftest import PROJECT, make_frame, transform_of
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
 
@@ -19,6 +19,7 @@ from cliploc_ros.core.transforms import (
     pose_error,
     transform_from_pose,
 )
+from cliploc_ros.ros.conversions import stamp_ns
 
 
 def test_the_map_can_come_as_parameters(start, tester, room_map):
@@ -41,6 +42,17 @@ def test_compressed_images(own_relocalizer, tester):
         assert not answer.success
         assert 'does not decode' in answer.message
     assert tester.relocalize((good, info, detections)).success
+
+
+def test_a_detector_of_compressed_images(start, tester):
+    start('nodes.detector', parameters={
+        'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'image_transport': 'compressed'})
+    image = make_frame()[0]
+    data = cv2.imencode('.png', np.zeros((480, 640, 3), dtype=np.uint8))[1].tobytes()
+    compressed = CompressedImage(header=image.header, format='png', data=data)
+    with tester.hearing_detections() as detected:
+        tester.feed_until(lambda: detected, [compressed], 'detections')
+    assert list(detected) == [stamp_ns(image.header.stamp)]
 
 
 def test_any_detector_will_do(own_relocalizer, tester):
