@@ -14,6 +14,10 @@ import yaml
 from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
 
 PROJECT = Path(__file__).resolve().parents[1]
+# what every node has
+OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
+                    'change_state|get_state|get_available_.*|get_transition_graph|.*_parameters(_atomically)?|'
+                    'get_parameter_types)$')
 
 
 @pytest.fixture(scope='module')
@@ -44,12 +48,18 @@ def test_the_default_parameters_are_valid_together():
     relocalizer_options({row.name: row.default for row in RELOCALIZER})
 
 
-def test_the_readme_names_every_topic_and_service(document):
-    readme = (PROJECT / 'README.md').read_text()
-    for name in ('image', 'image/compressed', 'camera_info', 'detections', '~/pose',
-                 'initialpose', '~/hypotheses', '~/relocalize',
-                 'reinitialize_global_localization'):
-        assert f'`{name}`' in readme
+@pytest.mark.parametrize('node', ['detector', 'relocalizer'])
+def test_the_readme_has_every_topic_and_service_and_no_other(node):
+    """The policy has them all; a test holds that equal to the graph."""
+    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
+    profile = policy.find(f'.//profile[@node="{node}"]')
+    used = {entry.text for group in profile for entry in group if not OF_ROS.search(entry.text)}
+    section = (PROJECT / 'README.md').read_text().split(f'\n### {node}\n')[1].split('<!--')[0]
+    cells = [line.split('|')[1] for line in section.splitlines() if line.startswith('| `')]
+    named = [name for cell in cells for name in re.findall('`(.+?)`', cell)]
+    assert len(named) == len(set(named))
+    assert {name if name[0] == '/' else f'/{name}'.replace('/~', f'/{node}')
+            for name in named} == used
 
 
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
