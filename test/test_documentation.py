@@ -16,8 +16,8 @@ from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
 PROJECT = Path(__file__).resolve().parents[1]
 # what every node has
 OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
-                    'change_state|get_state|get_available_.*|get_transition_graph|.*_parameters(_atomically)?|'
-                    'get_parameter_types)$')
+                    'change_state|get_state|get_available_.*|get_transition_graph|'
+                    '.*_parameters(_atomically)?|get_parameter_types)$')
 
 
 @pytest.fixture(scope='module')

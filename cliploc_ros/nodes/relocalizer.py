@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer node: from image and detections to the robot's pose, when asked."""
 
+import re
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -101,6 +102,11 @@ class RelocalizerNode(ManagedNode):
         if self.settings['publish_tf']:
             self._odom_frame.open()
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
+        if (re.search('[/_]rect', self._frames.image_topic)
+                and not self.settings['rectified']):
+            self.get_logger().warning(
+                f'{self._frames.image_topic} sounds rectified, but the parameter rectified is '
+                'false: poses would be wrong by as much as the lens distorts')
         if self.settings['mode'] == 'continuous':
             self._listen(self._listening, self._frames)
 

@@ -74,6 +74,11 @@ class FrameSource:
         self._newest: Frame | None = None
         self._stopped = ''
 
+    @property
+    def image_topic(self) -> str:
+        """Return where images come from."""
+        return self._resolved('image')
+
     def open(self) -> None:
         """Listen until closed as often as opened."""
         with self._changed:

@@ -44,6 +44,15 @@ def test_compressed_images(own_relocalizer, tester):
     assert tester.relocalize((good, info, detections)).success
 
 
+@pytest.mark.parametrize(('rectified', 'warned'), [(False, True), (True, False)])
+def test_a_rectified_image_taken_for_a_raw_one_is_warned_of(own_relocalizer, tester, rectified,
+                                                            warned):
+    process = own_relocalizer('--ros-args', '-r', 'image:=camera/image_rect', rectified=rectified,
+                              timeout_s=0.5)
+    tester.answer(tester.ask())  # by now it is active
+    assert ('/camera/image_rect sounds rectified' in process.output()) == warned
+
+
 def test_a_detector_of_compressed_images(start, tester):
     start('nodes.detector', parameters={
         'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'image_transport': 'compressed'})
