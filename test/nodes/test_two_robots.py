@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Several robots on one network."""
+"""Several robots on one network, and several cameras on one robot."""
 
 from conftest import class_matching, make_frame
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 
 
@@ -46,3 +47,42 @@ def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_ma
             tester.destroy_subscription(subscription)
         for client in clients.values():
             tester.destroy_client(client)
+
+
+def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tester, room_map):
+    """Each in a namespace of its own, and the robot's names given back (doc/nav2.md)."""
+    remaps = [argument for name in ('odom', 'initialpose', 'request_nomotion_update')
+              for argument in ('-r', f'{name}:=/{name}')]
+    for camera in ('front', 'rear'):
+        start('nodes.relocalizer', '--ros-args', '-r', f'__ns:=/{camera}', *remaps,
+              parameters=class_matching(room_map)).wait_for_output('ready after')
+    frame = make_frame()
+    publishers = {camera: [tester.create_publisher(type(message), f'/{camera}/{name}', 10)
+                           for message, name in zip(
+                               frame, ('image', 'camera_info', 'detections'), strict=True)]
+                  for camera in ('front', 'rear')}
+    odom, odometry = tester.create_publisher(Odometry, '/odom', 10), Odometry()
+
+    def ask(camera):
+        client = tester.create_client(Trigger, f'/{camera}/relocalizer/relocalize')
+        tester.wait(client.service_is_ready, client.srv_name)
+        future = client.call_async(Trigger.Request())
+
+        def answered():
+            odom.publish(odometry)
+            for publisher, message in zip(publishers[camera], frame, strict=True):
+                publisher.publish(message)
+            return future.done()
+        tester.wait(answered, 'an answer')
+        tester.destroy_client(client)
+        return future.result()
+    try:
+        odometry.twist.twist.linear.x = 0.5
+        assert [ask(camera).message.split(':')[0] for camera in publishers] == ['withheld'] * 2
+        assert not tester.initial_poses
+        odometry.twist.twist.linear.x = 0.0
+        assert all(ask(camera).success for camera in publishers)
+        tester.wait(lambda: len(tester.initial_poses) == 2, 'a pose by each camera')
+    finally:
+        for publisher in (odom, *publishers['front'], *publishers['rear']):
+            tester.destroy_publisher(publisher)
