@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fitting what makes confidences true: ``python -m cliploc_ros.evaluation.calibration --help``.
 
-Each frame is localized whole and with some of its boxes dropped, by labels and by classes alone.
-The coefficients make what turned out right the likeliest. Half of the places choose them and the
-other half judges, and the other way round; neighbouring frames are always in the same half.
+Each frame is localized as it is, with boxes dropped or invented, by classes alone, and in a map
+whose objects have exchanged places, where nothing is right. The coefficients make what turned out
+right the likeliest. Half of the places choose them and the other half judges, and the other way
+round; neighbouring frames are always in the same half.
 """
 
 import argparse
@@ -29,19 +30,60 @@ from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.evaluation.troubles import (
+    Change,
+    drop_detections,
+    exchange_landmarks,
+    invent_detections,
+)
 
 RIGHT_M = 1.0
-#: Of labels: what share of the boxes is dropped, once for each; of classes alone fewer, since
-#: these need more boxes.
-DROPS = {'hybrid': (0.0, 0.3, 0.3, 0.5, 0.5), 'class': (0.0, 0.3)}
-_FIELDS = ('score', 'misfit', 'likeness', 'same_class', 'unlabelled', 'is_bare')
+_FIELDS = ('score', 'misfit', 'likeness', 'same_class', 'unlabelled', 'unexplained')
 # Nothing that speaks for a pose may count against it, whatever a small data set says.
 _BOUNDS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
-# What was made harder shows what wrong poses look like, but is not what is asked.
-_WEIGHT_OF_DROPPED = 0.1
+# Where a robot wakes up is hardly ever a place that its map does not show.
+_ELSEWHERE = 0.01
+
+
+@dataclass(frozen=True)
+class Round:
+    """How all frames are localized once.
+
+    Parameters
+    ----------
+    weight : float
+        Of a frame, in the fit.
+    matching : str
+    change : Change
+        What goes wrong.
+    level : float
+        And by how much; nothing with 0.
+    is_elsewhere : bool
+        Whether the map shows another place, so that no pose is right.
+    """
+
+    weight: float
+    matching: str = 'hybrid'
+    change: Change = drop_detections
+    level: float = 0.0
+    is_elsewhere: bool = False
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether labels are matched and nothing goes wrong: what is reported on."""
+        return self.matching == 'hybrid' and self.level == 0.0
+
+
+# What was made harder shows what wrong poses look like, but is not what is asked: it weighs less.
+WHOLE = Round(1.0)
+ROUNDS = (WHOLE, *(Round(0.1, level=level) for level in (0.3, 0.3, 0.5, 0.5)),
+          Round(0.1, change=invent_detections, level=0.5),
+          *(Round(0.1, 'class', level=level) for level in (0.0, 0.3)),
+          *(Round(_ELSEWHERE, matching, exchange_landmarks, 1.0, True)
+            for matching in ('hybrid', 'hybrid', 'hybrid', 'class', 'class')))
 
 
 @dataclass(frozen=True)
@@ -52,32 +94,31 @@ class Case:
     ----------
     place : str
         Frames of one place are never parted.
-    whole : bool
-        Whether labels were matched and no box was dropped: what is reported on.
+    round : Round
     supports : tuple of m Support
     poses : ndarray (m, 4, 4)
     right : ndarray (m,) of bool
     """
 
     place: str
-    whole: bool
+    round: Round
     supports: tuple[Support, ...]
     poses: NDArray[np.float64]
     right: NDArray[np.bool_]
 
 
 def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: str,
-          whole: bool = True) -> Case:
+          of_round: Round = WHOLE) -> Case:
     """Return what a search found, judged by the truth (4, 4)."""
     poses = np.array([one.map_from_camera for one in found.hypotheses])
     errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
-    return Case(place, whole, tuple(one.support for one in found.hypotheses), poses,
-                errors < RIGHT_M)
+    return Case(place, of_round, tuple(one.support for one in found.hypotheses), poses,
+                (errors < RIGHT_M) & (not of_round.is_elsewhere))
 
 
 def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequence[str],
             seed: int = 0) -> Iterator[Case | None]:
-    """Localize frames whole and with boxes dropped.
+    """Localize frames as they are and in trouble, see ROUNDS.
 
     Parameters
     ----------
@@ -86,7 +127,7 @@ def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequenc
     places : sequence of str
         Of each query.
     seed : int
-        Of the choice of boxes.
+        Of what goes wrong.
 
     Yields
     ------
@@ -94,25 +135,13 @@ def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequenc
         None where no pose was found.
     """
     rng = np.random.default_rng(seed)
-    for matching, drops in DROPS.items():
-        options = RelocalizerOptions(matching=matching)
-        relocalizer = Relocalizer(landmark_map, replace(
-            options, k=min(options.k, len(landmark_map))))
-        for drop in drops:
-            for query, place in zip(queries, places, strict=True):
-                found = relocalizer.relocalize([without_boxes(query, drop, rng).observation])
-                yield judge(found, query.map_from_camera, place, drop == 0 and matching
-                            == 'hybrid') if found.solved else None
-
-
-def without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query with a share of its boxes dropped at random."""
-    observation = query.observation
-    rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
-    similarities = observation.similarities
-    return replace(query, observation=replace(
-        observation, detections=observation.detections.select(rows),
-        similarities=None if similarities is None else np.asarray(similarities)[rows]))
+    for one in ROUNDS:
+        changed, asked = one.change(landmark_map, queries, one.level, rng)
+        options = RelocalizerOptions(matching=one.matching)
+        relocalizer = Relocalizer(changed, replace(options, k=min(options.k, len(changed))))
+        for query, place in zip(asked, places, strict=True):
+            found = relocalizer.relocalize([query.observation])
+            yield judge(found, query.map_from_camera, place, one) if found.solved else None
 
 
 def fit(cases: Sequence[Case]) -> Calibration:
@@ -132,7 +161,7 @@ def fit(cases: Sequence[Case]) -> Calibration:
         raise OptionsError(f'of {len(first)} poses {first.sum()} are right: a fit needs both')
     support, given, right = _padded(cases)
     scale = np.append(support[given].std(axis=0) + 1e-9, 1.0)
-    weights = np.array([1.0 if case.whole else _WEIGHT_OF_DROPPED for case in cases])
+    weights = np.array([case.round.weight for case in cases])
     weights /= weights.sum()
     solved = minimize(_loss, np.append(0.0 * scale[:-1], 1.0),
                       (support / scale[:-1], given, right, weights),
@@ -195,15 +224,25 @@ def halves(cases: Sequence[Case], seed: int = 0) -> tuple[set[str], set[str]]:
     return ({places[row] for row in order[::2]}, {places[row] for row in order[1::2]})
 
 
-def cross_fitted(cases: Sequence[Case], seed: int = 0
+def cross_fitted(cases: Sequence[Case], seed: int = 0, elsewhere: bool = False
                  ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
-    """Return confidence and rightness of the whole frames of each half, as the other has it."""
+    """Return confidence and rightness of each half's frames, as the other half has them.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    seed : int
+        Of the halves.
+    elsewhere : bool
+        Of the rounds in maps of another place; else of the whole frames.
+    """
     judged = []
     for own in halves(cases, seed):
         calibration = fit([case for case in cases if case.place not in own])
-        whole = [case for case in cases if case.place in own and case.whole]
-        judged.append((confidence(whole, calibration),
-                       np.array([case.right[0] for case in whole], dtype=bool)))
+        asked = [case for case in cases if case.place in own
+                 and (case.round.is_elsewhere if elsewhere else case.round.is_whole)]
+        judged.append((confidence(asked, calibration),
+                       np.array([case.right[0] for case in asked], dtype=bool)))
     return judged
 
 
@@ -218,7 +257,7 @@ def _read(options: argparse.Namespace) -> list[Case]:
         queries = make_queries(recorded, landmark_map, every_frame=True)
         cases += tqdm(collect(landmark_map, queries,
                               [f'{number}.{frame.group}' for frame in recorded], options.seed),
-                      path.name, len(queries) * sum(map(len, DROPS.values())), disable=None)
+                      path.name, len(queries) * len(ROUNDS), disable=None)
     return [case for case in cases if case is not None]
 
 
@@ -262,6 +301,9 @@ def run(arguments: list[str]) -> int:
         print(_report(f'half {number}, as the other half has it', *half))
     print(_report('both', np.concatenate([half[0] for half in judged]),
                   np.concatenate([half[1] for half in judged])))
+    elsewhere = cross_fitted(cases, options.seed, elsewhere=True)
+    print(_report('another place, both', np.concatenate([half[0] for half in elsewhere]),
+                  np.concatenate([half[1] for half in elsewhere])))
     if options.out is not None:
         _draw(options.out, {f'half {number}': half for number, half in enumerate(judged, start=1)})
     print('\nfitted on all, for cliploc_ros/core/confidence.py:\n'

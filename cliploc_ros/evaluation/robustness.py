@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a map or a detector gone wrong costs: ``python -m cliploc_ros.evaluation.robustness``.
 
-Landmarks are removed, moved and mislabelled, detections dropped and invented, ever more of them;
-each time all queries are localized. Success counts poses believed or not; a wrong pose believed is
-what a robot must never get.
+Landmarks are removed, moved, mislabelled and exchange places, detections are dropped and invented,
+ever more of them; each time all queries are localized. Success counts poses believed or not; a
+wrong pose believed is what a robot must never get.
 """
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import fill
@@ -21,28 +21,31 @@ from tqdm import tqdm
 
 from cliploc_ros.cli.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
-from cliploc_ros.evaluation.calibration import without_boxes
 from cliploc_ros.evaluation.figures import save_figure
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.evaluation.troubles import (
+    Change,
+    drop_detections,
+    exchange_landmarks,
+    invent_detections,
+    mislabel_landmarks,
+    move_landmarks,
+    remove_landmarks,
+)
 from cliploc_ros.evaluation.trust import wilson_interval
 
 _SUCCESS_M = 1.0
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+_ALL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 _DISTANCES_M = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
-_BOX_SIDE_PX = (20.0, 200.0)
 _PANEL_SIZE = 2.6, 3.4  # of one trouble in the figure [inch]
 _LABEL_WIDTH = 22
-
-World = tuple[LandmarkMap, Sequence[Query]]
-Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
-
 
 @dataclass(frozen=True)
 class Trouble:
@@ -54,87 +57,17 @@ class Trouble:
     change: Change
 
 
-def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
-                     rng: np.random.Generator) -> World:
-    """Leave a share of the landmarks out of the map; their detections stay."""
-    count = len(landmark_map)
-    kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
-    fewer = replace(landmark_map, landmark_ids=tuple(landmark_map.landmark_ids[row]
-                                                     for row in kept),
-                    labels=tuple(landmark_map.labels[row] for row in kept),
-                    class_ids=tuple(landmark_map.class_ids[row] for row in kept),
-                    centers=landmark_map.centers[kept], semi_axes=landmark_map.semi_axes[kept],
-                    quats_xyzw=landmark_map.quats_xyzw[kept])
-    return fewer, [_with_similarities(query, np.asarray(query.observation.similarities)[:, kept])
-                   for query in queries]
-
-
-def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
-                   rng: np.random.Generator) -> World:
-    """Move a third of the landmarks by a distance, each in a direction of its own."""
-    steps = rng.normal(size=landmark_map.centers.shape)
-    steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
-    steps[rng.random(len(steps)) > 1 / 3] = 0.0
-    return replace(landmark_map, centers=landmark_map.centers + steps), queries
-
-
-def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
-                       rng: np.random.Generator) -> World:
-    """Give a share of the landmarks each other's labels and classes."""
-    count = len(landmark_map)
-    chosen = rng.permutation(count)[:round(share * count)]
-    source = np.arange(count)
-    source[chosen] = np.roll(chosen, 1)
-    wrong = replace(landmark_map, labels=tuple(landmark_map.labels[row] for row in source),
-                    class_ids=tuple(landmark_map.class_ids[row] for row in source))
-    return wrong, [_with_similarities(query, np.asarray(query.observation.similarities)[:, source])
-                   for query in queries]
-
-
-def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
-                    rng: np.random.Generator) -> World:
-    """Leave a share of the boxes out."""
-    return landmark_map, [without_boxes(query, share, rng) for query in queries]
-
-
-def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
-                      rng: np.random.Generator) -> World:
-    """Add boxes anywhere, so many for each true one, that look like landmarks at random."""
-    return landmark_map, [_with_invented(query, share, rng) for query in queries]
-
-
 TROUBLES = (
     Trouble('landmarks_removed', 'share of landmarks removed', _SHARES, remove_landmarks),
     Trouble('landmarks_moved', 'a third of the landmarks moved by [m]', _DISTANCES_M,
             move_landmarks),
+    Trouble('landmarks_exchanged', 'share of landmarks that exchange places', _ALL_SHARES,
+            exchange_landmarks),
     Trouble('landmarks_mislabelled', 'share of landmarks mislabelled', _SHARES,
             mislabel_landmarks),
     Trouble('detections_dropped', 'share of detections dropped', _SHARES, drop_detections),
     Trouble('detections_invented', 'invented detections for each true one', _SHARES,
             invent_detections))
-
-
-def _with_similarities(query: Query, similarities: np.ndarray) -> Query:
-    return replace(query, observation=replace(
-        query.observation, similarities=np.ascontiguousarray(similarities)))
-
-
-def _with_invented(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query with boxes whose crops look like those of its own, in another order."""
-    observation, true = query.observation, query.observation.detections
-    count = int(rng.binomial(len(true), share)) if len(true) else 0
-    camera, similarities = observation.camera, np.asarray(observation.similarities)
-    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
-    rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
-    looks = rng.permuted(similarities[rows], axis=1)
-    detections = Detections(
-        np.vstack([true.bboxes_xyxy, boxes]),
-        true.class_ids + tuple(true.class_ids[row] for row in rng.permutation(rows)),
-        np.concatenate([true.scores, true.scores[rows]]))
-    return replace(query, observation=replace(
-        observation, detections=detections,
-        similarities=np.ascontiguousarray(np.vstack([similarities, looks]))))
 
 
 def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Trouble, seed: int,

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether accepted poses are right, and whether their covariances are true."""
 
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +15,8 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.scoring import make_scene
 from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.core.uncertainty import pose_covariance
+from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.evaluation.troubles import exchange_landmarks
 
 # 95 % of a chi-squared variable of six degrees of freedom lies below this.
 CHI2_95 = 12.592
@@ -53,6 +54,19 @@ def test_accepted_poses_are_right_and_their_covariances_true(iterations, office_
     assert low <= np.mean(within) <= high
 
 
+@pytest.mark.parametrize('matching', ['hybrid', 'class'])
+def test_another_place_is_hardly_ever_believed(matching, office_map, queries, thresholds):
+    """The map's own objects, at places that they exchanged: whatever fits is wrong."""
+    asked = make_queries(queries, office_map, every_frame=True)[::3]
+    believed, options = [], RelocalizerOptions(matching=matching)
+    for seed in range(2):
+        elsewhere, _ = exchange_landmarks(office_map, asked, 1.0, np.random.default_rng(seed))
+        relocalizer = Relocalizer(elsewhere, options)
+        believed += [relocalizer.relocalize([one.observation]).accepted for one in asked]
+    print(f'\n{matching}: {sum(believed)} of {len(believed)} believed in another place')
+    assert np.mean(believed) <= thresholds['trust']['believed_elsewhere'][matching]
+
+
 APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=np.float64)
 
 
@@ -80,6 +94,17 @@ def test_several_landmarks_behind_one_box_count_once(view, queries):
     found = support([view], queries[0].map_from_camera[None],
                     [[Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)]])
     assert (found.inliers, found.score) == (2, pytest.approx(1.3))
+
+
+def test_what_no_landmark_explains_counts_against_a_pose(view, queries, office_map):
+    poses = np.tile(queries[0].map_from_camera, (2, 1, 1))
+    # chair and the class of landmark 4 are in the map, 'none' is not
+    assert 'chair' in office_map.class_ids and 'none' not in office_map.class_ids
+    assert support([view], poses[:1], [[Match(0, 3, 0.5), Match(1, 4, 0.5)]]).unexplained == 0
+    assert support([view], poses[:1], [[Match(1, 4, 0.5), Match(2, 3, 0.5)]]).unexplained == 1
+    # seen twice, missed twice: one object, as are those that are explained twice
+    twice = support([view] * 2, poses, [[Match(1, 4, 0.5)]] * 2)
+    assert (twice.inliers, twice.unexplained) == (1, 1)
 
 
 def test_nothing_supports_nothing(view):

@@ -27,14 +27,15 @@ def make_cases(rng, count):
     for number in range(count):
         some = int(rng.integers(1, 5))
         supports = tuple(Support(int(rng.integers(3, 9)), *rng.uniform((0, 4, 0), (4, 30, 9)),
-                                 float(rng.integers(0, 5)), 0.0) for _ in range(some))
+                                 float(rng.integers(0, 5)), 0.0, float(rng.integers(0, 4)))
+                         for _ in range(some))
         poses = np.tile(np.eye(4), (some, 1, 1))
         poses[:, 0, 3] = 5.0 * np.arange(some)
         chances = confidences(supports, poses, MADE_FROM)
         right = np.zeros(some, dtype=bool)
         chosen = int(np.searchsorted(np.cumsum(chances), rng.random()))
         right[chosen:chosen + 1] = True
-        cases.append(Case(str(number // 5), True, supports, poses, right))
+        cases.append(Case(str(number // 5), calibration.WHOLE, supports, poses, right))
     return cases
 
 
@@ -44,6 +45,7 @@ def test_a_fit_finds_what_the_data_were_made_from():
     assert found.score == pytest.approx(MADE_FROM.score, rel=0.15)
     assert found.likeness == pytest.approx(MADE_FROM.likeness, rel=0.15)
     assert found.misfit == pytest.approx(MADE_FROM.misfit, rel=0.15)
+    assert found.unexplained == pytest.approx(MADE_FROM.unexplained, rel=0.15)
     assert found.none_right == pytest.approx(MADE_FROM.none_right, rel=0.15)
     likely = calibration.confidence(cases[2000:], found)
     right = np.array([case.right[0] for case in cases[2000:]])

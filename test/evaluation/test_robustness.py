@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.evaluation import robustness
+from cliploc_ros.evaluation import robustness, troubles
 from cliploc_ros.evaluation.trials import make_queries
 
 
@@ -27,7 +27,7 @@ def rng():
 
 
 def test_landmarks_are_removed_with_their_similarities(changed, room, questions):
-    fewer, asked = changed(robustness.remove_landmarks, 0.5)
+    fewer, asked = changed(troubles.remove_landmarks, 0.5)
     assert len(fewer) == len(room) - round(len(room) / 2)
     columns = [room.landmark_ids.index(one) for one in fewer.landmark_ids]
     np.testing.assert_array_equal(fewer.centers, room.centers[columns])
@@ -36,14 +36,23 @@ def test_landmarks_are_removed_with_their_similarities(changed, room, questions)
 
 
 def test_landmarks_are_moved_by_a_distance(changed, room):
-    distances = np.linalg.norm(changed(robustness.move_landmarks, 0.3)[0].centers - room.centers,
+    distances = np.linalg.norm(changed(troubles.move_landmarks, 0.3)[0].centers - room.centers,
                                axis=1)
     assert distances.max() == pytest.approx(0.3)
     assert 0 < (distances > 0).sum() < len(room)
 
 
+def test_landmarks_exchange_places(changed, room):
+    other = changed(troubles.exchange_landmarks, 1.0)[0]
+    assert other.labels == room.labels
+    assert np.array_equal(np.sort(other.centers, axis=0), np.sort(room.centers, axis=0))
+    assert (other.centers != room.centers).any(axis=1).all()
+    some = changed(troubles.exchange_landmarks, 0.5)[0]
+    assert (some.centers != room.centers).any(axis=1).sum() == round(len(room) / 2)
+
+
 def test_landmarks_are_mislabelled(changed, room, questions):
-    wrong, asked = changed(robustness.mislabel_landmarks, 0.5)
+    wrong, asked = changed(troubles.mislabel_landmarks, 0.5)
     assert sorted(wrong.labels) == sorted(room.labels)
     source = [room.labels.index(one) for one in wrong.labels]
     assert sum(row != own for own, row in enumerate(source)) == round(len(room) / 2)
@@ -54,9 +63,9 @@ def test_landmarks_are_mislabelled(changed, room, questions):
 def test_detections_are_dropped_and_invented(changed, questions):
     before = sum(len(one.observation.detections) for one in questions)
     fewer = sum(len(one.observation.detections)
-                for one in changed(robustness.drop_detections, 0.5)[1])
+                for one in changed(troubles.drop_detections, 0.5)[1])
     assert 0.3 * before < fewer < 0.7 * before
-    asked = changed(robustness.invent_detections, 0.5)[1]
+    asked = changed(troubles.invent_detections, 0.5)[1]
     more = sum(len(one.observation.detections) for one in asked)
     assert 1.3 * before < more < 1.7 * before
     assert all(one.observation.similarities.shape[0] == len(one.observation.detections)

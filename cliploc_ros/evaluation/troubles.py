@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What may go wrong with a map or a detector, done to recorded queries: simulated."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.evaluation.trials import Query
+
+_BOX_SIDE_PX = (20.0, 200.0)
+
+World = tuple[LandmarkMap, Sequence[Query]]
+Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
+
+
+def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                     rng: np.random.Generator) -> World:
+    """Leave a share of the landmarks out of the map; their detections stay."""
+    count = len(landmark_map)
+    kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
+    fewer = replace(landmark_map, landmark_ids=tuple(landmark_map.landmark_ids[row]
+                                                     for row in kept),
+                    labels=tuple(landmark_map.labels[row] for row in kept),
+                    class_ids=tuple(landmark_map.class_ids[row] for row in kept),
+                    centers=landmark_map.centers[kept], semi_axes=landmark_map.semi_axes[kept],
+                    quats_xyzw=landmark_map.quats_xyzw[kept])
+    return fewer, [_with_similarities(query, np.asarray(query.observation.similarities)[:, kept])
+                   for query in queries]
+
+
+def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+                   rng: np.random.Generator) -> World:
+    """Move a third of the landmarks by a distance, each in a direction of its own."""
+    steps = rng.normal(size=landmark_map.centers.shape)
+    steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
+    steps[rng.random(len(steps)) > 1 / 3] = 0.0
+    return replace(landmark_map, centers=landmark_map.centers + steps), queries
+
+
+def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                       rng: np.random.Generator) -> World:
+    """Let a share of the landmarks exchange places; with all of them it is another place."""
+    count = len(landmark_map)
+    chosen = rng.permutation(count)[:round(share * count)]
+    centers = landmark_map.centers.copy()
+    centers[chosen] = centers[np.roll(chosen, 1)]
+    return replace(landmark_map, centers=centers), queries
+
+
+def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                       rng: np.random.Generator) -> World:
+    """Give a share of the landmarks each other's labels and classes."""
+    count = len(landmark_map)
+    chosen = rng.permutation(count)[:round(share * count)]
+    source = np.arange(count)
+    source[chosen] = np.roll(chosen, 1)
+    wrong = replace(landmark_map, labels=tuple(landmark_map.labels[row] for row in source),
+                    class_ids=tuple(landmark_map.class_ids[row] for row in source))
+    return wrong, [_with_similarities(query, np.asarray(query.observation.similarities)[:, source])
+                   for query in queries]
+
+
+def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                    rng: np.random.Generator) -> World:
+    """Leave a share of the boxes out."""
+    return landmark_map, [_without_boxes(query, share, rng) for query in queries]
+
+
+def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                      rng: np.random.Generator) -> World:
+    """Add boxes anywhere, so many for each true one, that look like landmarks at random."""
+    return landmark_map, [_with_invented(query, share, rng) for query in queries]
+
+
+def _without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:
+    """Return a query with a share of its boxes dropped at random."""
+    observation = query.observation
+    rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
+    similarities = observation.similarities
+    return replace(query, observation=replace(
+        observation, detections=observation.detections.select(rows),
+        similarities=None if similarities is None else np.asarray(similarities)[rows]))
+
+
+def _with_similarities(query: Query, similarities: np.ndarray) -> Query:
+    return replace(query, observation=replace(
+        query.observation, similarities=np.ascontiguousarray(similarities)))
+
+
+def _with_invented(query: Query, share: float, rng: np.random.Generator) -> Query:
+    """Return a query with boxes whose crops look like those of its own, in another order."""
+    observation, true = query.observation, query.observation.detections
+    count = int(rng.binomial(len(true), share)) if len(true) else 0
+    camera, similarities = observation.camera, np.asarray(observation.similarities)
+    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
+    rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
+    looks = rng.permuted(similarities[rows], axis=1)
+    detections = Detections(
+        np.vstack([true.bboxes_xyxy, boxes]),
+        true.class_ids + tuple(true.class_ids[row] for row in rng.permutation(rows)),
+        np.concatenate([true.scores, true.scores[rows]]))
+    return replace(query, observation=replace(
+        observation, detections=detections,
+        similarities=np.ascontiguousarray(np.vstack([similarities, looks]))))
