@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
-WARM_UP = """
+# A few kernels of one module, which are compiled within a second.
+FEW = """
+from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.ellipse import unit_circle_overlap
+warm_up(lambda: unit_circle_overlap(0.1, 0.2, 1.0, 2.0))
+print('warm')
+"""
+ALL = """
 import numpy as np
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -23,30 +30,25 @@ print('warm')
 """
 
 
-@pytest.fixture(scope='module')
-def warm_cache(tmp_path_factory):
-    """A cache of compiled kernels of its own."""
-    folder = tmp_path_factory.mktemp('numba')
-    assert run(folder).stdout == 'warm\n'
-    return folder
-
-
-def run(folder, code=WARM_UP):
+def run(code, folder):
+    """Run a program whose compiled kernels are kept in a folder."""
     return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           cwd=PROJECT, check=False,
                           env=os.environ | {'NUMBA_CACHE_DIR': str(folder)})
 
 
-@pytest.mark.parametrize(('ending', 'size'), [('nbi', 0), ('nbc', 100)])
-def test_a_damaged_cache_is_mended(warm_cache, ending, size):
-    files = list(warm_cache.rglob(f'*.{ending}'))
-    assert files
+@pytest.mark.parametrize(('ending', 'size', 'code'), [('nbi', 0, FEW), ('nbc', 100, ALL)])
+def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
+    assert run(FEW, tmp_path).stdout == 'warm\n'
+    files = list(tmp_path.rglob(f'*.{ending}'))
+    assert len(files) > 3
     for file in files:
         os.truncate(file, size)
-    done = run(warm_cache)
+    done = run(code, tmp_path)
     assert done.stdout == 'warm\n', done.stderr
+    assert 'compiling anew' in done.stderr
     # and is whole again
-    assert 'compiling anew' not in run(warm_cache).stderr
+    assert 'compiling anew' not in run(code, tmp_path).stderr
 
 
 FULL_DISK = """
@@ -64,11 +66,11 @@ print(*run())
 
 
 def test_a_full_disk_costs_only_the_cache(tmp_path):
-    done = run(tmp_path, FULL_DISK)
+    done = run(FULL_DISK, tmp_path)
     assert np.array(done.stdout.split(), float) == pytest.approx([2.0, np.pi]), done.stderr
     assert done.stderr.count('WARNING') == 1, 'not one for each kernel'
     assert 'NUMBA_CACHE_DIR' in done.stderr
-    assert run(tmp_path, FULL_DISK.replace('(100, 100)', '(-1, -1)')).stderr == ''
+    assert run(FULL_DISK.replace('(100, 100)', '(-1, -1)'), tmp_path).stderr == ''
     assert list(tmp_path.rglob('*.nbc'))
 
 
