@@ -2,19 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real nodes as processes, and a node in the test that talks to them over the wire."""
 
-import os
-import signal
-import subprocess
-import sys
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from processes import PATIENCE_S, Process, wait_for
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -29,83 +25,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.transforms import transform_from_pose
 from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
 
-PROJECT = Path(__file__).resolve().parents[2]
-# How long a test waits for what must come; only failures take so long.
-PATIENCE_S = 60.0
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
-
-class Process:
-    """A module of the package in its own process, with its output in a file."""
-
-    def __init__(self, module, arguments, log, within=(), **environment):
-        self.log = log
-        with log.open('w') as output:
-            self._popen = subprocess.Popen(
-                [*within, sys.executable, '-m', f'cliploc_ros.{module}', *map(str, arguments)],
-                stdout=output, stderr=subprocess.STDOUT, cwd=PROJECT,
-                env=os.environ | environment)
-
-    @property
-    def alive(self):
-        return self._popen.poll() is None
-
-    def output(self):
-        return self.log.read_text()
-
-    def sees(self, path):
-        """Return where a path of the process, which may have disks of its own, is for others."""
-        return Path(f'/proc/{self._popen.pid}/root{path}')
-
-    def wait_for_output(self, text):
-        wait_for(lambda: text in self.output() or not self.alive,
-                 f'{text!r} in the output:\n{self.output()[-2000:]}')
-        assert text in self.output(), self.output()[-2000:]
-
-    def memory_mib(self, field='VmRSS'):
-        """Resident memory now, or with VmHWM at its peak [MiB]."""
-        status = Path(f'/proc/{self._popen.pid}/status').read_text()
-        return int(status.split(f'{field}:')[1].split()[0]) / 1024
-
-    def descriptors(self):
-        """Return how many files, sockets and the like are open."""
-        return len(list(Path(f'/proc/{self._popen.pid}/fd').iterdir()))
-
-    def threads(self):
-        """Return how many threads run."""
-        return len(list(Path(f'/proc/{self._popen.pid}/task').iterdir()))
-
-    def wait_for_import(self, library):
-        """Wait until a part of a library is in memory: its loading has begun."""
-        maps = Path(f'/proc/{self._popen.pid}/maps')
-        wait_for(lambda: not self.alive or f'/{library}/' in maps.read_text(),
-                 f'{library} to be loaded')
-        assert self.alive, self.output()
-
-    def cpu_s(self):
-        """Processor time used so far [s]."""
-        fields = Path(f'/proc/{self._popen.pid}/stat').read_text().rsplit(')', 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-    def stop(self, signal_number=signal.SIGINT):
-        """Signal the process; return its exit code and how long it took to end [s]."""
-        start = time.monotonic()
-        if self.alive:
-            self._popen.send_signal(signal_number)
-        try:
-            code = self._popen.wait(20)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            code = self._popen.wait()
-        return code, time.monotonic() - start
-
-
-def wait_for(condition, what, patience_s=PATIENCE_S, work=lambda: time.sleep(0.02)):
-    """Wait until a condition holds; fail after a time limit."""
-    deadline = time.monotonic() + patience_s
-    while not condition():
-        assert time.monotonic() < deadline, f'waited {patience_s:g} s for {what}'
-        work()
 
 
 class Tester(Node):
@@ -268,12 +188,12 @@ def starter(folder):
     """Return a function that starts modules as processes, and the list of those it started."""
     started = []
 
-    def run(module, *arguments, parameters=None, **environment):
+    def run(module, *arguments, parameters=None, **options):
         ros_arguments = ['--ros-args'] if parameters is not None else []
         for name, value in (parameters or {}).items():
             ros_arguments += ['-p', f'{name}:={value}']
         process = Process(module, [*arguments, *ros_arguments],
-                          folder / f'{module}_{len(started)}.log', **environment)
+                          folder / f'{module}_{len(started)}.log', **options)
         started.append(process)
         return process
     return run, started
@@ -316,8 +236,8 @@ def relocalizer(start_shared, tester, room_map):
 @pytest.fixture
 def own_relocalizer(start, tester, room_map):
     """Start a relocalizer with parameters of the test's own; ready, or with its error logged."""
-    def run(*arguments, expect='ready after', **parameters):
-        process = start('nodes.relocalizer', *arguments,
+    def run(*arguments, expect='ready after', fresh=False, **parameters):
+        process = start('nodes.relocalizer', *arguments, fresh=fresh,
                         parameters=class_matching(room_map, **parameters))
         process.wait_for_output(expect)
         tester.connect()

@@ -14,7 +14,7 @@ import time
 import open_clip
 import pytest
 import torch
-from conftest import make_frame, transform_of
+from conftest import class_matching, make_frame, transform_of
 from rcl_interfaces.srv import GetParameters
 from scene import MAP_FROM_CAMERA, make_room, see_room
 
@@ -35,14 +35,18 @@ def cache_dir(tmp_path_factory):
     return tmp_path_factory.mktemp('cache')
 
 
-@pytest.fixture
-def clip_relocalizer(own_relocalizer, checkpoint, cache_dir):
-    def run(**parameters):
-        return own_relocalizer(**{
-            'matching': 'hybrid', 'algorithm': 'b-prosac', 'k': 12, 'iterations': 30000,
-            'clip_model': 'ViT-B-32', 'clip_pretrained': checkpoint, 'cache_dir': cache_dir,
-            **parameters})
-    return run
+@pytest.fixture(scope='module', params=['first start', 'warm cache'])
+def clip_relocalizer(request, start_shared, room_map, tester, checkpoint, cache_dir):
+    """A relocalizer with CLIP, started twice: the second time its labels are encoded already."""
+    process = start_shared('nodes.relocalizer', parameters=class_matching(
+        room_map, matching='hybrid', algorithm='b-prosac', k=12, iterations=30000,
+        clip_model='ViT-B-32', clip_pretrained=checkpoint, cache_dir=cache_dir))
+    process.wait_for_output('ready after')
+    assert ('encoded' if request.param == 'first start' else 'cached') in process.output()
+    tester.connect()
+    yield process
+    process.stop()
+    tester.wait(lambda: tester.count_publishers('/relocalizer/pose') == 0, 'its end')
 
 
 def crowded_frame():
@@ -53,23 +57,13 @@ def crowded_frame():
                                  seen.scores[rows]), stamp_s=5.0)
 
 
-def test_crops_lead_to_a_pose_and_the_second_start_is_warm(clip_relocalizer, tester):
-    print()
-    for name in ('first start', 'with a warm cache'):
-        process = clip_relocalizer()
-        assert ('encoded' if name == 'first start' else 'cached') in process.output()
-        assert tester.relocalize(make_frame()).success
-        tester.wait(lambda: tester.poses, 'a pose')
-        pose = transform_of(tester.poses.pop().pose.pose)
-        assert pose_error(pose, MAP_FROM_CAMERA) < (0.05, 1.0)
-        seconds = re.search(r'ready after ([0-9.]+) s', process.output()).group(1)
-        print(f'{name}: ready after {seconds} s, at most {process.memory_mib("VmHWM"):.0f} MiB')
-        process.stop()
-        tester.wait(lambda: tester.count_publishers('/relocalizer/pose') == 0, 'its end')
+def test_crops_lead_to_a_pose(clip_relocalizer, tester):
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: tester.poses, 'a pose')
+    assert pose_error(transform_of(tester.poses.pop().pose.pose), MAP_FROM_CAMERA) < (0.05, 1.0)
 
 
 def test_the_node_answers_while_clip_works(clip_relocalizer, tester):
-    clip_relocalizer()
     future = tester.ask()
     tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
     frame = crowded_frame()
@@ -89,38 +83,38 @@ def test_the_node_answers_while_clip_works(clip_relocalizer, tester):
     assert max(latencies) * 1e3 < clip_ms / 2
 
 
-@pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_node_while_clip_works(clip_relocalizer, tester, signal_number):
-    process = clip_relocalizer()
+def test_signals_end_the_node_while_clip_works(request, clip_relocalizer, tester):
+    """The last to use the process: the first start is ended by SIGINT, the other by SIGTERM."""
     future = tester.ask()
-    tester.feed_until(lambda: tester.listened_to() == 0 or future.done(), crowded_frame(),
-                      'the frame to be taken')
-    code, seconds = process.stop(signal_number)
-    print(f'\nended after {seconds:.2f} s')
-    assert code == 0, process.output()
+    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
+    before = clip_relocalizer.cpu_s()
+    tester.feed_until(lambda: clip_relocalizer.cpu_s() > before + 0.5, crowded_frame(),
+                      'CLIP to work')
+    assert not future.done()
+    number = signal.SIGINT if 'first' in request.node.name else signal.SIGTERM
+    code, seconds = clip_relocalizer.stop(number)
+    print(f'\n{number.name}: ended after {seconds:.2f} s')
+    assert code == 0, clip_relocalizer.output()
     assert seconds < 2.0
-    assert 'Traceback' not in process.output()
+    assert 'Traceback' not in clip_relocalizer.output()
 
 
-def test_weights_of_another_model_are_named(own_relocalizer, checkpoint, cache_dir, tester):
+def test_weights_that_do_not_load_are_named(own_relocalizer, checkpoint, cache_dir, tester,
+                                            tmp_path):
+    """Truncated ones, then those of another model; each request tries again."""
+    weights = tmp_path / 'weights.pt'
+    with checkpoint.open('rb') as file:
+        weights.write_bytes(file.read(checkpoint.stat().st_size // 2))
     process = own_relocalizer(
         expect='[ERROR]', matching='hybrid', algorithm='b-prosac', clip_model='ViT-B-16',
-        clip_pretrained=checkpoint, cache_dir=cache_dir)
-    answer = tester.answer(tester.ask())
-    assert not answer.success
-    assert str(checkpoint) in answer.message
-    assert 'ViT-B-16' in answer.message
-    assert process.alive
-
-
-def test_truncated_weights_are_named(own_relocalizer, checkpoint, cache_dir, tester, tmp_path):
-    half = tmp_path / 'half.pt'
-    with checkpoint.open('rb') as file:
-        half.write_bytes(file.read(checkpoint.stat().st_size // 2))
-    process = own_relocalizer(
-        expect='[ERROR]', matching='hybrid', algorithm='b-prosac', clip_model='ViT-B-32',
-        clip_pretrained=half, cache_dir=cache_dir)
-    answer = tester.answer(tester.ask())
-    assert not answer.success
-    assert str(half) in answer.message
+        clip_pretrained=weights, cache_dir=cache_dir)
+    truncated = tester.answer(tester.ask())
+    weights.unlink()
+    weights.symlink_to(checkpoint)
+    other = tester.answer(tester.ask())
+    for answer in (truncated, other):
+        assert not answer.success
+        assert str(weights) in answer.message
+    assert 'ViT-B-16' in other.message
+    assert truncated.message != other.message
     assert process.alive

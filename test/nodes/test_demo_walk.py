@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 import yaml
-from conftest import PROJECT
+from processes import PROJECT
 from wake_ups import judge, wake_up_on_every_frame
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
@@ -25,9 +25,9 @@ def recording(tmp_path, monkeypatch):
 
 def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
     print()
-    start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
+    start('nodes.detector', fresh=True, parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
         'ready after')
-    start('nodes.relocalizer', parameters={
+    start('nodes.relocalizer', fresh=True, parameters={
         'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid',
         'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
         'cache_dir': tmp_path}).wait_for_output('ready after')

@@ -9,9 +9,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PROJECT, class_matching, make_frame
+from conftest import class_matching, make_frame
 from disks import small_disk
 from geometry_msgs.msg import PoseArray
+from processes import PROJECT
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -120,7 +121,7 @@ def fast_frame():
 
 
 def test_a_fast_camera_leaves_no_backlog(own_relocalizer, tester, fast_frame):
-    process = own_relocalizer(mode='continuous')
+    process = own_relocalizer(fresh=True, mode='continuous')
     latencies_s, memory_mib = [], []
     subscription = tester.create_subscription(
         PoseArray, 'relocalizer/hypotheses', lambda msg: latencies_s.append(

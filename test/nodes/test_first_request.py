@@ -18,7 +18,7 @@ WITH_CLIP = {'matching': 'hybrid', 'algorithm': 'auto', 'clip_model': ASSETS / '
 @pytest.mark.parametrize('parameters', [{'algorithm': 'auto'}, WITH_CLIP],
                          ids=['class', 'CLIP'])
 def test_the_first_request_is_no_slower(own_relocalizer, tester, parameters, tmp_path):
-    own_relocalizer(**parameters, cache_dir=tmp_path)
+    own_relocalizer(fresh=True, **parameters, cache_dir=tmp_path)
     times = []
     for number in range(10):
         message = tester.relocalize(make_frame(stamp_s=100.0 + number)).message

@@ -38,7 +38,7 @@ def garble(frame, rng):
 
 
 def test_garbage_at_full_rate(own_relocalizer, tester):
-    process = own_relocalizer(mode='continuous')
+    process = own_relocalizer(fresh=True, mode='continuous')
     tester.wait(lambda: tester.images.get_subscription_count(), 'the node to listen')
     rng = np.random.default_rng(0)
     heard = None

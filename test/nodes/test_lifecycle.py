@@ -8,9 +8,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PROJECT, class_matching, make_frame
+from conftest import class_matching, make_frame
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from processes import PROJECT
 
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 # What each transition makes of each state where it is possible.
@@ -67,8 +68,9 @@ def manage(start, tester):
     """Start a node that waits for its manager; return both."""
     managers = []
 
-    def run(name, **parameters):
-        process = start(f'nodes.{name}', parameters={'autostart': 'false', **parameters})
+    def run(name, fresh=False, **parameters):
+        process = start(f'nodes.{name}', fresh=fresh,
+                        parameters={'autostart': 'false', **parameters})
         managers.append(Manager(tester, name))
         return process, managers[-1]
     yield run
@@ -86,7 +88,7 @@ def with_networks(name, folder):
 
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
 def test_many_transitions_in_any_order_leak_nothing(manage, tmp_path, name):
-    process, manager = manage(name, **with_networks(name, tmp_path))
+    process, manager = manage(name, fresh=True, **with_networks(name, tmp_path))
     rng, state, measured = np.random.default_rng(0), 'unconfigured', []
     for number in range(MANY):
         allowed = [wanted for start, wanted in TRANSITIONS if start == state]
@@ -135,7 +137,7 @@ def test_shutdown_works_from_every_state(manage, room_map, state):
 
 def test_sigterm_while_weights_load(start, tmp_path):
     for name in ('detector', 'relocalizer'):
-        process = start(f'nodes.{name}', parameters=with_networks(name, tmp_path))
+        process = start(f'nodes.{name}', fresh=True, parameters=with_networks(name, tmp_path))
         process.wait_for_import('torch')
         code, seconds = process.stop(signal.SIGTERM)
         assert code == 0, process.output()

@@ -9,7 +9,8 @@ import time
 import cv2
 import numpy as np
 import pytest
-from conftest import PROJECT, make_frame, transform_of
+from conftest import make_frame, transform_of
+from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
 
@@ -125,7 +126,7 @@ def test_no_mount_is_an_answer_not_an_end(own_relocalizer, tester):
 @pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('asked', [False, True])
 def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
-    process = own_relocalizer()
+    process = own_relocalizer(fresh=True)
     if asked:
         tester.ask()
         tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
@@ -136,7 +137,7 @@ def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
 
 
 def test_a_flood_of_images_is_survived_in_bounded_memory(own_relocalizer, tester):
-    process = own_relocalizer(mode='continuous')
+    process = own_relocalizer(fresh=True, mode='continuous')
     image, _, _ = make_frame()
     tester.wait(lambda: tester.images.get_subscription_count() > 0, 'the relocalizer to listen')
     before, start = process.memory_mib(), time.monotonic()

@@ -14,8 +14,9 @@ from statistics import median_low
 import cv2
 import numpy as np
 import pytest
-from conftest import PATIENCE_S, RELIABLE, transform_of, wait_for
+from conftest import RELIABLE, transform_of
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from processes import PATIENCE_S, wait_for
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
@@ -175,7 +176,7 @@ def judge(request, witness):
 
 
 def test_soak(start, ros, own_relocalizer, recording):
-    process = own_relocalizer(image_transport='compressed')
+    process = own_relocalizer(fresh=True, image_transport='compressed')
     executor = SingleThreadedExecutor()
     witness = Witness(executor)
     clients = [Client(number, executor, REQUESTS // 2) for number in range(2)]
