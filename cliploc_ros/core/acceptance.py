@@ -41,6 +41,8 @@ class Evidence:
     meetings : float
         How many samples, of those that the search tried, hold nothing but inliers of the best
         hypothesis; infinite of a search that tried all.
+    unexplained : float
+        Other objects of the map's classes, see cliploc_ros.core.confidence.
     """
 
     inliers: int
@@ -49,6 +51,7 @@ class Evidence:
     coverage: float = 1.0
     tried: int = 0
     meetings: float = math.inf
+    unexplained: float = 0.0
 
     @property
     def found(self) -> float:
@@ -96,8 +99,10 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely)):
         return (f'ambiguous: the best pose is right with {says}, another with '
                 f'{_percent(evidence.rival)}: turn to where more can be told apart')
-    return (f'unsure: {evidence.inliers} objects make the best pose right with {says}: turn to '
-            'where more are in view')
+    others = round(evidence.unexplained)
+    unlike = f' ({others} more are where the map has none: is it this place?)' if others else ''
+    return (f'unsure: {evidence.inliers} objects{unlike} make the best pose right with {says}: '
+            'turn to where more are in view')
 
 
 def _percent(share: float) -> str:

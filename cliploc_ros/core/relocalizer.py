@@ -192,7 +192,8 @@ class Relocalizer:
             its_support.inliers, likely[0], max(likely[1:], default=0.0), coverage,
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
-            else meetings_of(frames, best, matches))
+            else meetings_of(frames, best, matches),
+            unexplained=its_support.unexplained)
 
 
 def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:

@@ -178,6 +178,7 @@ def test_confidences_never_exceed_certainty(rng):
     (Evidence(3, 0.995), {}, ''),
     (Evidence(5, 0.5, 0.3), {}, 'ambiguous: the best pose is right with 50 %'),
     (Evidence(5, 0.5, 0.1), {}, 'unsure: 5 objects'),
+    (Evidence(5, 0.5, unexplained=4.0), {}, 'unsure: 5 objects (4 more are where the map has'),
     (Evidence(5, 0.1, 0.3), {}, 'ambiguous: '),
     (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
     (Evidence(8, 0.98999), {}, 'unsure: 8 objects make the best pose right with 98.9 %'),
