@@ -8,6 +8,7 @@ size and depth are bounded, so that a hostile file ends in an error and not in a
 
 import os
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 import yaml
@@ -31,14 +32,19 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     MapError
-        The file cannot be read, is too large, is no YAML mapping, is nested too deeply, has an
-        alias or a repeated key. The message names file and line.
+        The file cannot be read, is none, is too large, is no YAML mapping, is nested too deeply,
+        has an alias or a repeated key. The message names file and line.
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
+        if not S_ISREG(path.stat().st_mode):
+            # whoever may set parameters may name a device or a pipe, which have no end
+            raise MapError(f'{path}: is no regular file')
+        with path.open('rb') as file:
+            content = file.read(MAX_FILE_BYTES + 1)
+        if len(content) > MAX_FILE_BYTES:
             raise MapError(f'{path}: larger than {MAX_FILE_BYTES // 2**20} MiB')
-        text = path.read_bytes().decode('utf-8')
+        text = content.decode('utf-8')
     except OSError as error:
         raise MapError(f'{path}: {error.strerror}') from error
     except UnicodeDecodeError as error:

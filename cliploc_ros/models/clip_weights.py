@@ -242,10 +242,10 @@ def _download(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
     what = f"the weights '{options.pretrained}' of CLIP model '{model}'"
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
-                         'checkpoint_path to the file')
+                         'clip_checkpoint_path to the file')
     remedy = (f'Without a network: download {names[0]} or {names[1]} from '
-              f'https://huggingface.co/{repository} on another machine and set checkpoint_path '
-              'to the file')
+              f'https://huggingface.co/{repository} on another machine and set '
+              'clip_checkpoint_path to the file')
     return download('cliploc_ros.models.clip_weights:fetch_from_hub',
                     [repository, ','.join(names)], _weights_folder(options), what, remedy,
                     options.download_timeout_s)

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map that stands in a node's parameters, as `--params-file map.yaml` puts it there."""
 
-from contextlib import suppress
-from pathlib import Path
-from stat import S_ISREG
 from typing import Any
 
 from rclpy.node import Node
@@ -24,10 +21,6 @@ def load_map(node: Node, map_file: str) -> LandmarkMap:
         Names the source, the landmark and the field to mend.
     """
     if map_file:
-        with suppress(OSError):  # which reading it will name
-            if not S_ISREG(Path(map_file).stat().st_mode):
-                # whoever may set parameters may name a device or a pipe, which have no end
-                raise MapError(f'{map_file}: is no regular file')
         return LandmarkMap.from_file(map_file)
     parameters = node.get_parameters_by_prefix('map')
     if not parameters:

@@ -71,7 +71,7 @@ RELOCALIZER = (
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
     ParameterRow('time_budget_ms', 50.0, 'Search and refinement of auto take no longer; the other '
                  'algorithms have timeout_s, and what they are cut short in is refused.',
-                 unit='ms', low=0.0, high=3.6e6),
+                 unit='ms', low=1.0, high=3.6e6),
     ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
                  'base_frame, or the topic imu. auto then needs two objects in place of three.',
                  choices=SOURCES, read_only=True),

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
 import copy
+import os
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cliploc_ros.core import parameter_file
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 
@@ -107,6 +109,21 @@ def test_a_repeated_landmark_is_refused(tmp_path):
     text = yaml.safe_dump(file_of({'cup_1': CUP, 'cup_2': CUP})).replace('cup_2', 'cup_1')
     with pytest.raises(MapError, match=r"line \d+: 'cup_1' stands twice"):
         LandmarkMap.from_file(write(tmp_path, text))
+
+
+def test_what_has_no_end_is_not_read(tmp_path):
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    for path in ('/dev/zero', pipe, tmp_path):
+        with pytest.raises(MapError, match=f'{path}: is no regular file'):
+            LandmarkMap.from_file(path)
+
+
+def test_a_file_too_large_is_refused(tmp_path):
+    with (tmp_path / 'map.yaml').open('wb') as file:
+        file.truncate(parameter_file.MAX_FILE_BYTES + 1)  # holes: it takes no disk
+    with pytest.raises(MapError, match='larger than 256 MiB'):
+        LandmarkMap.from_file(tmp_path / 'map.yaml')
 
 
 def test_a_missing_file_is_named(tmp_path):

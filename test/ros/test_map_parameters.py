@@ -1,7 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-import os
-
 import numpy as np
 import pytest
 import yaml
@@ -72,16 +70,6 @@ def test_a_file_goes_before_the_parameters(start_with, tmp_path):
     write_map(make_room(), path)
     with pytest.raises(MapError, match=r'absent\.yaml'):
         load_map(start_with(path), str(absent))
-
-
-def test_what_has_no_end_is_not_read(tmp_path):
-    pipe = tmp_path / 'pipe'
-    os.mkfifo(pipe)
-    for path in ('/dev/zero', str(pipe), str(tmp_path)):
-        with pytest.raises(MapError, match=f'{path}: is no regular file'):
-            load_map(None, path)
-    with pytest.raises(MapError, match='No such file'):
-        load_map(None, str(tmp_path / 'nothing'))
 
 
 @pytest.mark.parametrize(('change', 'message'), [
