@@ -11,6 +11,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from textwrap import fill
 
@@ -44,7 +45,8 @@ _SUCCESS_M = 1.0
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 _ALL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 _DISTANCES_M = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
-_PANEL_SIZE = 2.6, 3.4  # of one trouble in the figure [inch]
+_PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
+_COLUMNS = 3
 _LABEL_WIDTH = 22
 
 @dataclass(frozen=True)
@@ -85,12 +87,17 @@ def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Troubl
 
 def draw(folder: Path, found: Sequence[tuple[Trouble, Sequence[Summary]]]) -> Path:
     """Draw success, what is believed, and what is believed and wrong, with 95 % intervals."""
-    figure = Figure(figsize=(_PANEL_SIZE[0] * len(found), _PANEL_SIZE[1]), layout='constrained')
-    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
-    for axes, (trouble, summaries) in zip(panels, found, strict=True):
+    rows, columns = ceil(len(found) / _COLUMNS), min(len(found), _COLUMNS)
+    figure = Figure(figsize=(_PANEL_SIZE[0] * columns, _PANEL_SIZE[1] * rows),
+                    layout='constrained')
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes, (trouble, summaries) in zip(panels.flat, found, strict=False):
         _draw_panel(axes, trouble, summaries)
-    panels[0].set(ylabel='share of images', ylim=(-0.02, 1.02))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+    for axes in panels[:, 0]:
+        axes.set(ylabel='share of images', ylim=(-0.02, 1.02))
+    for axes in panels.flat[len(found):]:
+        axes.remove()
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
                   frameon=False, fontsize=9)
     return save_figure(figure, folder / 'robustness.png')
 
