@@ -41,6 +41,8 @@ from cliploc_ros.ros.worker import LatestOnly
 
 _LOG_PERIOD_S = 5.0
 _VERDICTS = ('accepted', 'refused', 'withheld')
+# Each image that odometry does not join to those before is another chance to be wrong.
+_MAX_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Answer:
     is_open: bool = False
     #: Whether it comes from any frame.
     has_frame: bool = True
+    #: Whether it was refused by one frame alone.
+    is_alone: bool = False
 
 
 class RelocalizerNode(ManagedNode):
@@ -159,13 +163,15 @@ class RelocalizerNode(ManagedNode):
             if self.active and self._frames is not None:
                 self._listen(listening, self._frames)
             answer, frames = self._flights.board(timeout_s), 1
-            while answer.is_open or not answer.has_frame:
+            alone = int(answer.is_alone)
+            while (answer.is_open and alone < _MAX_ALONE) or not answer.has_frame:
                 left_s = start + timeout_s - time.monotonic()
                 if left_s <= 0.0:
                     break
                 later = self._flights.board(left_s)
                 if later.has_frame:
                     answer, frames = later, frames + 1
+                    alone += later.is_alone
         if frames > 1:
             answer = replace(answer, message=f'{answer.message} [{frames} frames in '
                                              f'{time.monotonic() - start:.1f} s]')
@@ -260,13 +266,14 @@ class RelocalizerNode(ManagedNode):
             values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
             header.stamp, values['tf_timeout_s'])
         views: list[View] | None = [] if self._visualization.wants_view else None
+        place = self._place(frame, values, camera_from_base)
         found, times = localizer.localize(
-            frame, values, self._up_in_camera(frame, values, camera_from_base), views,
-            self._place(frame, values, camera_from_base))
+            frame, values, self._up_in_camera(frame, values, camera_from_base), views, place)
         self.stages.add(times.ms)
         self.check_active()
         self._visualization.show(header, localizer.landmark_map, found, camera_from_base)
-        answer = self._answer(header, found, times, camera_from_base)
+        answer = replace(self._answer(header, found, times, camera_from_base),
+                         is_alone=place is None and not found.accepted)
         for view in views or []:  # who waits for the answer does not wait for its picture
             self.worker.submit(partial(
                 self._visualization.show_view, frame.image.header, view, localizer.landmark_map,

@@ -2,18 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which of the last frames are asked about together: a few, from places that differ."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.frame_search import Searched
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.transforms import invert_transform, pose_error
 
 # A camera that moved less sees the same again: such a frame takes the place of the one before.
 _MOVED_M = 0.05
 _MOVED_DEG = 3.0
+# Looks agree on a pose to this.
+_AGREEING_M = 0.5
+_AGREEING_DEG = 20.0
+# A camera is to notice in time when what was in its way is gone.
+_MAX_LOOKS = 20
+
+
+class _Look(NamedTuple):
+    """What the best pose, believed or not, made of odometry each time somebody asked."""
+
+    stamp_ns: int
+    map_from_odom: NDArray[np.float64]
 
 
 @dataclass
@@ -40,6 +54,7 @@ class FrameWindow:
 
     def __init__(self) -> None:
         self._kept: list[Kept] = []
+        self._looks: list[_Look] = []
         self._run = -1
 
     def __len__(self) -> int:
@@ -47,8 +62,9 @@ class FrameWindow:
         return len(self._kept)
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Forget all frames, and what they led to."""
         self._kept.clear()
+        self._looks.clear()
 
     def forget_searches(self) -> None:
         """Forget what was found in the frames: it would be found in another way now."""
@@ -74,14 +90,15 @@ class FrameWindow:
             back.
         """
         if run != self._run:
-            self._kept.clear()
+            self.clear()
             self._run = run
         place = observation.odom_from_camera
         assert place is not None
-        oldest_ns = observation.stamp_ns - round(length_s * 1e9)
+        lasting_ns = range(observation.stamp_ns - round(length_s * 1e9), observation.stamp_ns)
+        self._looks = [one for one in self._looks if one.stamp_ns in lasting_ns]
         # with a frame that shows nothing there is nothing to join
         kept = [one for one in self._kept if len(one.observation.detections)
-                and oldest_ns <= one.observation.stamp_ns < observation.stamp_ns]
+                and one.observation.stamp_ns in lasting_ns]
         anchor = place
         if kept and not _has_moved(kept[-1].anchor, place):
             anchor = kept.pop().anchor
@@ -91,10 +108,42 @@ class FrameWindow:
         self._kept = kept
         return list(kept)
 
+    def judge(self, found: Relocalization) -> Relocalization:
+        """Refuse a pose that most of the last looks, carried by odometry, do not lead to.
+
+        Who asks until a pose is believed gives chance as many chances: of robots before boxes at
+        random, where one look of fifty is believed, one of three was misled within twenty. What
+        is right is found again and again, what chance finds is not.
+
+        Parameters
+        ----------
+        found : Relocalization
+            By the frames that were last joined.
+        """
+        if found.map_from_camera is None:
+            return found
+        newest = self._kept[-1].observation
+        assert newest.odom_from_camera is not None
+        look = _Look(newest.stamp_ns,
+                     found.map_from_camera @ invert_transform(newest.odom_from_camera))
+        self._looks = [*self._looks, look][-_MAX_LOOKS:]
+        agreeing = sum(_agree(look.map_from_odom @ newest.odom_from_camera, found.map_from_camera)
+                       for look in self._looks)
+        if not found.accepted or 2 * agreeing > len(self._looks):
+            return found
+        return replace(found, accepted=False, reason=(
+            f'unsure: only {agreeing} of the last {len(self._looks)} images lead to this pose: '
+            'turn to where more objects are in view'))
+
 
 def _has_moved(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     distance_m, angle_deg = pose_error(before, after)
     return distance_m > _MOVED_M or angle_deg > _MOVED_DEG
+
+
+def _agree(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    distance_m, angle_deg = pose_error(one, other)
+    return distance_m < _AGREEING_M and angle_deg < _AGREEING_DEG
 
 
 def _way(before: Kept, after: Kept) -> float:

@@ -146,7 +146,7 @@ class Localizer:
         found = relocalizer.relocalize([frame.observation for frame in frames], searched)
         for frame, one in zip(frames, searched, strict=True):
             frame.searched = one
-        return found
+        return self._window.judge(found)
 
     def _with_options(self, values: Mapping[str, Any]) -> Relocalizer:
         """Return the relocalizer for the options as they are now."""
