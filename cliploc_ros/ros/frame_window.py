@@ -111,9 +111,8 @@ class FrameWindow:
     def judge(self, found: Relocalization) -> Relocalization:
         """Refuse a pose that most of the last looks, carried by odometry, do not lead to.
 
-        Who asks until a pose is believed gives chance as many chances: of robots before boxes at
-        random, where one look of fifty is believed, one of three was misled within twenty. What
-        is right is found again and again, what chance finds is not.
+        Who asks until a pose is believed gives chance as many chances. What is right is found
+        again and again, what chance finds is not.
 
         Parameters
         ----------
