@@ -225,6 +225,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """Take a step; rclpy would swallow what it raises."""
         try:
             step()
+        except StoppedError as error:
+            self._failure = str(error)
+            return Outcome.FAILURE
         except CliplocError as error:
             self._failure = str(error)
             self.get_logger().error(self._failure)

@@ -5,7 +5,7 @@
 import threading
 import traceback
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from cliploc_ros.errors import CliplocError, InternalError, StoppedError
@@ -27,6 +27,7 @@ class Worker:
         self._report = report
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix='inference')
         self._running: set[Future[Any]] = set()
+        self._stopped: Future[None] = Future()
 
     def submit[T](self, task: Callable[[], T]) -> 'Future[T]':
         """Queue a task; its result or CliplocError is in the future returned."""
@@ -46,10 +47,12 @@ class Worker:
         CliplocError
             What the task raised; StoppedError when the process ends first.
         """
-        try:
-            return self.submit(task).result()
-        except CancelledError as error:
-            raise StoppedError('the node is shutting down') from error
+        future = self.submit(task)
+        either: list[Future[Any]] = [future, self._stopped]
+        wait(either, return_when=FIRST_COMPLETED)
+        if not future.done() or future.cancelled():
+            raise StoppedError('the node is shutting down')
+        return future.result()
 
     def _guarded[T](self, task: Callable[[], T]) -> T:
         try:
@@ -62,9 +65,11 @@ class Worker:
                                 'is in the log)') from error
 
     def stop(self) -> None:
-        """Drop what waits, and give the running task a moment to end."""
+        """Drop what waits, and give the running task a moment to end; nobody waits for it then."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         wait(list(self._running), _GRACE_S)
+        if not self._stopped.done():
+            self._stopped.set_result(None)
 
 
 class LatestOnly[T]:

@@ -137,23 +137,26 @@ class Announcing(Worker):
         return future
 
 
-def test_whoever_waits_in_run_learns_that_the_node_stops(gate):
+@pytest.mark.parametrize('is_running', [False, True])
+def test_whoever_waits_in_run_learns_that_the_node_stops(gate, is_running):
     worker = Announcing(print)
-    gate.hold(worker)
+    if not is_running:
+        gate.hold(worker)
     worker.queued.clear()
     learned = []
 
     def ask():
         try:
-            worker.run(lambda: None)
+            worker.run(gate if is_running else lambda: None)
         except CliplocError as error:
             learned.append(error)
     asker = threading.Thread(target=ask)
     asker.start()
     assert worker.queued.wait(PATIENCE_S)
     worker.stop()
-    asker.join(PATIENCE_S)
+    asker.join(PATIENCE_S / 2)  # before the gate gives up
     assert [type(error) for error in learned] == [StoppedError]
+    gate.open()
 
 
 def test_a_task_that_ends_in_time_is_waited_for(worker):
