@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import OptionsError
 
 ASSETS = Path(__file__).resolve().parents[1] / 'demo' / 'assets'

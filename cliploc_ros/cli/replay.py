@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import run_command, split_ros_args
+from cliploc_ros.command import run_command, split_ros_args
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.errors import OptionsError
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.rosbag import STORAGES

@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import run_command
+from cliploc_ros.command import run_command
 from cliploc_ros.demo.world.reading import find_worlds, hold_out, read_frames
 
 CONFIG = Path(__file__).parent / 'assets' / 'clip.json'

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import run_command
+from cliploc_ros.command import run_command
 from cliploc_ros.demo.world.appearance import CLASSES
 from cliploc_ros.demo.world.reading import TrueFrame, find_worlds, hold_out, read_frames
 from cliploc_ros.demo.world.trajectories import CAMERA

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from tqdm import tqdm
 
-from cliploc_ros.cli.command import run_command
+from cliploc_ros.command import run_command
 from cliploc_ros.core.confidence import DEFAULT, Calibration, Support, confidences
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
