@@ -61,15 +61,22 @@ def assert_error(done, *named):
         assert text in lines[0]
 
 
+def children_cpu_s():
+    """Processor time of the commands run so far: others may be at work beside them."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def test_the_papers_table_on_real_queries(shared_data, tmp_path):
     office = shared_data / 'tum_fr3_office'
-    start = time.monotonic()
+    start, used_s = time.monotonic(), children_cpu_s()
     done = evaluate('--queries', office / 'queries.npz', '--map', office / 'map.yaml', '--methods',
                     'all', '--trials', 5, '--out', tmp_path)
-    seconds = time.monotonic() - start
+    seconds, used_s = time.monotonic() - start, children_cpu_s() - used_s
     assert done.returncode == 0, done.stderr
-    print(f'\n{done.stdout}ten methods, five trials, sweep and figures in {seconds:.0f} s')
-    assert seconds < 60
+    print(f'\n{done.stdout}ten methods, five trials, sweep and figures in {seconds:.0f} s, '
+          f'{used_s:.0f} s of processors')
+    assert used_s < 120
     table = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['table']
     rows = {f'{matching}_{algorithm}': [float(rate) for rate in rates.split(' / ')]
             for matching, algorithm, rates in re.findall(
