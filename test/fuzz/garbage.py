@@ -56,6 +56,10 @@ def images():
         data=or_sound(bytes(SIZE), st.one_of(st.binary(max_size=100), st.just(bytes(3 * SIZE)))))
 
 
+def sound_info():
+    return CameraInfo(d=[], distortion_model='plumb_bob', **INFO)
+
+
 def compressed_images():
     starts = st.sampled_from([b'', b'\xff\xd8\xff\xc0\x00\x11\x08', b'\x89PNG\r\n\x1a\n',
                               b'\xff\xd8\xff\xe0\x00\x02', b'GIF89a'])
@@ -107,5 +111,3 @@ def stamped(msg, nanoseconds):
     msg.header = Header(frame_id='camera', stamp=Time(sec=nanoseconds // 10**9,
                                                       nanosec=nanoseconds % 10**9))
     return msg
-
-

@@ -9,6 +9,9 @@ from garbage import (
     detections,
     images,
     infos,
+    likely_detections,
+    sound_image,
+    sound_info,
     stamped,
 )
 from hypothesis import given
@@ -54,3 +57,10 @@ def test_raw_images(localizer, values, image, info, found):
 def test_compressed_images(localizer, values, image, info, found):
     result = localize(localizer, values, image, info, found)
     assert result is None or not result.accepted
+
+
+@given(likely_detections())
+@CASES
+def test_likely_boxes(localizer, values, found):
+    result = localize(localizer, values, sound_image(), sound_info(), found)
+    assert result is not None and not result.accepted
