@@ -18,9 +18,14 @@ import numpy as np
 
 try:
     from numba import njit
+    from numba.core import config
     from numba.core.caching import NullCache
 except ImportError:
     njit = None
+else:
+    # As newer numba always has it; 0.59 takes a damaged file of a kernel that another one
+    # calls for a mistake in that one's types.
+    config.CAPTURED_ERRORS = 'new_style'
 
 logger = logging.getLogger(__name__)
 _kernels: list[Any] = []
