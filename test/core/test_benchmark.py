@@ -12,6 +12,7 @@ import pytest
 PROJECT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.clock
 def test_the_kernel_is_two_orders_faster_than_a_plain_loop_and_as_good():
     done = subprocess.run([sys.executable, '-m', 'cliploc_ros.core.benchmark', '--landmarks',
                            '100', '1000'], capture_output=True, text=True, cwd=PROJECT, check=True)

@@ -113,9 +113,9 @@ def test_a_hypothesis_costs_little_more_in_a_large_map():
         samples = draw_ransac(scene.pairs, 4_000, np.random.default_rng(0))
         least = np.inf
         for _ in range(5):
-            start = time.perf_counter()
+            start = time.process_time()
             list(search_samples(scene, samples, Leaders.none_yet()))
-            least = min(least, time.perf_counter() - start)
+            least = min(least, time.process_time() - start)
         times_us[count] = 1e6 * least / len(samples)
     print(f'\na sample among 100 landmarks {times_us[100]:.1f} us, among 100,000 '
           f'{times_us[100_000]:.1f} us')

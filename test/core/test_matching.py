@@ -106,6 +106,7 @@ def test_no_more_are_tried_than_asked_for(limit):
         else not again.solved
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('count', [60, 400])
 def test_a_search_keeps_its_time_budget(count):
     """To within 10 % on an idle core; the least of some runs, since others work beside it."""
@@ -139,9 +140,9 @@ for count in (60, 400):
     compiled = sum(len(kernel.signatures) for kernel in _kernels)
     times = []
     for _ in range(10):
-        start = time.perf_counter()
+        start = time.process_time()
         assert relocalizer.relocalize([observation]).solved
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     print(count, sum(len(kernel.signatures) for kernel in _kernels) - compiled,
           1e3 * times[0], 1e3 * min(times))
 """

@@ -62,9 +62,9 @@ def test_a_hundred_thousand_labels_in_little_time_and_memory(rng):
     nearest_landmarks(similarities, 10)
     least = np.inf
     for _ in range(15):
-        start = time.perf_counter()
+        start = time.process_time()
         nearest_landmarks(similarities, 10)
-        least = min(least, time.perf_counter() - start)
+        least = min(least, time.process_time() - start)
     tracemalloc.start()
     nearest_landmarks(similarities, 10)
     peak = tracemalloc.get_traced_memory()[1]
