@@ -4,6 +4,7 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from math import comb
 from typing import NamedTuple
 
@@ -100,14 +101,21 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
-        samples = _draw(scene, options)
-        progress = _run(_search(scene, vertical, options, samples, leaders), deadline)
+        samples, prior = _draw(scene, options), _prior(vertical, options)
+        if options.algorithm == 'auto':
+            try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
+                              limit=options.iterations)
+            progress = _run(try_all(leaders, size=_sample_size(vertical)), deadline)
+            if _is_known(vertical):
+                # Where what is said to be the vertical is wrong, as by a wrong mount, what the
+                # boxes say by themselves must be among the rivals of what it leads to.
+                free = _run(try_all(tilted), deadline)
+                progress = progress._replace(tried=progress.tried + free.tried)
+        elif samples is None:
+            progress = _run(search_exhaustively(scene, leaders, prior), deadline)
+        else:
+            progress = _run(search_samples(scene, samples, leaders, prior), deadline)
         progress = progress._replace(coverage=progress.coverage * share)
-        if _is_known(vertical):
-            # Where what is said to be the vertical is wrong, as by a wrong mount, what the boxes
-            # say by themselves must be among the rivals of what it leads to.
-            free = _try_in_order(scene, SAMPLE_SIZE, vertical, options, tilted)
-            progress = progress._replace(tried=progress.tried + _run(free, deadline).tried)
     return Searched(scene, vertical, leaders, tilted, progress, samples)
 
 
@@ -148,23 +156,6 @@ def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None
     draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
     seed = options.random_seed if options.random_seed >= 0 else None
     return draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-
-
-def _search(scene: Scene, vertical: NDArray[np.float64], options: RelocalizerOptions,
-            samples: NDArray[np.int64] | None, leaders: Leaders) -> Iterator[Progress]:
-    """Return the search that the options name."""
-    if options.algorithm == 'auto':
-        return _try_in_order(scene, _sample_size(vertical), vertical, options, leaders)
-    prior = _prior(vertical, options)
-    if samples is None:
-        return search_exhaustively(scene, leaders, prior)
-    return search_samples(scene, samples, leaders, prior)
-
-
-def _try_in_order(scene: Scene, size: int, vertical: NDArray[np.float64],
-                  options: RelocalizerOptions, leaders: Leaders) -> Iterator[Progress]:
-    return search_progressively(scene, compatible_pairs(scene), leaders,
-                                _prior(vertical, options), options.iterations, size)
 
 
 def _run(search: Iterator[Progress], deadline: float) -> Progress:
