@@ -31,7 +31,9 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of poses would be taken for a speed.
 _MOMENT_NS = 300_000_000
-_MOMENT_PATIENCE_S = 0.5
+# A moment of what has just begun, and what a busy machine makes of it: a robot that is taken to
+# stand although it moves is worse than an answer that comes later.
+_MOMENT_PATIENCE_S = 2.0
 # How long a publisher that has just been found may need for its first message.
 _DISCOVERY_S = 1.0
 
