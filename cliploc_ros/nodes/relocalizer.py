@@ -28,6 +28,7 @@ from cliploc_ros.ros.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.frames import BaseFrame, FrameError
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.lingering import Lingering
 from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.odom_frame import OdomFrame
 from cliploc_ros.ros.odometry import CameraPlace, OdometrySource
@@ -75,6 +76,7 @@ class RelocalizerNode(ManagedNode):
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
         self._listening = ExitStack()
+        self._lingering = Lingering(self)
         self._verdict = 'none yet'
         self._verdicts = dict.fromkeys((*_VERDICTS, 'failed'), 0)
         self._flights: Flights[Answer] = Flights(self._wake_up)
@@ -100,6 +102,7 @@ class RelocalizerNode(ManagedNode):
     def open(self) -> None:
         """Be ready for requests; in continuous mode listen to frames."""
         self._handoff.open()
+        self._lingering.open()
         if self.settings['publish_tf'] or (self.settings['base_frame']
                                            and not any(self.settings['base_from_camera'])):
             self.worker.run(self._base.listen)
@@ -121,6 +124,7 @@ class RelocalizerNode(ManagedNode):
         if self._frames is not None:
             self._frames.stop('the node was deactivated')
         self._listening.close()
+        self._lingering.close()
         self.worker.submit(self._base.forget)  # after a search that may be under way
 
     def release(self) -> None:
@@ -172,6 +176,7 @@ class RelocalizerNode(ManagedNode):
                 if later.has_frame:
                     answer, frames = later, frames + 1
                     alone += later.is_alone
+            self._lingering.keep(listening.pop_all())
         if frames > 1:
             answer = replace(answer, message=f'{answer.message} [{frames} frames in '
                                              f'{time.monotonic() - start:.1f} s]')

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
@@ -62,7 +61,6 @@ class FrameSource:
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
         self._on_frame = on_frame
-        self._group = MutuallyExclusiveCallbackGroup()
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
         self._changed = threading.Condition()
@@ -165,8 +163,7 @@ class FrameSource:
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
                                             ('detections', Detection2DArray, qos.DETECTIONS_IN)):
             self._subscriptions.append(AdaptiveSubscription(
-                self._node, message_type, self._topics[name], self._receiver(name), profile,
-                self._group))
+                self._node, message_type, self._topics[name], self._receiver(name), profile))
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:

@@ -13,7 +13,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from cliploc_ros.core.transforms import invert_transform, pose_error
@@ -65,7 +64,6 @@ class OdometrySource:
     def __init__(self, node: Node, base: BaseFrame) -> None:
         self._node = node
         self._base = base
-        self._group = MutuallyExclusiveCallbackGroup()
         self._heard = threading.Condition()
         self._window = OdometryWindow(_LENGTH_S)
         self._newest: Odometry | None = None
@@ -92,7 +90,7 @@ class OdometrySource:
             self._listeners += 1
             if self._subscription is None:
                 self._subscription = AdaptiveSubscription(self._node, Odometry, 'odom', self.take,
-                                                          qos.ODOM, self._group)
+                                                          qos.ODOM)
         try:
             yield
         finally:

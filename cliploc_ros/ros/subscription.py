@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -30,22 +30,18 @@ class AdaptiveSubscription:
     message_type : type
     topic : str
     callback : callable
-        Takes each message.
+        Takes each message, one at a time but for the moment of such a change.
     profile : QoSProfile
         All but the reliability.
-    group : CallbackGroup or None
-        The node's own where None.
     """
 
     def __init__(self, node: Node, message_type: type, topic: str,
-                 callback: Callable[[Any], None], profile: QoSProfile,
-                 group: CallbackGroup | None = None) -> None:
+                 callback: Callable[[Any], None], profile: QoSProfile) -> None:
         self._node = node
         self._message_type = message_type
         self._topic = node.resolve_topic_name(topic)
         self._callback = callback
         self._profile = profile
-        self._group = group
         # What a user sets stays; else the parameter must not be declared, or it would stay too.
         self._overridden = node.has_parameter(
             f'qos_overrides.{self._topic}.subscription.reliability')
@@ -71,13 +67,14 @@ class AdaptiveSubscription:
         return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
 
     def _create(self) -> Subscription:
-        # rclpy keeps a dead reference to everything that ever was in a group
-        entities = (self._group or self._node.default_callback_group).entities
-        entities.difference_update([entity for entity in entities if entity() is None])
+        # A group of its own: where an event of a subscription that was destroyed meanwhile is to
+        # be taken, rclpy takes the group for busy ever after. And a group keeps a dead reference
+        # to everything that ever was in it.
+        group = MutuallyExclusiveCallbackGroup()
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
                              durability=self._profile.durability, reliability=self._reliability)
         return self._node.create_subscription(
-            self._message_type, self._topic, self._callback, profile, callback_group=self._group,
+            self._message_type, self._topic, self._callback, profile, callback_group=group,
             qos_overriding_options=overridable(
                 *(() if self._overridden else (QoSPolicyKind.RELIABILITY,))),
             event_callbacks=SubscriptionEventCallbacks(

@@ -47,6 +47,7 @@ def odom(tester):
         return future.result()
     yield feed
     tester.destroy_publisher(publisher)
+    tester.wait(lambda: not tester.count_subscribers('/odom'), 'what was heard to be forgotten')
 
 
 def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates, odom):

@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+import threading
+from contextlib import suppress
+
 import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import (
     DurabilityPolicy,
@@ -113,6 +119,37 @@ def test_publishers_come_and_go_many_times(ear):
             ear.wait_for_policies(policy)
             ear.wait_for_hearing(publisher, f'{policy.name} {turn}')
             ear.withdraw(publisher)
+
+
+@pytest.mark.filterwarnings('ignore:MultiThreadedExecutor is used with a single thread')
+def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
+    """The subscription is destroyed before its event is taken: rclpy stumbles over that."""
+    listener, executor = ear._listener, MultiThreadedExecutor(1, context=context)
+    busy, release, beside = threading.Event(), threading.Event(), []
+
+    def block():
+        timer.cancel()
+        busy.set()
+        release.wait()
+    timer = listener.create_timer(0.0, block, MutuallyExclusiveCallbackGroup())
+    listener.create_subscription(Header, ear.topic, beside.append, DEPTH_ONE)
+    executor.add_node(listener)
+
+    def spin():
+        with suppress(InvalidHandle):  # as the nodes' processes do
+            executor.spin_once(timeout_sec=0.01)
+    wait(busy.is_set, 'the only thread to be busy', spin)
+    publisher = ear.offer(RELIABLE)
+    for _ in range(20):
+        spin()  # the publisher's coming is an event, and waits for the thread
+    ear.subscription.destroy()
+    release.set()
+
+    def work():
+        publisher.publish(Header(frame_id='after'))
+        spin()
+    wait(lambda: beside, 'a message of the other subscription', work)
+    executor.shutdown()
 
 
 def test_destroyed_it_hears_nobody_and_stays_away(ear):
