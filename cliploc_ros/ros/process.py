@@ -7,39 +7,91 @@ import ctypes
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import (
+    ExternalShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
+from rclpy.node import Node
+from rclpy.service import Service
+from rclpy.task import Task
+from rclpy.timer import Timer
 
 from cliploc_ros.ros.lifecycle import ManagedNode
 from cliploc_ros.ros.requests import MAX_REQUESTS
 
-# For the requests that may wait, for transitions, frames, parameters and the rest. Threads are
+# For the requests that may wait, for transitions, parameters, timers and the rest. Threads are
 # made when they are first needed.
 _THREADS = MAX_REQUESTS + 8
+# A thread is free, but may have to wait for a core.
+_BEGIN_S = 0.1
 _M_ARENA_MAX = -8  # malloc.h
 # For callbacks to end before their node does.
 _GRACE_S = 1.0
 
 
-def _spin(executor: MultiThreadedExecutor, node: ManagedNode) -> None:
+class NodeExecutor(SingleThreadedExecutor):
+    """Takes messages in the thread that spins, services and timers in others, for they may wait.
+
+    rclpy's MultiThreadedExecutor hands each message to another thread. Until that has taken it,
+    the message wakes the executor again and again, for a subscription with events is waited for
+    even while it is being served: that costs a whole core, and Python's lock is passed around.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix='service')
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Execute one callback, or begin to; raise what one that is executed here raises."""
+        try:
+            handler, entity, node = self.wait_for_ready_callbacks(timeout_sec)
+        except TimeoutException:
+            return
+        if isinstance(entity, Service | Timer):
+            self._pool.submit(self._run_beside, handler, node)
+            # rclpy hands out again what has not begun
+            late = time.monotonic() + _BEGIN_S
+            while not (handler.executing() or handler.done()) and time.monotonic() < late:
+                time.sleep(0.0)
+            return
+        handler()
+        handler.result()
+
+    @staticmethod
+    def _run_beside(handler: Task, node: Node) -> None:
+        handler()
+        _report(handler.exception(), node)
+
+
+def _spin(executor: NodeExecutor, node: ManagedNode) -> None:
     """Execute callbacks until the process is told to end; no failure of one ends the node."""
     while node.context.ok():
         try:
             # rclpy loses the wake-up of a shutdown now and then: look up twice a second.
             executor.spin_once(timeout_sec=0.5)
-        except InvalidHandle:
-            # A subscription was destroyed while rclpy gathered what to wait for: it gathers
-            # again.
-            continue
-        except Exception:
-            if node.context.ok():  # else the process is told to end, and rclpy stumbles over that
-                node.get_logger().error(f'internal error: {traceback.format_exc()}')
+        except Exception as error:
+            _report(error, node)
+
+
+def _report(error: Exception | None, node: Node) -> None:
+    """Log what a callback raised.
+
+    Not the InvalidHandle of what was destroyed while rclpy gathered what to wait for, which
+    gathers again; nor what rclpy stumbles over while the process ends.
+    """
+    if error is not None and not isinstance(error, InvalidHandle) and node.context.ok():
+        text = ''.join(traceback.format_exception(error))
+        node.get_logger().error(f'internal error: {text}')
 
 
 def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
@@ -52,7 +104,7 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
         rclpy.init(args=sys.argv)
     except Exception as error:  # rcl raises its own types for arguments and for missing folders
         sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
-    executor = MultiThreadedExecutor(num_threads=_THREADS)
+    executor = NodeExecutor()
     node = None
     try:
         node = make_node()

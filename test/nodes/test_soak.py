@@ -40,6 +40,8 @@ REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
 #: Over the second half. A short run is still warming up there: pools of the middleware grow with
 #: the first thousand subscriptions.
 GROWTH = 0.01 if REQUESTS >= 10_000 else 0.03
+#: Those of the middleware and of Python, and one for each callback that ran beside the others.
+MAX_THREADS = 30
 SAMPLES = 100
 FRAMES, PERIOD_NS = 60, 25_000_000
 # A frame that was under way when the request was sent may be taken; one of the last request, or
@@ -212,9 +214,10 @@ def test_soak(start, ros, own_relocalizer, recording):
     for request in requests:
         assert request.success or request.message.startswith('refused'), request.message
     assert 0 < len(witness.poses) <= len(told) < len(requests)
-    (before_mib, *before), (after_mib, *after) = meter.ends()
+    (before_mib, before, _), (after_mib, after, threads) = meter.ends()
     assert after_mib < (1 + GROWTH) * before_mib
-    assert before == after, 'file descriptors, threads'
+    assert before == after, 'file descriptors'
+    assert threads <= MAX_THREADS
     assert 'Traceback' not in process.output()
 
 
@@ -231,4 +234,6 @@ def report(clients, witness, meter, elapsed_s):
     print(f'second half: {before_mib:.1f} to {after_mib:.1f} MiB '
           f'({100 * (after_mib / before_mib - 1):+.2f} %), descriptors and threads '
           f'{before} to {after}')
+    worst = max(requests, key=lambda request: request.answered_ns - request.sent_ns)
+    print(f'worst: {worst.message}')
     print('MiB by tenths of the run: ' + ', '.join(f'{row[0]:.1f}' for row in meter.rows[::10]))
