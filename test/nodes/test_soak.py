@@ -40,8 +40,8 @@ REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
 #: Over the second half. A short run is still warming up there: pools of the middleware grow with
 #: the first thousand subscriptions.
 GROWTH = 0.01 if REQUESTS >= 10_000 else 0.03
-#: Those of the middleware and of Python, and one for each callback that ran beside the others.
-MAX_THREADS = 30
+#: Those of the middleware and of Python, and 24 for callbacks that may wait: a pool that only grows.
+MAX_THREADS = 45
 SAMPLES = 100
 FRAMES, PERIOD_NS = 60, 25_000_000
 # A frame that was under way when the request was sent may be taken; one of the last request, or
