@@ -125,6 +125,8 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
             # A callback that goes on in a destroyed node ends the process by a segmentation
             # fault. rclpy's own shutdown means to wait for callbacks, and does not.
             executor._work_tracker.wait(_GRACE_S)
+            # What rclpy was about to hand out holds on to everything that it waited for.
+            executor.shutdown(0.0)
             # Others would take a node that does not say good-bye for alive, and wait for it.
             node.destroy_node()
         rclpy.try_shutdown()

@@ -130,9 +130,10 @@ def test_continuous_mode_joins_frames(own_relocalizer, tester, robot):
 
 def test_a_request_that_goes_on_ends_with_the_node(own_relocalizer, tester, robot):
     process = own_relocalizer(**PARAMETERS)
-    tester.ask()
-    wait_for(lambda: len(tester.hypotheses) > 2, 'some refusals',
+    future = tester.ask()
+    wait_for(lambda: len(tester.hypotheses) > 2 or future.done(), 'some refusals',
              work=lambda: robot.step(0.0, lambda odometry, now_s: None))
+    assert not future.done(), future.result().message
     code, seconds = process.stop()
     assert code == 0 and seconds < 2.0, process.output()
     assert 'Traceback' not in process.output()

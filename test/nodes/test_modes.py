@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import make_frame, transform_of
+from nav_msgs.msg import Odometry
 from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
@@ -134,6 +135,21 @@ def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
     assert code == 0, process.output()
     assert seconds < 2.0
     assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_ends_amid_frames_says_good_bye(own_relocalizer, tester, signal_number):
+    """Else it is taken to be there for twenty more seconds, and requests to it are lost."""
+    for _ in range(3):
+        process = own_relocalizer(mode='continuous')
+        odom = tester.create_publisher(Odometry, 'odom', 10)
+        tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
+        tester.publish(make_frame())
+        tester.destroy_publisher(odom)  # the node hears of it as it is told to end
+        code, seconds = process.stop(signal_number)
+        assert code == 0 and seconds < 2.0, process.output()
+        tester.wait(lambda: not tester.count_publishers('/relocalizer/pose'), 'its end', 2.0)
+        tester.forget()
 
 
 def test_a_flood_of_images_is_survived_in_bounded_memory(own_relocalizer, tester):
