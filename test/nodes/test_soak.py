@@ -40,7 +40,7 @@ REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
 #: Over the second half. A short run is still warming up there: pools of the middleware grow with
 #: the first thousand subscriptions.
 GROWTH = 0.01 if REQUESTS >= 10_000 else 0.03
-#: Those of the middleware and of Python, and 24 for callbacks that may wait: a pool that only grows.
+#: Those of the middleware and of Python, and 24 for callbacks that may wait: that pool only grows.
 MAX_THREADS = 45
 SAMPLES = 100
 FRAMES, PERIOD_NS = 60, 25_000_000
