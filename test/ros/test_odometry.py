@@ -143,4 +143,4 @@ def test_too_few_poses_tell_no_speed(source, moments):
     talk(source, *moments)
     start = time.monotonic()
     assert source.speeds_by_poses() == (0.0, 0.0)
-    assert time.monotonic() - start < 1.0
+    assert time.monotonic() - start < 3.0
