@@ -17,7 +17,7 @@ class Lingering:
     """Keeps what was opened last for a second or two, unless it is closed.
 
     A robot that is refused asks again. To find its publishers anew would cost it a tenth of a
-    second, the odometry that joins its images, and both processes a little memory each time.
+    second, and the odometry that joins its images.
 
     Parameters
     ----------

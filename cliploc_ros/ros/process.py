@@ -7,91 +7,19 @@ import ctypes
 import os
 import signal
 import sys
-import time
-import traceback
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import NoReturn
 
 import rclpy
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import (
-    ExternalShutdownException,
-    SingleThreadedExecutor,
-    TimeoutException,
-)
-from rclpy.node import Node
-from rclpy.service import Service
-from rclpy.task import Task
-from rclpy.timer import Timer
 
+from cliploc_ros.ros.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.lifecycle import ManagedNode
-from cliploc_ros.ros.requests import MAX_REQUESTS
 
-# For the requests that may wait, for transitions, parameters, timers and the rest. Threads are
-# made when they are first needed.
-_THREADS = MAX_REQUESTS + 8
-# A thread is free, but may have to wait for a core.
-_BEGIN_S = 0.1
 _M_ARENA_MAX = -8  # malloc.h
 # For callbacks to end before their node does.
 _GRACE_S = 1.0
-
-
-class NodeExecutor(SingleThreadedExecutor):
-    """Takes messages in the thread that spins, services and timers in others, for they may wait.
-
-    rclpy's MultiThreadedExecutor hands each message to another thread. Until that has taken it,
-    the message wakes the executor again and again, for a subscription with events is waited for
-    even while it is being served: that costs a whole core, and Python's lock is passed around.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix='service')
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Execute one callback, or begin to; raise what one that is executed here raises."""
-        try:
-            handler, entity, node = self.wait_for_ready_callbacks(timeout_sec)
-        except TimeoutException:
-            return
-        if isinstance(entity, Service | Timer):
-            self._pool.submit(self._run_beside, handler, node)
-            # rclpy hands out again what has not begun
-            late = time.monotonic() + _BEGIN_S
-            while not (handler.executing() or handler.done()) and time.monotonic() < late:
-                time.sleep(0.0)
-            return
-        handler()
-        handler.result()
-
-    @staticmethod
-    def _run_beside(handler: Task, node: Node) -> None:
-        handler()
-        _report(handler.exception(), node)
-
-
-def _spin(executor: NodeExecutor, node: ManagedNode) -> None:
-    """Execute callbacks until the process is told to end; no failure of one ends the node."""
-    while node.context.ok():
-        try:
-            # rclpy loses the wake-up of a shutdown now and then: look up twice a second.
-            executor.spin_once(timeout_sec=0.5)
-        except Exception as error:
-            _report(error, node)
-
-
-def _report(error: Exception | None, node: Node) -> None:
-    """Log what a callback raised.
-
-    Not the InvalidHandle of what was destroyed while rclpy gathered what to wait for, which
-    gathers again; nor what rclpy stumbles over while the process ends.
-    """
-    if error is not None and not isinstance(error, InvalidHandle) and node.context.ok():
-        text = ''.join(traceback.format_exception(error))
-        node.get_logger().error(f'internal error: {text}')
 
 
 def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
@@ -100,6 +28,9 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
     # waits by spinning, as they do, slows the other one tenfold. Read when PyTorch is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     _bound_arenas()
+    # Python would raise KeyboardInterrupt wherever it is, in the middle of a callback, too.
+    interrupted = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: interrupted.set())
     try:
         rclpy.init(args=sys.argv)
     except Exception as error:  # rcl raises its own types for arguments and for missing folders
@@ -110,15 +41,17 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
         node = make_node()
         node.context.on_shutdown(node.release)
         executor.add_node(node)
-        _spin(executor, node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while node.context.ok() and not interrupted.is_set():
+            try:
+                # rclpy loses the wake-up of a shutdown now and then: look up twice a second.
+                executor.spin_once(timeout_sec=0.5)
+            except Exception as error:
+                log_failure(error, node)
     except Exception:
         if rclpy.ok():
             raise
         # a signal came while the node was made
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
         if node is not None:
             node.release()
             node.worker.stop()
