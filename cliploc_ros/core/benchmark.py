@@ -149,9 +149,9 @@ def _verify_all(bench, samples):
                             bench.sampled_outlines, bench.uppers, 0.0)
         if which < 0:
             continue
-        verify_beyond(bench.tree, bench.groups, bench.landmarks, bench.boxes,
+        verify_beyond(bench.nearby, bench.groups, bench.landmarks, bench.boxes,
                       bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
-                      bench.translations, which, bench.ranges, bench.outlines,
+                      bench.translations, which, bench.seen, bench.outlines,
                       bench.owners, bench.entries, bench.bounds, bench.best_bounds, -1.0)
         solved += 1
     return solved

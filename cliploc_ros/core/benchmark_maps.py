@@ -78,7 +78,7 @@ def measure_maps(counts: Sequence[int]) -> None:
         request_ms = 1e3 * _least_s(partial(relocalizer.relocalize, [observation]))
         first_us = first_us or sample_us
         print(f'  {count:9,d} {knn_ms:8.1f} {similarities.labels.unique.nbytes / 1e6:10.0f} '
-              f'{tree_s:7.2f} {sum(part.nbytes for part in landmark_map.tree) / 1e6:8.1f} '
+              f'{tree_s:7.2f} {sum(part.nbytes for part in landmark_map.nearby) / 1e6:8.1f} '
               f'{setup_ms:10.2f} {sample_us:12.2f} {sample_us / first_us:6.2f} '
               f'{request_ms:11.1f} {_peak_mb():11.0f}', flush=True)
 

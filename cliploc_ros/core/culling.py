@@ -4,8 +4,8 @@
 
 A landmark overlaps a box by more than the threshold only if it reaches into the pyramid through
 all boxes, and only if it is near enough to appear large enough. Nothing else is left out, so no
-result changes. The tree belongs to the map and is made once; what a frame adds to it is the
-pyramid, and a reach for each class that it shows.
+result changes. The map is sorted once, neighbours together; each frame makes a tree of those
+landmarks whose classes it shows, which knows how far away each of them may be.
 """
 
 from math import inf
@@ -18,69 +18,68 @@ from cliploc_ros.core.compiled import compiled
 
 #: So few landmarks are looked at faster than sorted.
 FEW = 64
-# Children of a node, and landmarks of a leaf.
+# So many are held by each sphere of the level above.
 _BRANCHES = 8
 _MORTON_BITS = 16
 # Landmarks that appear larger than this half angle are never too far.
 _NEAR_ANGLE = np.radians(10.0)
 
 
-class Tree(NamedTuple):
-    """A map's landmarks in a tree of spheres: L landmarks, m nodes; 120 bytes a landmark.
+class SortedLandmarks(NamedTuple):
+    """A map's landmarks, neighbours together: L of them, 92 bytes each.
 
     Parameters
     ----------
     landmarks : ndarray (L, 10)
-        Centre, shape and squared radius of each, neighbours together.
-    numbers, classes : ndarray (L,)
-        Which of the map's landmarks they are, and their classes.
-    spheres : ndarray (m, 5)
-        Centre and radius that hold the centres of a node's landmarks [m]; the radius of its
-        largest landmark. Depth first.
-    rows : ndarray (m, 3)
-        First landmark, the one behind the last, and the node that follows when this one is
-        passed over; leaves are followed by the next node.
-    leaves : ndarray (m,) of bool
-    counts : ndarray (C,)
-        How many landmarks each class has.
+        Centre, shape and squared radius of each.
+    numbers : ndarray (L,)
+        Which of the map's landmarks they are.
+    classes : ndarray (L,) of int32
+        From 0.
     """
 
     landmarks: NDArray[np.float64]
     numbers: NDArray[np.int64]
-    classes: NDArray[np.int64]
-    spheres: NDArray[np.float64]
-    rows: NDArray[np.int64]
-    leaves: NDArray[np.bool_]
-    counts: NDArray[np.int64]
+    classes: NDArray[np.int32]
 
 
 class Groups(NamedTuple):
-    """The classes that a frame shows: g groups of detections that show any of a class.
+    """The classes that a frame shows, and the w landmarks of these classes in a tree of m spheres.
+
+    Each of g classes has a group of detections that show any of its landmarks.
 
     Parameters
     ----------
-    of_classes : ndarray (C,)
-        Each class's group; -1 for classes that the frame does not show.
     starts : ndarray (g + 1,)
         Where each group's detections begin in detections.
     detections : ndarray (v,)
     reaches : ndarray (g,)
         At a depth of how many of its radii a landmark appears too small to count.
-    frustum : ndarray (4, 2)
-        Unit normals of the sides of the pyramid through all boxes: x and z of left and right,
-        y and z of upper and lower, inwards.
+    frusta : ndarray (g + 1, 4, 2)
+        Unit normals of the sides of the pyramid through each group's boxes: x and z of left and
+        right, y and z of upper and lower, inwards. The last one is through all boxes.
+    members : ndarray (w, 2) of int32
+        Row among the sorted landmarks, in their order, and group.
+    levels : ndarray (d + 1,)
+        Where each level of the tree begins in spheres: the members, then what holds eight of
+        them, and so on to the one that holds all.
+    spheres : ndarray (m, 5)
+        Centre and radius; the centre must lie at less than this depth, or all of it appears too
+        small [m].
     """
 
-    of_classes: NDArray[np.int64]
     starts: NDArray[np.int64]
     detections: NDArray[np.int64]
     reaches: NDArray[np.float64]
-    frustum: NDArray[np.float64]
+    frusta: NDArray[np.float64]
+    members: NDArray[np.int32]
+    levels: NDArray[np.int64]
+    spheres: NDArray[np.float64]
 
 
-def make_tree(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-              classes: NDArray[np.int64]) -> Tree:
-    """Return the tree of a map.
+def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
+                   classes: NDArray[np.int64]) -> SortedLandmarks:
+    """Return the landmarks of a map, neighbours together.
 
     Parameters
     ----------
@@ -94,63 +93,73 @@ def make_tree(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     # the greatest eigenvalue of a shape matrix is the square of the greatest semi-axis
     squares = np.linalg.eigvalsh(shapes[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))[:, 2]
     squares *= 1.0 + 1e-9
-    radii = np.sqrt(squares)
-    begins, ends, spheres, leaves = [], [], [], []
-    size = _BRANCHES
-    while True:
-        begin = np.arange(0, len(centers), size)
-        low = np.minimum.reduceat(centers, begin)
-        high = np.maximum.reduceat(centers, begin)
-        spheres.append(np.c_[(low + high) / 2, np.linalg.norm(high - low, axis=1) / 2,
-                             np.maximum.reduceat(radii, begin)])
-        begins.append(begin)
-        ends.append(np.minimum(begin + size, len(centers)))
-        leaves.append(np.full(len(begin), size == _BRANCHES))
-        if len(begin) == 1:
-            break
-        size *= _BRANCHES
-    first, last = np.concatenate(begins), np.concatenate(ends)
-    order = np.lexsort((first - last, first))  # depth first: of equal first the larger one
-    first, last, leaf = first[order], last[order], np.concatenate(leaves)[order]
-    follows = np.where(leaf, np.arange(1, len(order) + 1), np.searchsorted(first, last))
-    return Tree(np.column_stack([centers, shapes, squares]), numbers.astype(np.int64),
-                classes[numbers], np.concatenate(spheres)[order],
-                np.stack([first, last, follows], axis=1), leaf,
-                np.bincount(classes).astype(np.int64))
+    return SortedLandmarks(np.column_stack([centers, shapes, squares]), numbers.astype(np.int64),
+                           classes[numbers].astype(np.int32))
 
 
-def no_tree() -> Tree:
-    """Return a tree without landmarks."""
-    nothing = np.empty(0, dtype=np.int64)
-    return Tree(np.empty((0, 10)), nothing, nothing, np.empty((0, 5)), nothing.reshape(0, 3),
-                np.empty(0, dtype=np.bool_), nothing)
+def no_landmarks() -> SortedLandmarks:
+    """Return a map without any."""
+    return SortedLandmarks(np.empty((0, 10)), np.empty(0, dtype=np.int64),
+                           np.empty(0, dtype=np.int32))
 
 
-def make_groups(class_count: int, classes: NDArray[np.int64], boxes: NDArray[np.float64],
-                iou_threshold: float) -> Groups:
+def make_groups(landmarks: SortedLandmarks, classes: NDArray[np.int64],
+                boxes: NDArray[np.float64], iou_threshold: float) -> Groups:
     """Return the groups of a frame.
 
     Parameters
     ----------
-    class_count : int
-        C.
+    landmarks : SortedLandmarks
     classes : ndarray (n,) of int
-        Of each detection; below 0 for none.
+        Of each detection, as the landmarks have them; below 0 for none.
     boxes : ndarray (n, 4)
         Box ellipses, see Scene.
     iou_threshold : float
         Less overlap does not count.
     """
     shown = np.unique(classes[classes >= 0])
-    of_classes = np.full(class_count, -1, dtype=np.int64)
-    of_classes[shown] = np.arange(len(shown))
     rows = [np.nonzero(classes == one)[0] for one in shown]
-    frustum, angle = _frustum(boxes[classes >= 0]) if rows else (np.zeros((4, 2)), 0.0)
-    reaches = [_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()), angle)
-               for some in rows]
-    return Groups(of_classes, np.cumsum([0, *map(len, rows)]).astype(np.int64),
+    frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
+    reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
+                               _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
+    members = _members(landmarks.classes, shown)
+    radii = np.sqrt(landmarks.landmarks[members[:, 0], 9])
+    return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
                   np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
-                  np.array(reaches, dtype=np.float64), frustum)
+                  reaches, frusta, members,
+                  *_make_tree(landmarks.landmarks[members[:, 0], :3], radii,
+                              radii * reaches[members[:, 1]]))
+
+
+def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return rows and groups (w, 2) of the landmarks of some classes, which are sorted."""
+    if not len(shown):
+        return np.empty((0, 2), dtype=np.int32)
+    of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
+    of_classes[shown] = np.arange(len(shown))
+    groups = of_classes[classes]
+    rows = np.nonzero(groups >= 0)[0]
+    return np.column_stack([rows, groups[rows]]).astype(np.int32)
+
+
+def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
+               depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return levels and spheres of some landmarks, neighbours together; see Groups.
+
+    Parameters
+    ----------
+    centers, radii, depths : ndarray (w, 3), (w,), (w,)
+        Of each landmark, and the depth from which on it appears too small.
+    """
+    spheres = [np.c_[centers, radii, depths]]
+    low = high = centers
+    while len(low) > 1:
+        cuts = np.arange(0, len(low), _BRANCHES)
+        low, high = np.minimum.reduceat(low, cuts), np.maximum.reduceat(high, cuts)
+        radii, depths = np.maximum.reduceat(radii, cuts), np.maximum.reduceat(depths, cuts)
+        around = np.linalg.norm(high - low, axis=1) / 2
+        spheres.append(np.c_[(low + high) / 2, around + radii, around + depths])
+    return (np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres))
 
 
 def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -168,14 +177,19 @@ def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
     return code
 
 
-def _frustum(boxes: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the sides of the pyramid through all boxes, and its greatest angle off the axis."""
+def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sides (4, 2) of the pyramid through some boxes; see Groups."""
+    if not len(boxes):
+        return np.zeros((4, 2))
     low = (boxes[:, :2] - boxes[:, 2:]).min(axis=0)
     high = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
     sides = np.array([[1.0, -low[0]], [-1.0, high[0]], [1.0, -low[1]], [-1.0, high[1]]])
-    corner = np.maximum(np.abs(low), np.abs(high))
-    return (sides / np.linalg.norm(sides, axis=1, keepdims=True),
-            float(np.arctan(np.linalg.norm(corner))))
+    return sides / np.linalg.norm(sides, axis=1, keepdims=True)
+
+
+def _widest_angle(boxes: NDArray[np.float64]) -> float:
+    """Return how far off the axis the corners of boxes are seen [rad]."""
+    return float(np.arctan(np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1).max()))
 
 
 def _reach(least_axes: float, angle: float) -> float:
@@ -200,44 +214,47 @@ def _reach(least_axes: float, angle: float) -> float:
 
 
 @compiled
-def visible_ranges(spheres, rows, leaves, reaches, frustum, rotations, translations, which,
-                   ranges):
-    """Write the first and last landmark of each run that a pose may see; return how many runs.
+def visible_members(groups, rotations, translations, which, seen):
+    """Write which members a pose may see into the first row of seen; return how many.
+
+    Without branches but for the loops: what a pose sees of a map is hard to predict.
 
     Parameters
     ----------
-    spheres, rows, leaves : ndarray
-        See Tree.
-    reaches, frustum : ndarray
-        See Groups.
+    groups : Groups
     rotations, translations : ndarray (p, 3, 3), (p, 3)
         Of camera_from_map; which is one of them.
-    ranges : ndarray (l, 2)
-        Room for every leaf.
+    seen : ndarray (2, w) of int
     """
+    frusta, members, levels, spheres = groups.frusta, groups.members, groups.levels, groups.spheres
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
     r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
     r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
     t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
-    left_x, left_z, right_x, right_z = frustum[0, 0], frustum[0, 1], frustum[1, 0], frustum[1, 1]
-    upper_y, upper_z, lower_y, lower_z = frustum[2, 0], frustum[2, 1], frustum[3, 0], frustum[3, 1]
-    farthest = np.max(reaches)
-    node, count = 0, 0
-    while node < spheres.shape[0]:
-        px, py, pz = spheres[node, 0], spheres[node, 1], spheres[node, 2]
-        around, radius = spheres[node, 3], spheres[node, 4]
-        reach = radius * farthest + around
-        margin = -(radius + around)
-        x = r00 * px + r01 * py + r02 * pz + t0
-        y = r10 * px + r11 * py + r12 * pz + t1
-        z = r20 * px + r21 * py + r22 * pz + t2
-        if (z < margin or z > reach
-                or x * left_x + z * left_z < margin or x * right_x + z * right_z < margin
-                or y * upper_y + z * upper_z < margin or y * lower_y + z * lower_z < margin):
-            node = rows[node, 2]
-            continue
-        if leaves[node]:
-            ranges[count, 0], ranges[count, 1] = rows[node, 0], rows[node, 1]
-            count += 1
-        node += 1
+    if members.shape[0] == 0:
+        return 0
+    top, pyramid = levels.shape[0] - 2, frusta.shape[0] - 1
+    seen[(top + 1) % 2, 0], count = 0, 1
+    for level in range(top, -1, -1):
+        first, size = levels[level], levels[level + 1] - levels[level]
+        above, here = (level + 1) % 2, level % 2
+        found = 0
+        for holder in range(count):
+            begin = _BRANCHES * seen[above, holder]
+            for number in range(begin, min(begin + _BRANCHES, size)):
+                sphere = first + number
+                if level == 0:
+                    pyramid = members[number, 1]
+                px, py, pz = spheres[sphere, 0], spheres[sphere, 1], spheres[sphere, 2]
+                behind = -spheres[sphere, 3]
+                x = r00 * px + r01 * py + r02 * pz + t0
+                y = r10 * px + r11 * py + r12 * pz + t1
+                z = r20 * px + r21 * py + r22 * pz + t2
+                seen[here, found] = number
+                found += ((z >= behind) & (z <= spheres[sphere, 4])
+                          & (x * frusta[pyramid, 0, 0] + z * frusta[pyramid, 0, 1] >= behind)
+                          & (x * frusta[pyramid, 1, 0] + z * frusta[pyramid, 1, 1] >= behind)
+                          & (y * frusta[pyramid, 2, 0] + z * frusta[pyramid, 2, 1] >= behind)
+                          & (y * frusta[pyramid, 3, 0] + z * frusta[pyramid, 3, 1] >= behind))
+        count = found
     return count

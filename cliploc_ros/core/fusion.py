@@ -48,9 +48,9 @@ class Rig(NamedTuple):
     scene : Scene
         All arrays but the map's joined; numbers in them count within their frame, and starts have
         an end of their own for each frame. It has no pairs.
-    bounds : ndarray (F + 1, 5)
+    bounds : ndarray (F + 1, 8)
         Where each frame's rows begin: of boxes, of potential_landmarks, of potential_detections,
-        and of the groups' reaches and detections.
+        and of the groups' reaches, detections, members, levels and spheres.
     cameras : ndarray (F, 3, 4)
         Rotation and translation of each camera from the reference camera.
     verticals : ndarray (F, 7)
@@ -85,10 +85,11 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
         np.concatenate([one.potential_landmarks for one in scenes]),
         np.concatenate([one.potential_starts for one in scenes]),
         np.concatenate([one.potential_detections for one in scenes]),
-        first.pairs[:0], first.iou_threshold, first.tree, groups)
-    counts = [[0] * 5, *([len(one.box_ellipses), len(one.potential_landmarks),
+        first.pairs[:0], first.iou_threshold, first.nearby, groups)
+    counts = [[0] * 8, *([len(one.box_ellipses), len(one.potential_landmarks),
                           len(one.potential_detections), len(one.groups.reaches),
-                          len(one.groups.detections)] for one in scenes)]
+                          len(one.groups.detections), len(one.groups.members),
+                          len(one.groups.levels), len(one.groups.spheres)] for one in scenes)]
     return Rig(joined, np.cumsum(counts, axis=0, dtype=np.int64),
                np.ascontiguousarray(camera_from_reference[:, :3]),
                np.ascontiguousarray(verticals))
@@ -99,16 +100,16 @@ def _scene_of(rig, frame):
     """Return the scene of one frame."""
     scene, groups = rig.scene, rig.scene.groups
     first, last = rig.bounds[frame], rig.bounds[frame + 1]
-    classes = len(groups.of_classes) // len(rig.cameras)
-    own = Groups(groups.of_classes[frame * classes:(frame + 1) * classes],
-                 groups.starts[first[3] + frame:last[3] + frame + 1],
+    own = Groups(groups.starts[first[3] + frame:last[3] + frame + 1],
                  groups.detections[first[4]:last[4]], groups.reaches[first[3]:last[3]],
-                 groups.frustum[4 * frame:4 * frame + 4])
+                 groups.frusta[first[3] + frame:last[3] + frame + 1],
+                 groups.members[first[5]:last[5]], groups.levels[first[6]:last[6]],
+                 groups.spheres[first[7]:last[7]])
     return Scene(scene.box_ellipses[first[0]:last[0]], scene.bearings[first[0]:last[0]],
                  scene.centers, scene.shapes, scene.potential_landmarks[first[1]:last[1]],
                  scene.potential_starts[first[1] + frame:last[1] + frame + 1],
                  scene.potential_detections[first[2]:last[2]], scene.pairs, scene.iou_threshold,
-                 scene.tree, own)
+                 scene.nearby, own)
 
 
 @compiled

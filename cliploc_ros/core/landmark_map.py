@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association import ClassIndex
-from cliploc_ros.core.culling import Tree, make_tree
+from cliploc_ros.core.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.ellipsoid import shape_matrices
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
@@ -58,7 +58,7 @@ class LandmarkMap:
 
     def prepare(self) -> None:
         """Make now what the first request would have to wait for."""
-        _ = self.shapes, self.classes, self.tree
+        _ = self.shapes, self.classes, self.nearby
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -71,9 +71,9 @@ class LandmarkMap:
         return ClassIndex.of(self.class_ids)
 
     @cached_property
-    def tree(self) -> Tree:
-        """Return what tells which landmarks a pose can see."""
-        return make_tree(self.centers, self.shapes, self.classes.of_landmarks)
+    def nearby(self) -> SortedLandmarks:
+        """Return the landmarks, neighbours together."""
+        return sort_landmarks(self.centers, self.shapes, self.classes.of_landmarks)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core import association
 from cliploc_ros.core.association import ADAPTIVE, Candidates
-from cliploc_ros.core.culling import FEW, Tree
+from cliploc_ros.core.culling import FEW, SortedLandmarks
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -42,27 +42,27 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     nearest = _nearest(landmark_map, observation, options, sound)
     candidates, share = _candidates(landmark_map, classes, nearest, options)
     by_class = classes if options.matching != 'clip' else np.full_like(classes, -1)
-    single, tree = _potential(landmark_map, by_class, nearest)
+    single, nearby = _potential(landmark_map, by_class, nearest)
     # what is not sound is replaced by numbers that nothing is done with
     return make_scene(np.where(sound[:, None], bboxes, 1.0), landmark_map.centers,
                       landmark_map.shapes, single, candidates.pairs, options.iou_threshold,
-                      tree, by_class), share
+                      nearby, by_class), share
 
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
-               ) -> tuple[NDArray[np.int64], Tree | None]:
-    """Return which pairs (p, 2) to verify, and the tree that holds those of equal class.
+               ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
+    """Return which pairs (p, 2) to verify, and the landmarks that hold those of equal class.
 
-    There is no tree for small maps, and the pairs are all.
+    For small maps there are none, and the pairs are all.
     """
     if len(landmark_map) <= FEW:
         of_class = landmark_map.classes.candidates(classes)
         return (of_class if nearest is None else
                 association.joined(nearest, of_class, len(landmark_map))).pairs, None
     if nearest is None:
-        return np.empty((0, 2), dtype=np.int64), landmark_map.tree
+        return np.empty((0, 2), dtype=np.int64), landmark_map.nearby
     others = landmark_map.classes.of_landmarks[nearest.landmarks] != classes[nearest.detections]
-    return nearest.select(others).pairs, landmark_map.tree
+    return nearest.select(others).pairs, landmark_map.nearby
 
 
 def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,

@@ -5,7 +5,7 @@
 from math import inf, sqrt
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import visible_ranges
+from cliploc_ros.core.culling import visible_members
 
 
 @compiled
@@ -60,43 +60,14 @@ def project(rotations, translations, which, landmarks, first, last, reach, outli
 
 
 @compiled
-def project_groups(tree, groups, rotations, translations, which, ranges, outlines, owners, out):
+def project_groups(landmarks, groups, rotations, translations, which, seen, outlines, owners, out):
     """Project what a pose may see of the groups into rows from out on; return where they end."""
-    landmarks, _, classes, spheres, rows, leaves, _ = tree
-    of_classes, _, _, reaches, frustum = groups
-    runs = visible_ranges(spheres, rows, leaves, reaches, frustum, rotations, translations,
-                          which, ranges)
-    r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
-    r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
-    r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
-    t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
-    for run in range(runs):
-        for row in range(ranges[run, 0], ranges[run, 1]):
-            group = of_classes[classes[row]]
-            if group < 0:
-                continue
-            px, py, pz = landmarks[row, 0], landmarks[row, 1], landmarks[row, 2]
-            square = landmarks[row, 9]
-            z = r20 * px + r21 * py + r22 * pz + t2
-            if z < 0.0 or z * z > square * reaches[group] * reaches[group]:
-                continue
-            x = r00 * px + r01 * py + r02 * pz + t0
-            if _beyond(x * frustum[0, 0] + z * frustum[0, 1], square) or _beyond(
-                    x * frustum[1, 0] + z * frustum[1, 1], square):
-                continue
-            y = r10 * px + r11 * py + r12 * pz + t1
-            if _beyond(y * frustum[2, 0] + z * frustum[2, 1], square) or _beyond(
-                    y * frustum[3, 0] + z * frustum[3, 1], square):
-                continue
-            project(rotations, translations, which, landmarks, row, row + 1, reaches[group],
-                    outlines, out)
-            if outlines[out, 2] > 0.0:
-                owners[out] = group
-                out += 1
+    members, reaches = groups.members, groups.reaches
+    for place in range(visible_members(groups, rotations, translations, which, seen)):
+        row, group = members[seen[0, place], 0], members[seen[0, place], 1]
+        project(rotations, translations, which, landmarks, row, row + 1, reaches[group],
+                outlines, out)
+        if outlines[out, 2] > 0.0:
+            owners[out] = group
+            out += 1
     return out
-
-
-@compiled
-def _beyond(distance, square):
-    """Tell whether a sphere of a squared radius lies wholly behind a plane."""
-    return distance < 0.0 and distance * distance > square

@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import Groups, Tree, make_groups, no_tree, visible_ranges
+from cliploc_ros.core.culling import (
+    Groups,
+    SortedLandmarks,
+    make_groups,
+    no_landmarks,
+    visible_members,
+)
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.ellipsoid import project_ellipsoid
 from cliploc_ros.core.p3p import MAX_SOLUTIONS, p3p
@@ -40,7 +46,7 @@ class Scene(NamedTuple):
         Detection and landmark of each correspondence candidate, in order of preference.
     iou_threshold : float
         A detection whose best IoU is not above it has no landmark.
-    tree, groups : Tree, Groups
+    nearby, groups : SortedLandmarks, Groups
         Of a large map the landmarks that detections may show by their class.
     """
 
@@ -53,7 +59,7 @@ class Scene(NamedTuple):
     potential_detections: NDArray[np.int64]
     pairs: NDArray[np.int64]
     iou_threshold: float
-    tree: Tree
+    nearby: SortedLandmarks
     groups: Groups
 
 
@@ -77,7 +83,8 @@ class Workspace(NamedTuple):
 
 def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
                shapes: NDArray[np.float64], potential: NDArray[np.bool_] | NDArray[np.int64],
-               pairs: NDArray[np.int64], iou_threshold: float, tree: Tree | None = None,
+               pairs: NDArray[np.int64], iou_threshold: float,
+               nearby: SortedLandmarks | None = None,
                classes: NDArray[np.int64] | None = None) -> Scene:
     """Return the scene of one frame.
 
@@ -93,10 +100,10 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
         Correspondence candidates, in order of preference.
     iou_threshold : float
         0 to 1.
-    tree : Tree, optional
-        Of the map, with classes: a detection may show every landmark of its class as well.
+    nearby : SortedLandmarks, optional
+        The map's, with classes: a detection may show every landmark of its class as well.
     classes : ndarray (n,) of int, optional
-        Of each detection, as the tree has them; below 0 for none.
+        Of each detection, as the sorted landmarks have them; below 0 for none.
     """
     middle, half = (bboxes[:, :2] + bboxes[:, 2:]) / 2, (bboxes[:, 2:] - bboxes[:, :2]) / 2
     bearings = np.concatenate([middle, np.ones((len(bboxes), 1))], axis=1)
@@ -105,12 +112,12 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     single = np.argwhere(potential) if potential.dtype == np.bool_ else potential
     single = single[np.lexsort(single.T)].astype(np.int64)  # by landmark
     unique, starts = np.unique(single[:, 1], return_index=True)
-    if tree is None or classes is None:
-        tree, classes = no_tree(), np.full(len(boxes), -1, dtype=np.int64)
+    if nearby is None or classes is None:
+        nearby, classes = no_landmarks(), np.full(len(boxes), -1, dtype=np.int64)
     return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
                  unique, np.append(starts, len(single)), np.ascontiguousarray(single[:, 0]),
-                 np.ascontiguousarray(pairs), float(iou_threshold), tree,
-                 make_groups(len(tree.counts), classes, boxes, iou_threshold))
+                 np.ascontiguousarray(pairs), float(iou_threshold), nearby,
+                 make_groups(nearby, classes, boxes, iou_threshold))
 
 
 @compiled
@@ -209,21 +216,12 @@ def _iou_bound(box, cx, cy, exx, eyy):
 @compiled
 def _verify_groups(scene, rotation, translation, ious, landmarks):
     """Compare detections with what a pose may see of their groups."""
-    nearby, numbers, classes, spheres, rows, leaves, _ = scene.tree
-    of_classes, starts, detections, reaches, frustum = scene.groups
-    ranges = np.empty((rows.shape[0], 2), dtype=np.int64)
-    runs = visible_ranges(spheres, rows, leaves, reaches, frustum, rotation.reshape(1, 3, 3),
-                          translation.reshape(1, 3), 0, ranges)
-    for run in range(runs):
-        for row in range(ranges[run, 0], ranges[run, 1]):
-            group = of_classes[classes[row]]
-            if group < 0:
-                continue
-            z = (rotation[2, 0] * nearby[row, 0] + rotation[2, 1] * nearby[row, 1]
-                 + rotation[2, 2] * nearby[row, 2] + translation[2])
-            if z * z > nearby[row, 9] * reaches[group] * reaches[group]:
-                continue
-            landmark = numbers[row]
-            _compare(scene.box_ellipses, detections, starts[group], starts[group + 1], rotation,
-                     translation, scene.centers[landmark], scene.shapes[landmark], landmark,
-                     ious, landmarks)
+    groups = scene.groups
+    seen = np.empty((2, len(groups.members)), dtype=np.int64)
+    count = visible_members(groups, rotation.reshape(1, 3, 3), translation.reshape(1, 3), 0, seen)
+    for member in seen[0, :count]:
+        landmark = scene.nearby.numbers[groups.members[member, 0]]
+        group = groups.members[member, 1]
+        _compare(scene.box_ellipses, groups.detections, groups.starts[group],
+                 groups.starts[group + 1], rotation, translation, scene.centers[landmark],
+                 scene.shapes[landmark], landmark, ious, landmarks)

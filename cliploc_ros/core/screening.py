@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import Groups, Tree
+from cliploc_ros.core.culling import Groups, SortedLandmarks
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.p3p import MAX_SOLUTIONS
 from cliploc_ros.core.projection import project, project_groups
@@ -60,7 +60,7 @@ class Bench(NamedTuple):
     candidates : ndarray (c, 16)
         Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
         landmark of each correspondence candidate.
-    tree, groups : Tree, Groups
+    nearby, groups : SortedLandmarks, Groups
         See Scene.
     landmarks : ndarray (u, 10)
         Centres, shapes and squared radii of the landmarks that single detections may show. The
@@ -83,8 +83,8 @@ class Bench(NamedTuple):
         Outlines of the sampled landmarks, three for each pose.
     uppers : ndarray (4,)
         Upper bounds of the sums of their IoUs; -1 where a pose is out of the question.
-    ranges : ndarray (l, 2)
-        Runs of the tree's landmarks that one pose may see.
+    seen : ndarray (2, w)
+        Members of the groups that one pose may see.
     outlines : ndarray (w, 6)
         Of all that it may see: centre, half extents, exy, the semi-axes' product. Room for all,
         of which the system gives only what is written to; so too the next three.
@@ -97,7 +97,7 @@ class Bench(NamedTuple):
     """
 
     candidates: NDArray[np.float64]
-    tree: Tree
+    nearby: SortedLandmarks
     groups: Groups
     landmarks: NDArray[np.float64]
     boxes: NDArray[np.float64]
@@ -113,7 +113,7 @@ class Bench(NamedTuple):
     sampled_landmarks: NDArray[np.float64]
     sampled_outlines: NDArray[np.float64]
     uppers: NDArray[np.float64]
-    ranges: NDArray[np.int64]
+    seen: NDArray[np.int64]
     outlines: NDArray[np.float64]
     owners: NDArray[np.int64]
     entries: NDArray[np.int64]
@@ -133,23 +133,21 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     rows, groups = scene.potential_landmarks, scene.groups
     table = np.column_stack([scene.centers[rows], scene.shapes[rows], np.full(len(rows), inf)])
-    shown = groups.of_classes >= 0
-    group_sizes = np.zeros(len(groups.reaches), dtype=np.int64)
-    group_sizes[groups.of_classes[shown]] = scene.tree.counts[shown]
+    group_sizes = np.bincount(groups.members[:, 1], minlength=len(groups.reaches))
     pairs = len(scene.potential_detections) + int(group_sizes @ np.diff(groups.starts))
-    count = len(rows) + int(group_sizes.sum())
+    count = len(rows) + len(groups.members)
     owners = np.empty(count, dtype=np.int64)
     owners[:len(rows)] = np.arange(len(rows))
     return Bench(
         np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                         scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
-        scene.tree, groups, table, scene.box_ellipses, scene.potential_starts,
+        scene.nearby, groups, table, scene.box_ellipses, scene.potential_starts,
         scene.potential_detections, (prior or Prior()).as_array(),
         scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
         np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
         np.empty((3, 4)), np.full((3, 10), inf),
         np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS),
-        np.empty((len(scene.tree.rows), 2), dtype=np.int64), np.empty((count, 6)),
+        np.empty((2, len(groups.members)), dtype=np.int64), np.empty((count, 6)),
         owners, np.empty((pairs, 2), dtype=np.int64), np.empty(pairs),
         np.empty(len(scene.bearings)))
 
@@ -266,8 +264,8 @@ def _sampled_total(boxes, size, outlines, first):
 
 
 @compiled
-def verify_beyond(tree, groups, landmarks, boxes, starts, detections, iou_threshold, rotations,
-                  translations, which, ranges, outlines, owners, entries, bounds, best_bounds,
+def verify_beyond(nearby, groups, landmarks, boxes, starts, detections, iou_threshold, rotations,
+                  translations, which, seen, outlines, owners, entries, bounds, best_bounds,
                   floor):
     """Return the score of a pose if it is above a floor; if not, the floor."""
     best_bounds[:] = iou_threshold
@@ -275,12 +273,12 @@ def verify_beyond(tree, groups, landmarks, boxes, starts, detections, iou_thresh
     project(rotations, translations, which, landmarks, 0, count, 1.0, outlines, 0)
     count = _bound(boxes, starts, owners, detections, iou_threshold, 0, count, outlines, entries,
                    bounds, best_bounds, 0)
-    if groups[3].shape[0] > 0:
+    if groups.reaches.shape[0] > 0:
         first = landmarks.shape[0]
-        last = project_groups(tree, groups, rotations, translations, which, ranges, outlines,
-                              owners, first)
-        count = _bound(boxes, groups[1], owners, groups[2], iou_threshold, first, last, outlines,
-                       entries, bounds, best_bounds, count)
+        last = project_groups(nearby.landmarks, groups, rotations, translations, which, seen,
+                              outlines, owners, first)
+        count = _bound(boxes, groups.starts, owners, groups.detections, iou_threshold, first,
+                       last, outlines, entries, bounds, best_bounds, count)
     upper = 0.0
     for detection in range(boxes.shape[0]):
         if best_bounds[detection] > iou_threshold:

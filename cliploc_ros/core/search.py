@@ -257,9 +257,9 @@ def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
                             bench.sampled_outlines, bench.uppers, least_iou)
         if which < 0:
             continue
-        score = verify_beyond(bench.tree, bench.groups, bench.landmarks, bench.boxes,
+        score = verify_beyond(bench.nearby, bench.groups, bench.landmarks, bench.boxes,
                               bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
-                              bench.translations, which, bench.ranges, bench.outlines,
+                              bench.translations, which, bench.seen, bench.outlines,
                               bench.owners, bench.entries, bench.bounds, bench.best_bounds, floor)
         if score > floor:
             _remember(score, tried_before + t + 1, samples[t], bench.rotations[which],

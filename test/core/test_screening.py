@@ -64,9 +64,9 @@ def poses_of(scene, samples, prior=None, least_iou=0.0):
 
 
 def score_beyond(bench, which, floor):
-    return verify_beyond(bench.tree, bench.groups, bench.landmarks, bench.boxes,
+    return verify_beyond(bench.nearby, bench.groups, bench.landmarks, bench.boxes,
                          bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
-                         bench.translations, which, bench.ranges, bench.outlines,
+                         bench.translations, which, bench.seen, bench.outlines,
                          bench.owners, bench.entries, bench.bounds, bench.best_bounds, floor)
 
 
