@@ -3,9 +3,9 @@
 """Which landmarks can a pose see at all? A tree of spheres, so that large maps cost little more.
 
 A landmark overlaps a box by more than the threshold only if it reaches into the pyramid through
-all boxes, and only if it is near enough to appear large enough. Nothing else is left out, so no
-result changes. The map is sorted once, neighbours together; each frame makes a tree of those
-landmarks whose classes it shows, which knows how far away each of them may be.
+the boxes of its class, and only if it is near enough to appear large enough. Nothing else is left
+out, so no result changes. The map is sorted once, neighbours together; each frame makes a tree of
+those landmarks whose classes it shows, which knows how far away each of them may be.
 """
 
 from math import inf
@@ -64,8 +64,8 @@ class Groups(NamedTuple):
         Where each level of the tree begins in spheres: the members, then what holds eight of
         them, and so on to the one that holds all.
     spheres : ndarray (m, 5)
-        Centre and radius; the centre must lie at less than this depth, or all of it appears too
-        small [m].
+        Centre and radius of what holds a landmark, or all that are below; its centre must lie
+        at no more than this depth, or all of them appear too small [m].
     """
 
     starts: NDArray[np.int64]
@@ -159,7 +159,7 @@ def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
         radii, depths = np.maximum.reduceat(radii, cuts), np.maximum.reduceat(depths, cuts)
         around = np.linalg.norm(high - low, axis=1) / 2
         spheres.append(np.c_[(low + high) / 2, around + radii, around + depths])
-    return (np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres))
+    return np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres)
 
 
 def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
