@@ -147,7 +147,8 @@ class Camera:
         """
         bboxes_xyxy = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4)
         left, top, right, bottom = bboxes_xyxy.T
-        middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
+        with np.errstate(invalid='ignore', over='ignore'):  # a box may reach from -inf to inf
+            middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
         midpoints = np.stack([left, middle_y, middle_x, top, right, middle_y, middle_x, bottom],
                              axis=-1)
         points = self.normalize_points(midpoints.reshape(-1, 2)).reshape(-1, 4, 2)

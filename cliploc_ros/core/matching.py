@@ -22,6 +22,9 @@ from cliploc_ros.errors import OptionsError
 #: here and not at its iterations, since candidates of equal class are hardly ever neighbours.
 MAX_CANDIDATES = 1_500
 
+# No lens sees what is so far off its axis, on the plane z = 1; squares of it are still numbers.
+_FARTHEST = 1e6
+
 
 def match_frame(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
                 ) -> tuple[Scene, float]:
@@ -36,7 +39,7 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     """
     bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
     # NaN where the lens model has no inverse; and a box turned inside out has no ellipse
-    sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1)
+    sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1) & (np.abs(bboxes) < _FARTHEST).all(axis=1)
     classes = landmark_map.classes.classes_of(observation.detections.class_ids)
     classes[~sound] = -1
     nearest = _nearest(landmark_map, observation, options, sound)

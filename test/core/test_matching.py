@@ -81,6 +81,23 @@ def candidate_mask_of(scene, shape):
     return mask
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('far', [1e10, 1e155, 1e300, np.inf, np.nan])
+@pytest.mark.parametrize('count', [50, 400])
+def test_a_box_that_no_lens_sees_changes_nothing(count, far):
+    landmark_map, observation = make_world(count)
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
+    alone = relocalizer.relocalize([observation])
+    seen = observation.detections
+    detections = Detections(np.r_[seen.bboxes_xyxy, [[0.0, 0, far, far], [-far, -far, far, far]]],
+                            (*seen.class_ids, *seen.class_ids[:2]), np.ones(len(seen) + 2))
+    similarities = np.r_[observation.similarities, observation.similarities[:2]]
+    found = relocalizer.relocalize([replace(observation, detections=detections,
+                                            similarities=similarities)])
+    assert alone.solved
+    assert (found.map_from_camera == alone.map_from_camera).all()
+
+
 def test_too_many_candidates_are_cut_and_said(monkeypatch):
     landmark_map, observation = make_world(400)
     whole, _ = match_frame(landmark_map, observation, RelocalizerOptions())
