@@ -103,15 +103,15 @@ def no_landmarks() -> SortedLandmarks:
                            np.empty(0, dtype=np.int32))
 
 
-def make_groups(landmarks: SortedLandmarks, classes: NDArray[np.int64],
-                boxes: NDArray[np.float64], iou_threshold: float) -> Groups:
+def make_groups(nearby: SortedLandmarks, classes: NDArray[np.int64], boxes: NDArray[np.float64],
+                iou_threshold: float) -> Groups:
     """Return the groups of a frame.
 
     Parameters
     ----------
-    landmarks : SortedLandmarks
+    nearby : SortedLandmarks
     classes : ndarray (n,) of int
-        Of each detection, as the landmarks have them; below 0 for none.
+        Of each detection, as the sorted landmarks have them; below 0 for none.
     boxes : ndarray (n, 4)
         Box ellipses, see Scene.
     iou_threshold : float
@@ -122,12 +122,12 @@ def make_groups(landmarks: SortedLandmarks, classes: NDArray[np.int64],
     frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
     reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
                                _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
-    members = _members(landmarks.classes, shown)
-    radii = np.sqrt(landmarks.landmarks[members[:, 0], 9])
+    members = _members(nearby.classes, shown)
+    radii = np.sqrt(nearby.landmarks[members[:, 0], 9])
     return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
                   np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
                   reaches, frusta, members,
-                  *_make_tree(landmarks.landmarks[members[:, 0], :3], radii,
+                  *_make_tree(nearby.landmarks[members[:, 0], :3], radii,
                               radii * reaches[members[:, 1]]))
 
 
@@ -225,6 +225,7 @@ def visible_members(groups, rotations, translations, which, seen):
     rotations, translations : ndarray (p, 3, 3), (p, 3)
         Of camera_from_map; which is one of them.
     seen : ndarray (2, w) of int
+        The second row is for what holds them.
     """
     frusta, members, levels, spheres = groups.frusta, groups.members, groups.levels, groups.spheres
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]

@@ -54,9 +54,9 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
                ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
-    """Return which pairs (p, 2) to verify, and the landmarks that hold those of equal class.
+    """Return which pairs (p, 2) to verify, and the landmarks among which are those of equal class.
 
-    For small maps there are none, and the pairs are all.
+    Small maps are not sorted for that: there the pairs are all.
     """
     if len(landmark_map) <= FEW:
         of_class = landmark_map.classes.candidates(classes)

@@ -49,8 +49,9 @@ from cliploc_ros.errors import OptionsError
 MAX_FRAMES = 10
 # Of the time budget: when the search ends, and the refinement; judging the result takes the rest.
 _SEARCH_SHARE, _REFINED_SHARE = 0.8, 0.9
-# And so much earlier for each further frame, on which what all have found is scored and judged.
-_EARLIER_SEARCH, _EARLIER_REFINED = 0.05, 0.02
+# And so much earlier [s] for each further frame, on which what all have found is scored and
+# judged; as shares of a budget that is shorter than this.
+_EARLIER_SEARCH_S, _EARLIER_REFINED_S, _SHORT_BUDGET_S = 0.0025, 0.001, 0.05
 
 
 class Relocalizer:
@@ -131,12 +132,18 @@ class Relocalizer:
         cameras = _cameras_from_last(observations)
         frames = [] if searched is None else searched
         new = observations[len(frames):]
-        share = _SEARCH_SHARE - _EARLIER_SEARCH * (len(observations) - 1)
-        each_s = share * self._options.time_budget_s / max(1, len(new))
+        each_s = self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S, observations) / max(1, len(new))
         for number, observation in enumerate(new):
             deadline = start + each_s * (number + 1)
             frames.append(search_frame(self._map, observation, self._options, deadline))
         return self._conclude(observations, frames, cameras, start)
+
+    def _time_s(self, share: float, earlier_s: float, observations: Sequence[Observation]
+                ) -> float:
+        """Return a share of the time budget [s], less what further frames need afterwards."""
+        budget_s = self._options.time_budget_s
+        shorter = min(1.0, budget_s / _SHORT_BUDGET_S)
+        return share * budget_s - shorter * earlier_s * (len(observations) - 1)
 
     def _conclude(self, observations: Sequence[Observation], frames: Sequence[Searched],
                   cameras: NDArray[np.float64], start: float) -> Relocalization:
@@ -150,8 +157,7 @@ class Relocalizer:
                           'candidates')
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]))
-        share = _REFINED_SHARE - _EARLIER_REFINED * (len(observations) - 1)
-        deadline = start + share * self._options.time_budget_s
+        deadline = start + self._time_s(_REFINED_SHARE, _EARLIER_REFINED_S, observations)
         upright = find_finalists(frames, rig, self._options.refine, REFINED, deadline)
         if not upright:
             return answer(False, 'no pose explains any three detections',

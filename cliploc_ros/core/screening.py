@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.culling import Groups, SortedLandmarks
+from cliploc_ros.core.culling import Groups
 from cliploc_ros.core.ellipse import ellipse_iou
 from cliploc_ros.core.p3p import MAX_SOLUTIONS
 from cliploc_ros.core.projection import project, project_groups
@@ -60,8 +60,9 @@ class Bench(NamedTuple):
     candidates : ndarray (c, 16)
         Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
         landmark of each correspondence candidate.
-    nearby, groups : SortedLandmarks, Groups
-        See Scene.
+    nearby : ndarray (L, 10)
+        The map's landmarks, sorted, see SortedLandmarks.
+    groups : Groups
     landmarks : ndarray (u, 10)
         Centres, shapes and squared radii of the landmarks that single detections may show. The
         radii are infinite: these are looked at from anywhere.
@@ -97,7 +98,7 @@ class Bench(NamedTuple):
     """
 
     candidates: NDArray[np.float64]
-    nearby: SortedLandmarks
+    nearby: NDArray[np.float64]
     groups: Groups
     landmarks: NDArray[np.float64]
     boxes: NDArray[np.float64]
@@ -141,7 +142,7 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
     return Bench(
         np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                         scene.centers[landmarks], scene.shapes[landmarks]], axis=1),
-        scene.nearby, groups, table, scene.box_ellipses, scene.potential_starts,
+        scene.nearby.landmarks, groups, table, scene.box_ellipses, scene.potential_starts,
         scene.potential_detections, (prior or Prior()).as_array(),
         scene.iou_threshold, np.empty((3, 3)), np.empty((3, 3)),
         np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)),
@@ -275,8 +276,8 @@ def verify_beyond(nearby, groups, landmarks, boxes, starts, detections, iou_thre
                    bounds, best_bounds, 0)
     if groups.reaches.shape[0] > 0:
         first = landmarks.shape[0]
-        last = project_groups(nearby.landmarks, groups, rotations, translations, which, seen,
-                              outlines, owners, first)
+        last = project_groups(nearby, groups, rotations, translations, which, seen, outlines,
+                              owners, first)
         count = _bound(boxes, groups.starts, owners, groups.detections, iou_threshold, first,
                        last, outlines, entries, bounds, best_bounds, count)
     upper = 0.0
