@@ -142,7 +142,7 @@ class Robot(Node):
         start = time.monotonic()
         future = self._client.call_async(Trigger.Request())
         # An image right behind it, larger than the memory that Fast DDS shares with a process's
-        # readers, lost one request in eight: DDS sent it again after up to three seconds.
+        # readers, lost one request in nine: DDS sent it again after up to three seconds.
         shown_at = start + _HEAD_START_S - _FRAME_PERIOD_S
 
         def answered() -> bool:
