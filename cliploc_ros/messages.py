@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import CameraError, ImageError
 
 # Where red, green and blue stand in each pixel, and how many bytes it has.

@@ -5,11 +5,15 @@
 import numpy as np
 import yaml
 
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import invert_transform, transform_from_pose
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
 
 PROJECT = Path(__file__).resolve().parents[1]
 # what every node has

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'

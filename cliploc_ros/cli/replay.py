@@ -20,7 +20,7 @@ from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.ros.player import Player, PlayReport
+    from cliploc_ros.ros.replay.player import Player, PlayReport
 
 NODE_NAME = 'replay'
 NS_PER_S = 1_000_000_000
@@ -142,7 +142,7 @@ def _make_player(
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.node import Node
 
-    from cliploc_ros.ros.player import Player, PlayOptions
+    from cliploc_ros.ros.replay.player import Player, PlayOptions
 
     play_options = PlayOptions(
         rate=options.rate,

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association import ClassIndex
-from cliploc_ros.core.culling import SortedLandmarks, sort_landmarks
-from cliploc_ros.core.ellipsoid import shape_matrices
+from cliploc_ros.core.association.candidates import ClassIndex
+from cliploc_ros.core.association.culling import SortedLandmarks, sort_landmarks
+from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
@@ -62,7 +62,7 @@ class LandmarkMap:
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
-        """Return the shape matrices (L, 6), see cliploc_ros.core.ellipsoid."""
+        """Return the shape matrices (L, 6), see cliploc_ros.core.geometry.ellipsoid."""
         return shape_matrices(self.semi_axes, self.quats_xyzw)
 
     @cached_property

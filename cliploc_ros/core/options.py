@@ -5,7 +5,7 @@
 import math
 from dataclasses import dataclass
 
-from cliploc_ros.core.association import ADAPTIVE, MATCHINGS
+from cliploc_ros.core.association.candidates import ADAPTIVE, MATCHINGS
 from cliploc_ros.errors import OptionsError
 
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
@@ -54,7 +54,7 @@ class RelocalizerOptions:
         Fewer explained objects are refused.
     min_confidence : float
         A pose that is within 1 m of the truth with less probability is refused (0 to 1), see
-        cliploc_ros.core.confidence.
+        cliploc_ros.core.acceptance.confidence.
 
     Raises
     ------

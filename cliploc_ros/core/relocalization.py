@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance import Match
-from cliploc_ros.core.confidence import Support
+from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.verdict import Match
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Relocalization:
     matches : tuple of Match
         The inliers of the best, in the frame that was asked about.
     covariance : ndarray (6, 6) or None
-        Of the best, see cliploc_ros.core.uncertainty; None when nothing was found.
+        Of the best, see cliploc_ros.core.fit.covariance; None when nothing was found.
     tried : int
         How many hypotheses were made.
     best_iteration : int

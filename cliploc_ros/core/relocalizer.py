@@ -10,30 +10,37 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core import association
-from cliploc_ros.core.acceptance import Evidence, Match, is_exhaustive, refusal
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.compatibility import compatible_pairs
+from cliploc_ros.core.acceptance.confidence import Support, View, confidences, support
+from cliploc_ros.core.acceptance.verdict import Evidence, Match, is_exhaustive, refusal
+from cliploc_ros.core.association.candidates import ADAPTIVE, check_k
+from cliploc_ros.core.association.scene import Workspace, make_scene
 from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.confidence import Support, View, confidences, support
-from cliploc_ros.core.ellipsoid import project_ellipsoids
-from cliploc_ros.core.finalists import (
+from cliploc_ros.core.fit.finalists import (
     Finalist,
     covariance_of,
     find_finalists,
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.frame_search import REFINED, Searched, search_frame
-from cliploc_ros.core.fusion import Rig, choose_distinct, make_rig, refine_all, verify_rig
+from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
+from cliploc_ros.core.fit.several_frames import (
+    Rig,
+    choose_distinct,
+    make_rig,
+    refine_all,
+    verify_rig,
+)
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.refinement import VERTICAL_UNKNOWN
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
-from cliploc_ros.core.sampling import draw_ransac
-from cliploc_ros.core.scoring import Workspace, make_scene
-from cliploc_ros.core.search import (
+from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.frame_search import REFINED, Searched, search_frame
+from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.search import (
     MAX_DISTINCT,
     Leaders,
     same_place,
@@ -41,7 +48,6 @@ from cliploc_ros.core.search import (
     search_progressively,
     search_samples,
 )
-from cliploc_ros.core.transforms import invert_transform, is_rigid
 from cliploc_ros.errors import OptionsError
 
 #: The most frames that are fused. Each frame's leaders are verified on every frame, so that time
@@ -69,8 +75,8 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities and options.k != association.ADAPTIVE:
-            association.check_k(options.k, len(landmark_map))
+        if options.needs_similarities and options.k != ADAPTIVE:
+            check_k(options.k, len(landmark_map))
         self._map = landmark_map
         landmark_map.prepare()
         self._options = options

@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.tum import NS_PER_S
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.datasets.bag_reader import BagReader
 from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.datasets.tum import TumSequence

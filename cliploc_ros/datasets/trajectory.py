@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 
 #: A pose counts for a stamp only if a sample lies this close to it.
 MAX_SAMPLE_DISTANCE_NS = 20_000_000

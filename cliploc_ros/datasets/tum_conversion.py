@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.rosbag import BagWriter

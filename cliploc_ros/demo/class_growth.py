@@ -24,9 +24,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.demo.compare import record
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
+from cliploc_ros.evaluation.paper_table import as_text, table_rows
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
-from cliploc_ros.evaluation.tables import as_text, table_rows
 from cliploc_ros.evaluation.trials import make_queries
 
 #: Objects of each class; the fewer the classes, the more.

@@ -13,9 +13,9 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from cliploc_ros.core.ellipsoid import outline_points, project_ellipsoids
+from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.transforms import invert_transform
 from cliploc_ros.demo.review import Review
 from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
 

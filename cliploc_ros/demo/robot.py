@@ -16,13 +16,13 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import transform_from_pose
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.bag_publisher import create_publisher
 from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns
+from cliploc_ros.ros.replay.bag_publisher import create_publisher
 
 _PATIENCE_S = 60.0
 # How often a camera that stands still shows the same again.

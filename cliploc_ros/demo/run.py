@@ -37,7 +37,7 @@ from cliploc_ros.demo.robot import Robot
 from cliploc_ros.demo.top_view import draw_top_view
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
 # The first start compiles the kernels of the search.
 _PATIENCE_S = 180.0

@@ -20,13 +20,13 @@ from scipy.optimize import minimize, minimize_scalar
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.confidence import DEFAULT, Calibration, Support, confidences
+from cliploc_ros.core.acceptance.confidence import DEFAULT, Calibration, Support, confidences
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search import MAX_DISTINCT
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.search.search import MAX_DISTINCT
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, make_queries
@@ -306,7 +306,7 @@ def run(arguments: list[str]) -> int:
                   np.concatenate([half[1] for half in elsewhere])))
     if options.out is not None:
         _draw(options.out, {f'half {number}': half for number, half in enumerate(judged, start=1)})
-    print('\nfitted on all, for cliploc_ros/core/confidence.py:\n'
+    print('\nfitted on all, for cliploc_ros/core/acceptance/confidence.py:\n'
           + ', '.join(f'{name}={value:.3g}' for name, value in fit(cases)._asdict().items()))
     return 0
 

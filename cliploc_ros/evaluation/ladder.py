@@ -21,10 +21,10 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.evaluation.methods import Method
+from cliploc_ros.evaluation.paper_table import as_markdown, as_text
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary, summarize
-from cliploc_ros.evaluation.tables import as_markdown, as_text
 from cliploc_ros.evaluation.trials import Query, make_queries
 
 _TRIALS = 3

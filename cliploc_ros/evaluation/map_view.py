@@ -9,7 +9,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from cliploc_ros.core.ellipsoid import outline_points
+from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 #: Sets writing off from what it stands on.

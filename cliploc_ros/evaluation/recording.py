@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.frames import Frame, Frames

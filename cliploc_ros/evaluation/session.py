@@ -19,9 +19,16 @@ from cliploc_ros.evaluation import tuning
 from cliploc_ros.evaluation.journal import Journal
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.output import write_text
+from cliploc_ros.evaluation.paper_table import (
+    as_csv,
+    as_json,
+    as_markdown,
+    as_text,
+    notes,
+    table_rows,
+)
 from cliploc_ros.evaluation.run import count_searches, run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
-from cliploc_ros.evaluation.tables import as_csv, as_json, as_markdown, as_text, notes, table_rows
 from cliploc_ros.evaluation.trajectories import absolute_trajectory_error, write_trajectories
 from cliploc_ros.evaluation.trials import Query, Result
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.transforms import quaternion_from_transform
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.evaluation.output import make_folder, write_text
 from cliploc_ros.evaluation.trials import NS_PER_S, Query, Result
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import pose_error
-from cliploc_ros.core.uncertainty import normalized_square
 from cliploc_ros.datasets.queries import Queries, QueryFrame
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.methods import Method

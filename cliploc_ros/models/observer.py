@@ -5,9 +5,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.association.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.similarity import CropSimilarities, LabelEmbeddings
 from cliploc_ros.models.protocols import ImageTextEncoder
 
 

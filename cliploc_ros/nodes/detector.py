@@ -16,13 +16,13 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.diagnostics import Health, Rates, StageTimes
-from cliploc_ros.ros.lifecycle import ManagedNode
-from cliploc_ros.ros.parameters import Value
-from cliploc_ros.ros.process import run_node
-from cliploc_ros.ros.subscription import AdaptiveSubscription
-from cliploc_ros.ros.tables import DETECTOR
-from cliploc_ros.ros.worker import LatestOnly
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.parameters import Value
+from cliploc_ros.ros.node.process import run_node
+from cliploc_ros.ros.node.worker import LatestOnly
+from cliploc_ros.ros.parameter_tables import DETECTOR
 
 _LOG_PERIOD_S = 5.0
 

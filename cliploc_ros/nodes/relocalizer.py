@@ -17,28 +17,28 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.transforms import move_covariance
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
-from cliploc_ros.ros.debug_image import View
-from cliploc_ros.ros.diagnostics import Health, StageTimes
-from cliploc_ros.ros.frame_source import Frame, FrameSource, NoFrameError
-from cliploc_ros.ros.frames import BaseFrame, FrameError
-from cliploc_ros.ros.handoff import HandOff, HandOffError
-from cliploc_ros.ros.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.odometry import CameraPlace, OdometrySource
+from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.lingering import Lingering
 from cliploc_ros.ros.localizer import Localizer, load_localizer
-from cliploc_ros.ros.odom_frame import OdomFrame
-from cliploc_ros.ros.odometry import CameraPlace, OdometrySource
-from cliploc_ros.ros.odometry_window import NoOdometryError
-from cliploc_ros.ros.process import run_node
-from cliploc_ros.ros.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
-from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
-from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource
-from cliploc_ros.ros.visualization import Visualization
-from cliploc_ros.ros.worker import LatestOnly
+from cliploc_ros.ros.node.diagnostics import Health, StageTimes
+from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.node.process import run_node
+from cliploc_ros.ros.node.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
+from cliploc_ros.ros.node.worker import LatestOnly
+from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
+from cliploc_ros.ros.outputs.map_to_odom import OdomFrame
+from cliploc_ros.ros.outputs.visualization import Visualization
+from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
 _LOG_PERIOD_S = 5.0
 _VERDICTS = ('accepted', 'refused', 'withheld')

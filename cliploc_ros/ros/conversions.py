@@ -18,8 +18,8 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import quaternion_from_transform
 
 
 def stamp_ns(stamp: Time) -> int:

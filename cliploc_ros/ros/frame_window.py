@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.frame_search import Searched
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.transforms import invert_transform, pose_error
+from cliploc_ros.core.search.frame_search import Searched
 
 # A camera that moved less sees the same again: such a frame takes the place of the one before.
 _MOVED_M = 0.05

@@ -23,13 +23,13 @@ from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
 )
-from cliploc_ros.ros.debug_image import View
-from cliploc_ros.ros.diagnostics import StageTimes
-from cliploc_ros.ros.frame_source import Frame
 from cliploc_ros.ros.frame_window import FrameWindow
-from cliploc_ros.ros.map_parameters import load_map
-from cliploc_ros.ros.odometry import CameraPlace
-from cliploc_ros.ros.tables import parse_class_map, relocalizer_options
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.odometry import CameraPlace
+from cliploc_ros.ros.node.diagnostics import StageTimes
+from cliploc_ros.ros.node.map_parameters import load_map
+from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
 
 
 class Localizer:

@@ -14,7 +14,7 @@ import pytest
 from executables import PROJECT, SIZE, run, wait_until
 
 from cliploc_ros.cli.tum_to_bag import main
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.rosbag import BagReader

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.association import (
+from cliploc_ros.core.association.candidates import (
     ClassIndex,
     adaptive_candidates,
     balanced_order,

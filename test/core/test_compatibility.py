@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.compatibility import FARTHEST, NEAREST, _distance_range, compatible_pairs
-from cliploc_ros.core.scoring import make_scene
-from cliploc_ros.core.search import Leaders, search_exhaustively, search_progressively
-from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.search.compatibility import (
+    FARTHEST,
+    NEAREST,
+    _distance_range,
+    compatible_pairs,
+)
+from cliploc_ros.core.search.search import Leaders, search_exhaustively, search_progressively
 
 
 @pytest.fixture(scope='module')

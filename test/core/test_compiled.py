@@ -14,7 +14,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 # A few kernels of one module, which are compiled within a second.
 FEW = """
 from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.ellipse import unit_circle_overlap
+from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 warm_up(lambda: unit_circle_overlap(0.1, 0.2, 1.0, 2.0))
 print('warm')
 """
@@ -54,8 +54,8 @@ def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
 FULL_DISK = """
 import logging, resource
 from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.cubic import largest_cubic_root
-from cliploc_ros.core.ellipse import unit_circle_overlap
+from cliploc_ros.core.geometry.cubic import largest_cubic_root
+from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 logging.basicConfig()
 def run():
     return largest_cubic_root(0.0, 0.0, -8.0), unit_circle_overlap(0.0, 0.0, 1.0, 1.0)
@@ -81,13 +81,13 @@ if len(sys.argv) > 1:
 import numpy as np
 sys.path.insert(0, 'test')
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
-from cliploc_ros.core.compatibility import compatible_pairs
+from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.sampling import draw_prosac
-from cliploc_ros.core.scoring import make_scene
-from cliploc_ros.core.screening import Prior
-from cliploc_ros.core.search import Leaders, search_progressively, search_samples
+from cliploc_ros.core.search.sampling import draw_prosac
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.search.screening import Prior
+from cliploc_ros.core.search.search import Leaders, search_progressively, search_samples
 room = make_room()
 Relocalizer(room, RelocalizerOptions()).warm_up()
 rows = slice(0, 6)

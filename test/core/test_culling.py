@@ -8,12 +8,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cliploc_ros.core.culling import make_groups, no_landmarks, sort_landmarks, visible_members
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.sampling import draw_ransac
-from cliploc_ros.core.scoring import Scene, Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.search import Leaders, search_samples
-from cliploc_ros.core.transforms import invert_transform, make_transform
+from cliploc_ros.core.association.culling import (
+    make_groups,
+    no_landmarks,
+    sort_landmarks,
+    visible_members,
+)
+from cliploc_ros.core.association.scene import Scene, Workspace, make_scene, sample_pose, verify
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.search import Leaders, search_samples
 
 
 def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.ellipsoid import (
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
     project_ellipsoids,
     shape_matrices,
 )
-from cliploc_ros.core.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform
 
 axes = st.floats(0.01, 0.6)
 

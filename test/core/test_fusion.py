@@ -7,8 +7,10 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
-from cliploc_ros.core.fusion import (
+from cliploc_ros.core.association.matching import match_frame
+from cliploc_ros.core.association.scene import Workspace, make_scene, verify
+from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN, move, robust_cost
+from cliploc_ros.core.fit.several_frames import (
     _linearize,
     _pair,
     _residuals,
@@ -17,13 +19,15 @@ from cliploc_ros.core.fusion import (
     refine_rig,
     verify_rig,
 )
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, move, robust_cost
-from cliploc_ros.core.scoring import Workspace, make_scene, verify
-from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
 
 FRAMES = 4
 

@@ -5,10 +5,10 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core import association
-from cliploc_ros.core.p3p import solve_p3p
-from cliploc_ros.core.scoring import Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.search import Leaders, search_exhaustively
+from cliploc_ros.core.association import candidates as association
+from cliploc_ros.core.association.scene import Workspace, make_scene, sample_pose, verify
+from cliploc_ros.core.geometry.p3p import solve_p3p
+from cliploc_ros.core.search.search import Leaders, search_exhaustively
 
 
 @pytest.fixture(scope='module')

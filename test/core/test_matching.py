@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core import matching
-from cliploc_ros.core.association import candidate_mask, nearest_candidates, same_class
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.association import matching
+from cliploc_ros.core.association.candidates import candidate_mask, nearest_candidates, same_class
+from cliploc_ros.core.association.matching import match_frame
+from cliploc_ros.core.association.scene import Workspace, make_scene, verify
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.matching import match_frame
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.scoring import Workspace, make_scene, verify
-from cliploc_ros.core.transforms import make_transform
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.p3p import solve_p3p
+from cliploc_ros.core.geometry.p3p import solve_p3p
 
 coordinates = st.floats(-5.0, 5.0)
 

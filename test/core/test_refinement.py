@@ -7,10 +7,10 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.fusion import _LEAST_SHARE, make_rig, refine_rig
-from cliploc_ros.core.refinement import VERTICAL_UNKNOWN, linearize, move, residuals_of
-from cliploc_ros.core.scoring import Workspace, make_scene, verify
-from cliploc_ros.core.transforms import invert_transform, pose_error
+from cliploc_ros.core.association.scene import Workspace, make_scene, verify
+from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN, linearize, move, residuals_of
+from cliploc_ros.core.fit.several_frames import _LEAST_SHARE, make_rig, refine_rig
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 
 
 @pytest.fixture(scope='module')

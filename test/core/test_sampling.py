@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.sampling import draw_prosac, draw_ransac, prosac_growth
+from cliploc_ros.core.search.sampling import draw_prosac, draw_ransac, prosac_growth
 
 
 def test_growth_of_chum_and_matas():

@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.compatibility import compatible_pairs
-from cliploc_ros.core.ellipse import ellipse_iou
-from cliploc_ros.core.p3p import p3p
-from cliploc_ros.core.sampling import draw_ransac
-from cliploc_ros.core.scoring import Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.screening import (
+from cliploc_ros.core.association.scene import Workspace, make_scene, sample_pose, verify
+from cliploc_ros.core.geometry.ellipse import ellipse_iou
+from cliploc_ros.core.geometry.p3p import p3p
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.screening import (
     Prior,
     choose_pose,
     iou_bound,
@@ -23,13 +24,12 @@ from cliploc_ros.core.screening import (
     set_up,
     verify_beyond,
 )
-from cliploc_ros.core.search import (
+from cliploc_ros.core.search.search import (
     Leaders,
     search_exhaustively,
     search_progressively,
     search_samples,
 )
-from cliploc_ros.core.transforms import invert_transform, make_transform, pose_error
 
 UP_IN_MAP = np.array([0.0, -1.0, 0.0])
 UP_IN_CAMERA = MAP_FROM_CAMERA[:3, :3].T @ UP_IN_MAP

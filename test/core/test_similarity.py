@@ -10,7 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.similarity import CropSimilarities, LabelEmbeddings, nearest_landmarks
+from cliploc_ros.core.association.similarities import (
+    CropSimilarities,
+    LabelEmbeddings,
+    nearest_landmarks,
+)
 from cliploc_ros.errors import OptionsError
 
 

@@ -5,9 +5,9 @@
 import numpy as np
 import pytest
 
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import pose_error
 
 LIMITS_M = (0.25, 0.5, 1.0)
 METHODS = ('class_bf', 'class_ransac', 'clip_bf', 'clip_b-prosac', 'hybrid_bf', 'hybrid_ransac',

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.transforms import (
+from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     move_covariance,
     pose_error,

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance import Evidence, Match, refusal
-from cliploc_ros.core.camera import Camera
-from cliploc_ros.core.confidence import Support, View, confidences, support
+from cliploc_ros.core.acceptance.confidence import Support, View, confidences, support
+from cliploc_ros.core.acceptance.verdict import Evidence, Match, refusal
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.covariance import pose_covariance
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.scoring import make_scene
-from cliploc_ros.core.transforms import pose_error
-from cliploc_ros.core.uncertainty import pose_covariance
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.evaluation.troubles import exchange_landmarks
 
@@ -266,8 +266,8 @@ def test_a_search_cut_short_is_refused(office_map, queries, observe):
 
 def test_covariance_is_that_of_simulated_boxes(rng):
     """The linearized covariance against the scatter of poses solved from noisy boxes."""
-    from cliploc_ros.core.p3p import solve_p3p
-    from cliploc_ros.core.uncertainty import _VARIANCE_INFLATION
+    from cliploc_ros.core.fit.covariance import _VARIANCE_INFLATION
+    from cliploc_ros.core.geometry.p3p import solve_p3p
     centers = np.array([[-1.0, 0.2, 4.0], [1.2, -0.3, 5.0], [0.1, 0.9, 3.0]])
     seen = centers[:, :2] / centers[:, 2:]
     sizes, scatter = np.full((3, 2), 0.1), 0.01

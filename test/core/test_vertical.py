@@ -10,10 +10,10 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.errors import OptionsError
 
 LIMITS_M = (0.25, 0.5, 1.0)

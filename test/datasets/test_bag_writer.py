@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import transform_from_pose
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.rosbag import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter, typestore
 from cliploc_ros.errors import DatasetError

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.intrinsics import PRESETS, find_camera, read_camera
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.trajectory import Trajectory, slerp

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.core.ellipsoid import (
+from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
     project_ellipsoids,
     shape_matrices,
 )
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.transforms import invert_transform
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.world.appearance import CLASSES, COLORS, Appearance, draw_appearance

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core.confidence import DEFAULT, Support, confidences
+from cliploc_ros.core.acceptance.confidence import DEFAULT, Support, confidences
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 from cliploc_ros.evaluation.figures import precision_recall
+from cliploc_ros.evaluation.paper_table import (
+    as_csv,
+    as_json,
+    as_markdown,
+    as_text,
+    notes,
+    table_rows,
+)
 from cliploc_ros.evaluation.summary import Summary, compare, find_best, summarize
-from cliploc_ros.evaluation.tables import as_csv, as_json, as_markdown, as_text, notes, table_rows
 from cliploc_ros.evaluation.trials import Result
 
 

@@ -18,9 +18,9 @@ from hypothesis import given
 from scene import make_room, write_map
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.localizer import load_localizer
-from cliploc_ros.ros.tables import RELOCALIZER
+from cliploc_ros.ros.parameter_tables import RELOCALIZER
 
 
 @pytest.fixture(scope='module')

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a first start of CLIP and a start with a warm cache cost."""
 
+from cliploc_ros.benchmark.startup import KINDS, format_results, measure_startup
 from cliploc_ros.models import ClipOptions
-from cliploc_ros.models.measure_startup import KINDS, format_results, measure_startup
 
 
 def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):

@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)

@@ -18,8 +18,8 @@ from conftest import class_matching, make_frame, transform_of
 from rcl_interfaces.srv import GetParameters
 from scene import MAP_FROM_CAMERA, make_room, see_room
 
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import pose_error
 
 
 @pytest.fixture(scope='module')

@@ -15,13 +15,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from std_msgs.msg import Header
 
-from cliploc_ros.core.ellipsoid import ellipse_bboxes, ellipses_in_pixels, project_ellipsoids
-from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.transforms import (
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
     transform_from_pose,
 )
+from cliploc_ros.core.observation import Detections
 from cliploc_ros.ros.conversions import pose_to_msg
 
 ROOM = make_room()

@@ -15,7 +15,7 @@ from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
 
-from cliploc_ros.core.transforms import (
+from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     move_covariance,
     pose_error,

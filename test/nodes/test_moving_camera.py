@@ -15,8 +15,8 @@ from lifecycle_msgs.srv import ChangeState
 from scene import MAP_FROM_CAMERA
 from std_msgs.msg import Header
 
-from cliploc_ros.core.transforms import invert_transform, pose_error, transform_from_pose
-from cliploc_ros.ros.odom_frame import transform_msg
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
+from cliploc_ros.ros.outputs.map_to_odom import transform_msg
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 

@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import Image
 
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 
 
 def test_a_request_is_answered_with_a_pose(relocalizer, tester):

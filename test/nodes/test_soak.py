@@ -23,7 +23,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.bag_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,

@@ -5,7 +5,7 @@
 import numpy as np
 from conftest import transform_of
 
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import stamp_ns
 
 

@@ -7,10 +7,10 @@ import pytest
 from scene import CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.confidence import Support
+from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
-from cliploc_ros.core.transforms import make_transform
 from cliploc_ros.ros.frame_window import FrameWindow
 
 SEEN = see_room(make_room())

@@ -6,8 +6,8 @@ from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.transforms import transform_from_pose
-from cliploc_ros.ros.frames import BaseFrame, FrameError
+from cliploc_ros.core.geometry.transforms import transform_from_pose
+from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
 
 NO_MOUNT = [0.0] * 7
 

@@ -5,7 +5,7 @@ import time
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from cliploc_ros.ros.diagnostics import Diagnostics, Health, Rates, Stages, StageTimes
+from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Rates, Stages, StageTimes
 
 
 def test_the_worst_problem_gives_the_level_and_comes_first():

@@ -9,12 +9,12 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from cliploc_ros.core.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.frame_source import Frame
+from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.localizer import load_localizer
-from cliploc_ros.ros.tables import RELOCALIZER
+from cliploc_ros.ros.parameter_tables import RELOCALIZER
 
 HEADER = Header(frame_id='camera', stamp=Time(sec=100))
 

@@ -6,7 +6,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.ros.markers import (
+from cliploc_ros.ros.outputs.markers import (
     MAX_SHOWN,
     class_color,
     landmark_markers,

@@ -6,8 +6,8 @@ import pytest
 from rclpy.parameter import Parameter
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.ros.parameters import NodeParameters, ParameterRow, yaml_defaults
-from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, yaml_defaults
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
 
 TABLE = (
     ParameterRow('low', 1, 'Not above high.', low=0, high=100),

@@ -7,11 +7,11 @@ import pytest
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
-from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.ros.frames import BaseFrame, FrameError
-from cliploc_ros.ros.odom_frame import OdomFrame, transform_msg
-from cliploc_ros.ros.tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.outputs.map_to_odom import OdomFrame, transform_msg
+from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {row.name: row.default for row in RELOCALIZER} | {

@@ -12,12 +12,12 @@ from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
-from cliploc_ros.core.transforms import make_transform, transform_from_pose
+from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_to_msg
-from cliploc_ros.ros.frames import BaseFrame
-from cliploc_ros.ros.odometry import OdometrySource
-from cliploc_ros.ros.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 BASE_FROM_CAMERA = transform_from_pose(np.array(OPTICAL[:3]), np.array(OPTICAL[3:]))

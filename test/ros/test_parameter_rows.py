@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.ros.parameters import ParameterRow, markdown_table, yaml_defaults
-from cliploc_ros.ros.tables import DETECTOR, RELOCALIZER, parse_class_map, relocalizer_options
+from cliploc_ros.ros.node.parameters import ParameterRow, markdown_table, yaml_defaults
+from cliploc_ros.ros.parameter_tables import (
+    DETECTOR,
+    RELOCALIZER,
+    parse_class_map,
+    relocalizer_options,
+)
 
 TEXT = ParameterRow('text', 'a', 'Some text.')
 CHOICE = ParameterRow('choice', 'raw', 'One of two.', choices=('raw', 'compressed'))

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import pose_error
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.evaluation.troubles import exchange_landmarks

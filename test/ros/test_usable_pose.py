@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
 from rclpy.time import Time
 
-from cliploc_ros.ros.handoff import speeds, usable_pose
+from cliploc_ros.ros.outputs.handoff import speeds, usable_pose
 
 # x, xy, yx, y and yaw: all that AMCL reads
 AMCL_READS = [0, 1, 6, 7, 35]

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 
-from cliploc_ros.core.transforms import transform_from_pose
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.frames import BaseFrame
-from cliploc_ros.ros.vertical import NoVerticalError, VerticalSource, sample_from_msg
+from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource, sample_from_msg
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 CAMERA_FROM_BASE = np.linalg.inv(transform_from_pose(np.array(OPTICAL[:3]),

@@ -10,11 +10,11 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.transforms import transform_from_pose
-from cliploc_ros.ros.visualization import Visualization
+from cliploc_ros.ros.outputs.visualization import Visualization
 
 ROOM = make_room()
 HEADER = Header(frame_id='map')

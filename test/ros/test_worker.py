@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError
-from cliploc_ros.ros.worker import LatestOnly, Worker
+from cliploc_ros.ros.node.worker import LatestOnly, Worker
 
 PATIENCE_S = 20.0
 

@@ -14,13 +14,13 @@ import yaml
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.ellipsoid import (
+from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
     project_ellipsoids,
     shape_matrices,
 )
-from cliploc_ros.core.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.demo.world.meshes import make_object
 from cliploc_ros.demo.world.photograph import expose
 from cliploc_ros.demo.world.renderer import Renderer

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.demo.world.appearance import COLORS
 from cliploc_ros.demo.world.meshes import Mesh, make_object
 from cliploc_ros.demo.world.room import HEIGHT_M, LENGTH_M, WIDTH_M, Room

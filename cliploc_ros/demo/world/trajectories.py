@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from cliploc_ros.core.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.demo.world.room import LENGTH_M, WIDTH_M, Room
 
 #: Pixel centres have whole coordinates, as everywhere in the package.

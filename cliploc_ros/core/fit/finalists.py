@@ -1,0 +1,212 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The last few of a search: refined, told apart, and each with what it explains."""
+
+import time
+from collections.abc import Sequence
+from itertools import batched, pairwise
+from math import comb, inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.verdict import Match
+from cliploc_ros.core.association.scene import Workspace
+from cliploc_ros.core.fit.covariance import (
+    box_scatter,
+    odometry_covariance,
+    pose_covariance,
+    refined_covariance,
+)
+from cliploc_ros.core.fit.several_frames import Rig, choose_distinct, refine_all, verify_rig
+from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
+from cliploc_ros.core.search.frame_search import Searched
+from cliploc_ros.core.search.search import MAX_DISTINCT, same_place
+
+# Between so many a time limit is looked at.
+_REFINED_AT_ONCE = 4
+# So often at most a leader of one frame is scored on one: all 32 of up to five frames, and eight
+# of each of ten, so that more frames take no longer.
+_SCORED = 800
+
+
+class Finalist(NamedTuple):
+    """One of the best hypotheses at places that differ.
+
+    Parameters
+    ----------
+    rotation, translation : ndarray (3, 3), (3,)
+        Of camera_from_map, of the reference frame.
+    score : float
+        Sum of the IoUs of its inliers, in all frames.
+    iteration : int
+        In which it was found, from 1.
+    frame : int
+        In whose search.
+    sample : ndarray (s,) of int
+        The candidates that it was made from: three, or two where the vertical is known.
+    information : ndarray (6, 6) or None
+        See refine_rig; None where it was not refined.
+    """
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    score: float
+    iteration: int
+    frame: int
+    sample: NDArray[np.int64]
+    information: NDArray[np.float64] | None = None
+
+    @property
+    def map_from_camera(self) -> NDArray[np.float64]:
+        """Return the pose (4, 4)."""
+        return invert_transform(make_transform(self.rotation, self.translation))
+
+
+def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: int,
+                   deadline: float = inf) -> list[Finalist]:
+    """Return the best of all frames' leaders, best first; what went to the same place is one.
+
+    Parameters
+    ----------
+    frames : sequence of Searched
+    rig : Rig
+        Of these frames.
+    refine : bool
+        Whether to refine them.
+    count : int
+        How many at most are refined.
+    deadline : float, optional
+        When to stop, of time.perf_counter [s]: what is left then, the worst, stays as found.
+    """
+    found = [one for frame in range(len(frames))
+             for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
+    if len(frames) > 1 and found:
+        found = _best_in_all(found, rig, count)
+    return _refined(found, rig, deadline)[:MAX_DISTINCT] if refine else found[:MAX_DISTINCT]
+
+
+def _leaders_of(frames: Sequence[Searched], rig: Rig, frame: int) -> list[Finalist]:
+    """Return the leaders of one frame, best first, as poses of the reference."""
+    leaders = frames[frame].leaders
+    camera = rig.cameras[frame]
+    back, offset = camera[:, :3].T, camera[:, 3]
+    return [Finalist(back @ leaders.rotations[row], back @ (leaders.translations[row] - offset),
+                     float(leaders.scores[row]), int(leaders.iterations[row]), frame,
+                     leaders.samples[row][leaders.samples[row] >= 0])
+            for row in leaders.ranked()]
+
+
+def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
+    """Return those that lead where all frames are asked, best first."""
+    rows, scores = choose_distinct(rig, *_poses(found), count, _workspace(rig))
+    return [found[row]._replace(score=float(scores[row])) for row in rows]
+
+
+def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:
+    """Return them after refinement, best first, each place once."""
+    improved: list[Finalist] = []
+    for some in batched(found, _REFINED_AT_ONCE):
+        if improved and time.perf_counter() > deadline:
+            improved += some
+            continue
+        rotations, translations = _poses(some)
+        scores, informations = refine_all(rig, rotations, translations, _workspace(rig))
+        improved += [one._replace(rotation=rotations[row], translation=translations[row],
+                                  score=float(scores[row]), information=informations[row])
+                     for row, one in enumerate(some)]
+    distinct: list[Finalist] = []
+    for one in sorted(improved, key=lambda one: -one.score):
+        if not any(same_place(one.rotation, one.translation, better.rotation, better.translation)
+                   for better in distinct):
+            distinct.append(one)
+    return distinct
+
+
+def _poses(found: Sequence[Finalist]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return (np.stack([one.rotation for one in found]),
+            np.stack([one.translation for one in found]))
+
+
+def _workspace(rig: Rig) -> Workspace:
+    return Workspace.allocate(int(rig.bounds[-1, 0]))
+
+
+def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
+    """Return the inliers of a pose in each frame."""
+    workspace = _workspace(rig)
+    verify_rig(rig, pose.rotation, pose.translation, workspace)
+    return [tuple(Match(int(row - first), int(workspace.landmarks[row]),
+                        float(workspace.ious[row]))
+                  for row in range(first, last) if workspace.landmarks[row] >= 0)
+            for first, last in pairwise(rig.bounds[:, 0])]
+
+
+def meetings_of(frames: Sequence[Searched], pose: Finalist,
+                matches: Sequence[Sequence[Match]]) -> int:
+    """Return how many of the samples tried hold nothing but a pose's inliers.
+
+    Parameters
+    ----------
+    frames : sequence of Searched
+    pose : Finalist
+    matches : sequence of sequence of Match
+        Its inliers in each frame.
+    """
+    return sum(_meetings_in(frame, len(pose.sample), found)
+               for frame, found in zip(frames, matches, strict=True))
+
+
+def _meetings_in(frame: Searched, size: int, matches: Sequence[Match]) -> int:
+    scene, progress = frame.scene, frame.progress
+    landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
+    for match in matches:
+        landmark_of[match.detection] = match.landmark
+    is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
+    if frame.samples is None:
+        return comb(int(is_inlier[:progress.reach].sum()), size)
+    tried = frame.samples[:round(progress.coverage * len(frame.samples))]
+    return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
+
+
+def covariance_of(frames: Sequence[Searched], rig: Rig, pose: Finalist,
+                  matches: Sequence[Sequence[Match]]) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose: of its refinement, or of its minimal sample.
+
+    Frames that show one object share the errors of its shape in the map: together they inform
+    like one view of each object. To that comes what odometry may be off by.
+
+    Parameters
+    ----------
+    frames : sequence of Searched
+    rig : Rig
+        Of these frames.
+    pose : Finalist
+    matches : sequence of sequence of Match
+        Its inliers in each frame.
+    """
+    cameras = [make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras]
+    reference_from_map = invert_transform(pose.map_from_camera)
+    outlines, boxes = [], []
+    for frame, camera, found in zip(frames, cameras, matches, strict=True):
+        landmarks = [match.landmark for match in found]
+        outlines.append(project_ellipsoids(camera @ reference_from_map,
+                                           frame.scene.centers[landmarks],
+                                           frame.scene.shapes[landmarks]))
+        boxes.append(frame.scene.box_ellipses[[match.detection for match in found]])
+    seen = [row for found in matches for row in {match.landmark for match in found}]
+    views = max(1.0, len(seen) / max(1, len(set(seen))))
+    scatter = box_scatter(np.concatenate(outlines), np.concatenate(boxes), views)
+    shared = odometry_covariance() if len(frames) > 1 else 0.0
+    if pose.information is not None:
+        return refined_covariance(pose.information / views, scatter) + shared
+    scene = frames[pose.frame].scene
+    map_from_camera = pose.map_from_camera @ invert_transform(cameras[pose.frame])
+    sampled = scene.pairs[pose.sample]
+    covariance = pose_covariance(map_from_camera, scene.centers[sampled[:, 1]],
+                                 2.0 * scene.box_ellipses[sampled[:, 0], 2:], scatter,
+                                 frames[pose.frame].vertical)
+    lever = pose.map_from_camera[:3, 3] - map_from_camera[:3, 3]
+    return move_covariance(covariance, lever) + shared

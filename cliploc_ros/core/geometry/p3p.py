@@ -1,0 +1,279 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The perspective-three-point problem.
+
+The depths d of the three points along their bearings solve three quadratic equations
+``di^2 + dj^2 - 2 di dj cos_ij = |Xi - Xj|^2``. Two homogeneous combinations of them are conics
+in (d1 : d2 : d3); a degenerate member of their pencil is a pair of lines (Persson and Nordberg,
+"Lambda Twist", ECCV 2018), split as in Ding et al., "Revisiting the P3P Problem", CVPR 2023.
+Each line meets a conic in up to two points, so there are up to four poses. The depths found are
+polished by Newton's method on the three equations themselves.
+"""
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.cubic import largest_cubic_root
+
+MAX_SOLUTIONS = 4
+_NEWTON_STEPS = 3
+# Triangles or bearings whose normalized cross products fall below this are degenerate.
+_MIN_SINE = 1e-9
+
+
+def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the poses from which three points are seen along three bearings.
+
+    Parameters
+    ----------
+    bearings : ndarray (3, 3)
+        Unit vectors in the camera's optical frame, one a row.
+    points : ndarray (3, 3)
+        The points in the map frame [m], one a row.
+
+    Returns
+    -------
+    rotations : ndarray (s, 3, 3)
+        Rotation of ``camera_from_map`` of each of the s = 0 to 4 solutions.
+    translations : ndarray (s, 3)
+        Its translation [m]. All points lie in front of the camera along their bearings.
+    """
+    rotations = np.empty((MAX_SOLUTIONS, 3, 3))
+    translations = np.empty((MAX_SOLUTIONS, 3))
+    count = p3p(np.ascontiguousarray(bearings, dtype=np.float64),
+                np.ascontiguousarray(points, dtype=np.float64), rotations, translations)
+    return rotations[:count], translations[:count]
+
+
+@compiled
+def p3p(bearings, points, rotations, translations):
+    """Write up to four poses into the two arrays; return how many (see solve_p3p)."""
+    m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
+    a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
+                     _squared_distance(points, 1, 2))
+    longest = max(a12, a13, a23)
+    if not min(a12, a13, a23) > _MIN_SINE * _MIN_SINE * longest:
+        return 0
+    # lengths in units of the longest side, so that every threshold below is relative
+    scale = sqrt(longest)
+    a12, a13, a23 = a12 / longest, a13 / longest, a23 / longest
+
+    # the two conics, as upper triangles (d1d1, d1d2, d1d3, d2d2, d2d3, d3d3)
+    first = (a23, -a23 * m12, 0.0, a23 - a12, a12 * m23, -a12)
+    second = (a23, 0.0, -a23 * m13, -a13, a13 * m23, a23 - a13)
+    line1, line2, real = _degenerate_lines(first, second)
+    if not real:
+        return 0
+
+    frame, sound = _inverse_triangle_frame(points)
+    if not sound:
+        return 0
+    count = 0
+    for line in (line1, line2):
+        roots, depths_a, depths_b = _meet_line_and_conic(line, first)
+        for which in range(roots):
+            d1, d2, d3 = depths_a if which == 0 else depths_b
+            norm = d2 * d2 + d3 * d3 - 2.0 * d2 * d3 * m23
+            if not (d1 > 0.0 and d2 > 0.0 and d3 > 0.0 and norm > 0.0):
+                continue
+            unit = sqrt(a23 / norm)
+            d1, d2, d3 = _polish(d1 * unit, d2 * unit, d3 * unit, m12, m13, m23, a12, a13, a23)
+            if not (d1 > 0.0 and d2 > 0.0 and d3 > 0.0):
+                continue
+            _pose_from_depths(d1 * scale, d2 * scale, d3 * scale, bearings, points, frame,
+                              rotations, translations, count)
+            count += 1
+    return count
+
+
+@compiled
+def _cosine(vectors, i, j):
+    return (vectors[i, 0] * vectors[j, 0] + vectors[i, 1] * vectors[j, 1]
+            + vectors[i, 2] * vectors[j, 2])
+
+
+@compiled
+def _squared_distance(points, i, j):
+    x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1],
+               points[i, 2] - points[j, 2])
+    return x * x + y * y + z * z
+
+
+@compiled
+def _cofactors(c):
+    """Return the adjugate of a symmetric matrix, both as upper triangles."""
+    xx, xy, xz, yy, yz, zz = c
+    return (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
+            xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy)
+
+
+@compiled
+def _degenerate_lines(first, second):
+    """Split a degenerate conic of the pencil into two lines; False when they are not real."""
+    # det(first + g second) is a cubic in g with these coefficients (mixed determinants)
+    adj1, adj2 = _cofactors(first), _cofactors(second)
+    det1 = first[0] * adj1[0] + first[1] * adj1[1] + first[2] * adj1[2]
+    det2 = second[0] * adj2[0] + second[1] * adj2[1] + second[2] * adj2[2]
+    mixed1 = (adj1[0] * second[0] + adj1[3] * second[3] + adj1[5] * second[5]
+              + 2.0 * (adj1[1] * second[1] + adj1[2] * second[2] + adj1[4] * second[4]))
+    mixed2 = (adj2[0] * first[0] + adj2[3] * first[3] + adj2[5] * first[5]
+              + 2.0 * (adj2[1] * first[1] + adj2[2] * first[2] + adj2[4] * first[4]))
+    nowhere = (0.0, 0.0, 0.0)
+    # Dividing by the larger end of the cubic keeps the root finite: g or 1 / g is sought.
+    if abs(det2) >= abs(det1):
+        if det2 == 0.0:
+            return nowhere, nowhere, False
+        w1, w2 = 1.0, largest_cubic_root(mixed2 / det2, mixed1 / det2, det1 / det2)
+    else:
+        w1, w2 = largest_cubic_root(mixed1 / det1, mixed2 / det1, det2 / det1), 1.0
+    conic = (w1 * first[0] + w2 * second[0], w1 * first[1] + w2 * second[1],
+             w1 * first[2] + w2 * second[2], w1 * first[3] + w2 * second[3],
+             w1 * first[4] + w2 * second[4], w1 * first[5] + w2 * second[5])
+    return _split_lines(conic)
+
+
+@compiled
+def _split_lines(c):
+    """Return the two lines of a rank-two conic: (p x) + conic has rank one for their point p."""
+    adj = _cofactors(c)
+    if adj[0] <= adj[3] and adj[0] <= adj[5]:
+        px, py, pz = adj[0], adj[1], adj[2]
+        pivot = adj[0]
+    elif adj[3] <= adj[5]:
+        px, py, pz = adj[1], adj[3], adj[4]
+        pivot = adj[3]
+    else:
+        px, py, pz = adj[2], adj[4], adj[5]
+        pivot = adj[5]
+    if not pivot < 0.0:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), False
+    root = sqrt(-pivot)
+    px, py, pz = px / root, py / root, pz / root
+    xx, xy, xz, yy, yz, zz = c
+    # the rank-one matrix l m^T, row by row
+    r0 = (xx, xy - pz, xz + py)
+    r1 = (xy + pz, yy, yz - px)
+    r2 = (xz - py, yz + px, zz)
+    columns = ((r0[0], r1[0], r2[0]), (r0[1], r1[1], r2[1]), (r0[2], r1[2], r2[2]))
+    return _longest(r0, r1, r2), _longest(columns[0], columns[1], columns[2]), True
+
+
+@compiled
+def _longest(a, b, c):
+    na = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+    nb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+    nc = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+    if na >= nb and na >= nc:
+        return a
+    return b if nb >= nc else c
+
+
+@compiled
+def _meet_line_and_conic(line, c):
+    """Return the number of points (0 or 2) that a line and a conic share, and the points."""
+    lx, ly, lz = line
+    # two points that span the line, far from parallel
+    if abs(lx) >= abs(ly) and abs(lx) >= abs(lz):
+        u, v = (-ly, lx, 0.0), (-lz, 0.0, lx)
+    elif abs(ly) >= abs(lz):
+        u, v = (ly, -lx, 0.0), (0.0, -lz, ly)
+    else:
+        u, v = (lz, 0.0, -lx), (0.0, lz, -ly)
+    quadratic, half, constant = _bilinear(c, u, u), _bilinear(c, u, v), _bilinear(c, v, v)
+    discriminant = half * half - quadratic * constant
+    if discriminant < 0.0:
+        # A double root that rounding made complex is one pose; a truly complex one is none.
+        if discriminant < -1e-12 * (half * half + abs(quadratic * constant)):
+            return 0, u, v
+        discriminant = 0.0
+    q = -half - sqrt(discriminant) if half > 0.0 else -half + sqrt(discriminant)
+    # roots q / quadratic and constant / q, homogeneous
+    first = _combine(q, u, quadratic, v)
+    second = _combine(constant, u, q, v)
+    return 2, first, second
+
+
+@compiled
+def _bilinear(c, u, v):
+    return (c[0] * u[0] * v[0] + c[3] * u[1] * v[1] + c[5] * u[2] * v[2]
+            + c[1] * (u[0] * v[1] + u[1] * v[0]) + c[2] * (u[0] * v[2] + u[2] * v[0])
+            + c[4] * (u[1] * v[2] + u[2] * v[1]))
+
+
+@compiled
+def _combine(s, u, t, v):
+    """Return s u + t v, turned so that its components are positive where they can be."""
+    x, y, z = s * u[0] + t * v[0], s * u[1] + t * v[1], s * u[2] + t * v[2]
+    if x + y + z < 0.0:
+        return -x, -y, -z
+    return x, y, z
+
+
+@compiled
+def _polish(d1, d2, d3, m12, m13, m23, a12, a13, a23):
+    """Return the depths after Newton steps on the three distance equations."""
+    for _ in range(_NEWTON_STEPS):
+        r1 = d1 * d1 + d2 * d2 - 2.0 * d1 * d2 * m12 - a12
+        r2 = d1 * d1 + d3 * d3 - 2.0 * d1 * d3 * m13 - a13
+        r3 = d2 * d2 + d3 * d3 - 2.0 * d2 * d3 * m23 - a23
+        if abs(r1) + abs(r2) + abs(r3) < 1e-15:
+            break
+        j11, j12 = d1 - d2 * m12, d2 - d1 * m12
+        j21, j23 = d1 - d3 * m13, d3 - d1 * m13
+        j32, j33 = d2 - d3 * m23, d3 - d2 * m23
+        determinant = -2.0 * (j11 * j23 * j32 + j12 * j21 * j33)
+        if determinant == 0.0:
+            break
+        d1 += (j23 * j32 * r1 + j12 * j33 * r2 - j12 * j23 * r3) / determinant
+        d2 += (j21 * j33 * r1 - j11 * j33 * r2 + j11 * j23 * r3) / determinant
+        d3 += (-j21 * j32 * r1 + j11 * j32 * r2 + j12 * j21 * r3) / determinant
+    return d1, d2, d3
+
+
+@compiled
+def _inverse_triangle_frame(points):
+    """Return the rows of the inverse of [X1-X2, X1-X3, their cross product], and True.
+
+    False for points on a line.
+    """
+    u0, u1, u2 = (points[0, 0] - points[1, 0], points[0, 1] - points[1, 1],
+                  points[0, 2] - points[1, 2])
+    v0, v1, v2 = (points[0, 0] - points[2, 0], points[0, 1] - points[2, 1],
+                  points[0, 2] - points[2, 2])
+    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    square = w0 * w0 + w1 * w1 + w2 * w2
+    sides = (u0 * u0 + u1 * u1 + u2 * u2) * (v0 * v0 + v1 * v1 + v2 * v2)
+    sound = square > _MIN_SINE * _MIN_SINE * sides
+    scale = 1.0 / square if sound else 0.0
+    return (((v1 * w2 - v2 * w1) * scale, (v2 * w0 - v0 * w2) * scale,
+             (v0 * w1 - v1 * w0) * scale),
+            ((w1 * u2 - w2 * u1) * scale, (w2 * u0 - w0 * u2) * scale,
+             (w0 * u1 - w1 * u0) * scale),
+            (w0 * scale, w1 * scale, w2 * scale)), sound
+
+
+@compiled
+def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translations, which):
+    """Write camera_from_map: the rotation carries the map's triangle into the camera's."""
+    y0, y1, y2 = d1 * bearings[0, 0], d1 * bearings[0, 1], d1 * bearings[0, 2]
+    u0, u1, u2 = (y0 - d2 * bearings[1, 0], y1 - d2 * bearings[1, 1], y2 - d2 * bearings[1, 2])
+    v0, v1, v2 = (y0 - d3 * bearings[2, 0], y1 - d3 * bearings[2, 1], y2 - d3 * bearings[2, 2])
+    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    p0, p1, p2 = points[0, 0], points[0, 1], points[0, 2]
+    i, j, k = inverse
+    r0, r1, r2 = (u0 * i[0] + v0 * j[0] + w0 * k[0], u0 * i[1] + v0 * j[1] + w0 * k[1],
+                  u0 * i[2] + v0 * j[2] + w0 * k[2])
+    rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2] = r0, r1, r2
+    translations[which, 0] = y0 - (r0 * p0 + r1 * p1 + r2 * p2)
+    r0, r1, r2 = (u1 * i[0] + v1 * j[0] + w1 * k[0], u1 * i[1] + v1 * j[1] + w1 * k[1],
+                  u1 * i[2] + v1 * j[2] + w1 * k[2])
+    rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2] = r0, r1, r2
+    translations[which, 1] = y1 - (r0 * p0 + r1 * p1 + r2 * p2)
+    r0, r1, r2 = (u2 * i[0] + v2 * j[0] + w2 * k[0], u2 * i[1] + v2 * j[1] + w2 * k[1],
+                  u2 * i[2] + v2 * j[2] + w2 * k[2])
+    rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2] = r0, r1, r2
+    translations[which, 2] = y2 - (r0 * p0 + r1 * p1 + r2 * p2)

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which two correspondences can hold at once: what cannot is never made a sample of.
+
+A box says how far away its landmark is, roughly: as far as makes the landmark that large. So two
+boxes and the angle between them bound the distance of their landmarks, which the map knows.
+"""
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.association.scene import Scene
+from cliploc_ros.core.compiled import compiled
+
+# Distance of a landmark over what the size of its box says. On 1375 boxes of real TUM frames with
+# a fitted map, 99.8 % lie within .67 and 2.5: boxes hold more than the ellipsoid, or are cut.
+NEAREST, FARTHEST = 0.55, 2.5
+
+
+def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
+    """Return which candidates (c, c) may stand in one sample.
+
+    Two may if detections and landmarks differ, and if some distances that their boxes allow put
+    the landmarks as far apart as the map has them. Symmetric.
+    """
+    depths = _depths(scene)
+    compatible = np.zeros((len(scene.pairs), len(scene.pairs)), dtype=np.bool_)
+    _compare_all(scene, depths, compatible)
+    return compatible
+
+
+def _depths(scene: Scene) -> NDArray[np.float64]:
+    """Return the distance (c,) [m] at which each candidate's landmark is as large as its box."""
+    xx, xy, xz, yy, yz, zz = scene.shapes[scene.pairs[:, 1]].T
+    # the determinant of a shape matrix is the product of the squared semi-axes
+    determinant = (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
+    radius = np.cbrt(np.sqrt(np.maximum(determinant, 0.0)))
+    half = scene.box_ellipses[scene.pairs[:, 0], 2:]
+    # boxes lie on the plane z = 1, whose points are farther the more they are off the axis
+    middle = scene.box_ellipses[scene.pairs[:, 0], :2]
+    return np.asarray(radius / np.sqrt(half.prod(axis=1))
+                      * np.sqrt(1.0 + (middle * middle).sum(axis=1)))
+
+
+@compiled
+def _compare_all(scene, depths, compatible):
+    pairs = scene.pairs
+    for i in range(pairs.shape[0]):
+        for j in range(i):
+            if pairs[i, 0] == pairs[j, 0] or pairs[i, 1] == pairs[j, 1]:
+                continue
+            a, b = scene.bearings[pairs[i, 0]], scene.bearings[pairs[j, 0]]
+            p, q = scene.centers[pairs[i, 1]], scene.centers[pairs[j, 1]]
+            cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+            apart = sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+            low, high = _distance_range(depths[i], depths[j], cosine)
+            if low <= apart <= high:
+                compatible[i, j] = compatible[j, i] = True
+
+
+@compiled
+def _distance_range(depth_a, depth_b, cosine):
+    """Return the least and greatest distance of two points at depths about these."""
+    near_a, far_a = NEAREST * depth_a, FARTHEST * depth_a
+    near_b, far_b = NEAREST * depth_b, FARTHEST * depth_b
+    # The squared distance is convex in both depths: greatest in a corner, least on an edge.
+    high = max(_square(near_a, near_b, cosine), _square(near_a, far_b, cosine),
+               _square(far_a, near_b, cosine), _square(far_a, far_b, cosine))
+    low = min(_square(near_a, min(max(near_a * cosine, near_b), far_b), cosine),
+              _square(far_a, min(max(far_a * cosine, near_b), far_b), cosine),
+              _square(min(max(near_b * cosine, near_a), far_a), near_b, cosine),
+              _square(min(max(far_b * cosine, near_a), far_a), far_b, cosine))
+    return sqrt(max(0.0, low)), sqrt(high)
+
+
+@compiled
+def _square(depth_a, depth_b, cosine):
+    return depth_a * depth_a + depth_b * depth_b - 2.0 * depth_a * depth_b * cosine

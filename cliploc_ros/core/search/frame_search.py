@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One frame searched as if it were alone, by the algorithm that the options name."""
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.association.matching import match_frame
+from cliploc_ros.core.association.scene import Scene
+from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
+from cliploc_ros.core.search.screening import Prior
+from cliploc_ros.core.search.search import (
+    MAX_DISTINCT,
+    Leaders,
+    Progress,
+    search_exhaustively,
+    search_progressively,
+    search_samples,
+)
+from cliploc_ros.errors import OptionsError
+
+#: So many of the best are refined: what is worse has never led afterwards on real frames.
+REFINED = 32
+# The map's third axis is up (REP 103), and the optical frame's second is down.
+_UP_IN_MAP = (0.0, 0.0, 1.0)
+_UPRIGHT = (0.0, -1.0, 0.0)
+_UNIT_TOLERANCE = 1e-3
+
+
+class Searched(NamedTuple):
+    """A frame, and what the search among its samples found.
+
+    Parameters
+    ----------
+    scene : Scene
+    vertical : ndarray (7,)
+        See make_rig.
+    leaders : Leaders
+        The best, as poses of this frame's camera.
+    tilted : Leaders
+        Where the vertical is known, the best that did not ask for it; else none.
+    progress : Progress
+    samples : ndarray (t, 3) or None
+        What was tried; None: all samples of the first candidates, as far as progress reaches.
+    """
+
+    scene: Scene
+    vertical: NDArray[np.float64]
+    leaders: Leaders
+    tilted: Leaders
+    progress: Progress
+    samples: NDArray[np.int64] | None = None
+
+    @property
+    def sample_size(self) -> int:
+        """Return how many candidates make a pose."""
+        return _sample_size(self.vertical)
+
+    @property
+    def has_samples(self) -> bool:
+        """Return whether detections and landmarks can differ in so many candidates."""
+        return _has_samples(self.scene, self.vertical)
+
+    @property
+    def known_tried(self) -> int:
+        """Return how many samples were looked at, with those that boxes contradict."""
+        return max(self.progress.tried, comb(self.progress.reach, self.sample_size))
+
+
+def search_frame(landmark_map: LandmarkMap, observation: Observation,
+                 options: RelocalizerOptions, deadline: float) -> Searched:
+    """Search one frame.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    observation : Observation
+    options : RelocalizerOptions
+    deadline : float
+        When to stop, of time.perf_counter [s].
+
+    Raises
+    ------
+    OptionsError
+        Similarities that the matching type needs are missing or of the wrong shape, or the
+        vertical is no unit vector.
+    """
+    scene, share = match_frame(landmark_map, observation, options)
+    vertical = _vertical(observation, options)
+    leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
+    tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
+    if _has_samples(scene, vertical):
+        samples, prior = _draw(scene, options), _prior(vertical, options)
+        if options.algorithm == 'auto':
+            try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
+                              limit=options.iterations)
+            progress = _run(try_all(leaders, size=_sample_size(vertical)), deadline)
+            if _is_known(vertical):
+                # Where what is said to be the vertical is wrong, as by a wrong mount, what the
+                # boxes say by themselves must be among the rivals of what it leads to.
+                free = _run(try_all(tilted), deadline)
+                progress = progress._replace(tried=progress.tried + free.tried)
+        elif samples is None:
+            progress = _run(search_exhaustively(scene, leaders, prior), deadline)
+        else:
+            progress = _run(search_samples(scene, samples, leaders, prior), deadline)
+        progress = progress._replace(coverage=progress.coverage * share)
+    return Searched(scene, vertical, leaders, tilted, progress, samples)
+
+
+def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
+    """Return the vertical as make_rig takes it; the paper's algorithms know of none."""
+    up = observation.up_in_camera
+    if up is None or options.algorithm != 'auto':
+        return VERTICAL_UNKNOWN
+    if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
+        raise OptionsError(f'up_in_camera: {up} is no unit vector')
+    return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
+
+
+def _is_known(vertical: NDArray[np.float64]) -> bool:
+    return bool(vertical[6] > 0.0)
+
+
+def _sample_size(vertical: NDArray[np.float64]) -> int:
+    return SAMPLE_SIZE - 1 if _is_known(vertical) else SAMPLE_SIZE
+
+
+def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
+    distinct = min(len(np.unique(scene.pairs[:, 0])), len(np.unique(scene.pairs[:, 1])))
+    return distinct >= _sample_size(vertical)
+
+
+def _prior(vertical: NDArray[np.float64], options: RelocalizerOptions) -> Prior:
+    """Return what the search may take for granted."""
+    up_in_camera = tuple(vertical[:3]) if _is_known(vertical) else _UPRIGHT
+    low, high = options.height_range_m
+    return Prior(up_in_camera, _UP_IN_MAP, low, high, np.radians(options.max_tilt_deg))
+
+
+def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None:
+    """Return the samples (t, 3) of an algorithm that draws them, else None."""
+    if options.algorithm in ('auto', 'bf'):
+        return None
+    draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+    seed = options.random_seed if options.random_seed >= 0 else None
+    return draw(scene.pairs, options.iterations, np.random.default_rng(seed))
+
+
+def _run(search: Iterator[Progress], deadline: float) -> Progress:
+    """Run a search until its end or until a deadline; return how far it came."""
+    progress = Progress(0, 1.0)
+    for step in search:
+        progress = step
+        if time.perf_counter() > deadline:
+            break
+    return progress

@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Minimal samples: which three candidates are tried next.
+
+A sample is three candidates of three different detections and three different landmarks.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+
+SAMPLE_SIZE = 3
+# An enumeration pauses after so many steps, of some nanoseconds each, even if it found nothing.
+_MAX_STEPS = 500_000
+# A draw that meets no valid sample in this many attempts is left out (its row is -1): among the
+# first candidates of PROSAC there may be none.
+_MAX_ATTEMPTS = 100
+
+
+def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
+    """Return T'_m .. T'_N: in which iteration PROSAC's candidate set stops at each size.
+
+    Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, with T_N = iterations (with
+    the textbook's 200,000 a search of 500 never leaves its first five candidates).
+
+    Parameters
+    ----------
+    candidate_count : int
+        N, at least 3.
+    iterations : int
+        T_N, after how many iterations PROSAC becomes RANSAC.
+
+    Returns
+    -------
+    ndarray (N - 2,) of int
+        For set sizes 3 to N.
+    """
+    sizes = np.arange(SAMPLE_SIZE, candidate_count)
+    drawn = iterations * np.prod([(SAMPLE_SIZE - i) / (candidate_count - i)
+                                  for i in range(SAMPLE_SIZE)])
+    expected = drawn * np.cumprod(np.concatenate(
+        [[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
+    # The tolerance keeps a whole number from being rounded up for its last digit.
+    steps = np.ceil(np.diff(expected) - 1e-9).astype(np.int64)
+    return 1 + np.concatenate([[0], np.cumsum(steps)])
+
+
+def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
+                ) -> NDArray[np.int64]:
+    """Return samples (iterations, 3) of candidates drawn uniformly; -1 where none is valid.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate.
+    """
+    samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
+    if len(pairs) >= SAMPLE_SIZE:
+        # a set that has stopped growing before the first iteration is the whole set
+        growth = np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
+        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
+    return samples
+
+
+def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
+                ) -> NDArray[np.int64]:
+    """Return samples (iterations, 3) as PROSAC draws them; -1 where none is valid.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate, in order of preference.
+    """
+    samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
+    if len(pairs) >= SAMPLE_SIZE:
+        growth = prosac_growth(len(pairs), iterations)
+        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
+    return samples
+
+
+@compiled
+def _draw(pairs, growth, rng, samples):
+    """Fill samples: u_n and two of the n - 1 before it while t <= T'_n, then three of all."""
+    size = SAMPLE_SIZE
+    for t in range(1, samples.shape[0] + 1):
+        while size < pairs.shape[0] and t > growth[size - SAMPLE_SIZE]:
+            size += 1
+        newest = t <= growth[size - SAMPLE_SIZE]
+        for _ in range(_MAX_ATTEMPTS):
+            i = size - 1 if newest else int(rng.random() * size)
+            j = int(rng.random() * (size - 1 if newest else size))
+            k = int(rng.random() * (size - 1 if newest else size))
+            if (pairs[i, 0] != pairs[j, 0] and pairs[i, 0] != pairs[k, 0]
+                    and pairs[j, 0] != pairs[k, 0] and pairs[i, 1] != pairs[j, 1]
+                    and pairs[i, 1] != pairs[k, 1] and pairs[j, 1] != pairs[k, 1]):
+                samples[t - 1, 0], samples[t - 1, 1], samples[t - 1, 2] = i, j, k
+                break
+
+
+@compiled
+def enumerate_triples(pairs, cursor, samples):
+    """Write the next valid samples, in lexicographic order; return how many.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate.
+    cursor : ndarray (3,)
+        Where to go on, at first 0, 1, 2; moved. The end is reached at c - 2 in its first place.
+    samples : ndarray (t, 3)
+        Filled from the first row on.
+    """
+    count = pairs.shape[0]
+    first, second, third = cursor[0], cursor[1], cursor[2]
+    found, steps = 0, 0
+    while first < count - 2 and found < samples.shape[0] and steps < _MAX_STEPS:
+        steps += 1
+        if second >= count - 1:
+            first += 1
+            second, third = first + 1, first + 2
+            continue
+        if third >= count or _clash(pairs, first, second):
+            second += 1
+            third = second + 1
+            continue
+        if not (_clash(pairs, first, third) or _clash(pairs, second, third)):
+            samples[found, 0], samples[found, 1], samples[found, 2] = first, second, third
+            found += 1
+        third += 1
+    cursor[0], cursor[1], cursor[2] = first, second, third
+    return found
+
+
+@compiled
+def _clash(pairs, a, b):
+    """Tell whether two candidates share a detection or a landmark."""
+    return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
+
+
+@compiled
+def enumerate_compatible_triples(compatible, cursor, samples):
+    """Write the next samples of compatible candidates, by their newest; return how many.
+
+    Parameters
+    ----------
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.search.compatibility.
+    cursor : ndarray (3,)
+        Newest, first and second candidate, at first 2, 0, 1; moved. The end is c in the first
+        place.
+    samples : ndarray (t, 3)
+        Filled from the first row on: first, second, newest.
+    """
+    count = compatible.shape[0]
+    newest, first, second = cursor[0], cursor[1], cursor[2]
+    found, steps = 0, 0
+    while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
+        steps += 1
+        if first >= newest - 1:
+            newest, first, second = newest + 1, 0, 1
+            continue
+        if second >= newest or not compatible[newest, first]:
+            first += 1
+            second = first + 1
+            continue
+        if compatible[newest, second] and compatible[first, second]:
+            samples[found, 0], samples[found, 1], samples[found, 2] = first, second, newest
+            found += 1
+        second += 1
+    cursor[0], cursor[1], cursor[2] = newest, first, second
+    return found
+
+
+@compiled
+def enumerate_compatible_pairs(compatible, cursor, samples):
+    """Write the next pairs of compatible candidates, by their newer; return how many.
+
+    Parameters
+    ----------
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.search.compatibility.
+    cursor : ndarray (2,)
+        Newer and older candidate, at first 1, 0; moved. The end is c in the first place.
+    samples : ndarray (t, 3)
+        Its first two columns are filled from the first row on: older, newer.
+    """
+    count = compatible.shape[0]
+    newest, first = cursor[0], cursor[1]
+    found, steps = 0, 0
+    while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
+        steps += 1
+        if first >= newest:
+            newest, first = newest + 1, 0
+            continue
+        if compatible[newest, first]:
+            samples[found, 0], samples[found, 1] = first, newest
+            found += 1
+        first += 1
+    cursor[0], cursor[1] = newest, first
+    return found

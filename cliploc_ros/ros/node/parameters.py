@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters declared once: each row of a table is declaration, validation and documentation."""
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from cliploc_ros.errors import OptionsError
+
+Value = str | int | float | bool | list[float]
+
+# What rclpy declares by itself, or what holds a map.
+_FOREIGN_PREFIXES = ('map.', 'qos_overrides.')
+_FOREIGN_NAMES = ('use_sim_time', 'start_type_description_service')
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter of a node.
+
+    Parameters
+    ----------
+    name : str
+    default : str, int, float, bool or list of float
+        Its type is the parameter's.
+    description : str
+        One sentence in prose.
+    unit : str
+        SI symbol, px or ''.
+    low, high : float
+        Range of a number, ends included.
+    choices : tuple of str
+        The allowed values of a text; empty allows any.
+    read_only : bool
+        Read at start-up only. The others change at run time.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ''
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """Return what the parameter may be, for people."""
+        if self.choices:
+            return ', '.join(self.choices)
+        if isinstance(self.default, bool) or not isinstance(self.default, int | float):
+            return ''
+        if math.isinf(self.low) and math.isinf(self.high):
+            return ''
+        if math.isinf(self.high):
+            return f'>= {self.low:g}'
+        return f'{self.low:g} to {self.high:g}'
+
+    @property
+    def descriptor(self) -> ParameterDescriptor:
+        """Return what ROS's tools show of the parameter."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        descriptor = ParameterDescriptor(
+            description=self.description + unit, additional_constraints=self.allowed,
+            read_only=self.read_only)
+        if isinstance(self.default, float) and math.isfinite(self.high - self.low):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(self.low), to_value=float(self.high))]
+        elif type(self.default) is int and math.isfinite(self.high - self.low):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)]
+        return descriptor
+
+    def validated(self, value: Any) -> Value:
+        """Return a value as the parameter's type, integers as floats where floats are meant.
+
+        Raises
+        ------
+        OptionsError
+            Names the parameter and what it allows.
+        """
+        if isinstance(self.default, float) and type(value) is int:
+            value = float(value)
+        if isinstance(self.default, list):
+            if not _is_number_list(value) or len(value) != len(self.default):
+                raise OptionsError(f'{self.name}: must be {len(self.default)} finite numbers')
+            value = [float(item) for item in value]
+        if type(value) is not type(self.default):
+            raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
+                               f'not {type(value).__name__} ({value!r:.60})')
+        if self.choices and value not in self.choices:
+            nearest = difflib.get_close_matches(str(value), self.choices, 1)
+            hint = f" (did you mean '{nearest[0]}'?)" if nearest else ''
+            raise OptionsError(f"{self.name}: '{value}' is none of {self.allowed}{hint}")
+        if isinstance(value, int | float) and not self.low <= value <= self.high:
+            raise OptionsError(f'{self.name}: {value} must be {self.allowed}')
+        return value
+
+
+def _is_number_list(value: Any) -> bool:
+    return (not isinstance(value, str | bytes) and isinstance(value, Iterable)
+            and all(type(item) in (int, float) and math.isfinite(item) for item in value))
+
+
+class NodeParameters:
+    """The parameters of one node: declared from its table, validated at every change.
+
+    A bad value in a parameter file does not end the node: it is kept as a problem, which
+    snapshot() raises until the value is mended.
+
+    Parameters
+    ----------
+    node : Node
+        Made with automatically_declare_parameters_from_overrides=True.
+    table : iterable of ParameterRow
+    check : callable
+        Takes all values by name; raises OptionsError where they do not fit together.
+    """
+
+    def __init__(self, node: Node, table: Iterable[ParameterRow],
+                 check: Callable[[Mapping[str, Value]], object]) -> None:
+        self._node = node
+        self._rows = {row.name: row for row in table}
+        self._check = check
+        self._problems: dict[str, str] = {}
+        for row in self._rows.values():
+            self._declare(row)
+        self._report_unknown()
+        for problem in self._problems.values():
+            node.get_logger().error(f'parameter {problem}')
+        # Replaced as a whole, so that who reads them sees all of a change or nothing of it.
+        self._values: dict[str, Value] = {
+            name: node.get_parameter(name).value for name in self._rows}
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._take)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a parameter's value."""
+        return self._values[name]
+
+    def snapshot(self) -> dict[str, Value]:
+        """Return all values, by name.
+
+        Raises
+        ------
+        OptionsError
+            A value given at start-up is not allowed, or the values do not fit together.
+        """
+        if self._problems:
+            raise OptionsError('parameter ' + '; '.join(self._problems.values()))
+        values = self._values
+        self._check(values)
+        return dict(values)
+
+    def _declare(self, row: ParameterRow) -> None:
+        """Declare one parameter with the value given at start-up, else with its default."""
+        value: Value = row.default
+        if self._node.has_parameter(row.name):
+            given = self._node.get_parameter(row.name).value
+            self._node.undeclare_parameter(row.name)
+            try:
+                value = row.validated(given)
+            except OptionsError as error:
+                remedy = 'mend it and start again' if row.read_only else \
+                    f'mend it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
+                self._problems[row.name] = f'{error}; {remedy}'
+        self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
+
+    def _report_unknown(self) -> None:
+        """Warn of names that no row declares: most are typing mistakes."""
+        for name in self._node.get_parameters_by_prefix(''):
+            if (name in self._rows or name in _FOREIGN_NAMES
+                    or name.startswith(_FOREIGN_PREFIXES)):
+                continue
+            nearest = difflib.get_close_matches(name, self._rows, 1)
+            hint = f"; did you mean '{nearest[0]}'?" if nearest else ''
+            self._node.get_logger().warning(f"unknown parameter '{name}' has no effect{hint}")
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Allow a change at run time only if all values are valid together."""
+        own = [parameter for parameter in parameters if parameter.name in self._rows]
+        try:
+            for parameter in parameters:
+                if parameter.name.startswith('map.'):
+                    raise OptionsError(f'{parameter.name}: the map is read at start-up')
+            changed = {parameter.name: self._rows[parameter.name].validated(parameter.value)
+                       for parameter in own}
+            remaining = {name: text for name, text in self._problems.items()
+                         if name not in changed}
+            if not remaining:
+                self._check(self._values | changed)
+        except OptionsError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._problems = remaining
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        """Use a change that was allowed."""
+        self._values = self._values | {
+            parameter.name: self._rows[parameter.name].validated(parameter.value)
+            for parameter in parameters if parameter.name in self._rows}
+
+
+def markdown_table(table: Iterable[ParameterRow]) -> str:
+    """Return a table of parameters in Markdown, as it stands in the README."""
+    lines = ['| parameter | default | unit | allowed | at run time | what it does |',
+             '|---|---|---|---|---|---|']
+    lines += [f'| `{row.name}` | `{_yaml_value(row.default)}` | {row.unit} | {row.allowed} | '
+              f'{"" if row.read_only else "yes"} | {row.description} |' for row in table]
+    return '\n'.join(lines) + '\n'
+
+
+def yaml_defaults(node_name: str, table: Iterable[ParameterRow]) -> str:
+    """Return a parameter file with every default, each after a comment in prose."""
+    lines = ['# SPDX-FileCopyrightText: 2026 the cliploc_ros authors',
+             '# SPDX-License-Identifier: Apache-2.0',
+             f'# Every parameter of the {node_name} node at its default.',
+             '# Written by script/document from cliploc_ros/ros/parameter_tables.py: '
+             'copy it to change it.',
+             '/**:',
+             '  ros__parameters:']
+    for row in table:
+        unit = f' [{row.unit}]' if row.unit else ''
+        allowed = f' Allowed: {row.allowed}.' if row.allowed else ''
+        lines += [f'    # {row.description}{unit}{allowed}',
+                  f'    {row.name}: {_yaml_value(row.default)}']
+    return '\n'.join(lines) + '\n'
+
+
+def _yaml_value(value: Value) -> str:
+    if isinstance(value, str):
+        return f"'{value}'"
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,311 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Publishing a recording: the recorded bytes, with recorded QoS, at their recorded times."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, islice
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
+
+from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.ros.replay.bag_publisher import create_publisher, is_latched
+
+NS_PER_S = 1_000_000_000
+CLOCK_TOPIC = '/clock'
+_POLL_S = 0.02
+#: Between a subscriber's appearance here and its readiness to receive: discovery has to
+#: complete in the other direction too, which no call of ROS tells.
+_DISCOVERY_S = 0.2
+#: At the end, acknowledgements take up to Fast DDS's heartbeat of 3 s, what was sent only this.
+DEFAULT_LINGER_S = 0.3
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How to play a recording.
+
+    Parameters
+    ----------
+    rate : float
+        Speed; 1 is as recorded.
+    start_offset_s : float
+        Begin this long after the recording's start [s].
+    topics : collection of str, optional
+        Play these only.
+    exclude : collection of str
+        Leave these out.
+    remap : mapping of str to str
+        New names of topics, by recorded name.
+    clock_hz : float, optional
+        Publish the recording's time on /clock this often per second of real time.
+    loop : bool
+        Begin again at the end, until stopped.
+    linger_s : float
+        At the end, wait this long at most until all reliable subscribers have acknowledged
+        all messages [s].
+    """
+
+    rate: float = 1.0
+    start_offset_s: float = 0.0
+    topics: Collection[str] | None = None
+    exclude: Collection[str] = ()
+    remap: Mapping[str, str] = field(default_factory=dict)
+    clock_hz: float | None = None
+    loop: bool = False
+    linger_s: float = DEFAULT_LINGER_S
+
+
+@dataclass
+class PlayReport:
+    """What was published.
+
+    Parameters
+    ----------
+    counts : Counter
+        Messages by recorded topic name.
+    passes : int
+        How often the recording was played to its end.
+    unread : int
+        Messages that the recording claims to hold but that were not found in it.
+    worst_lateness_s : float
+        The longest that a message was published after its time [s].
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    passes: int = 0
+    unread: int = 0
+    worst_lateness_s: float = 0.0
+
+
+class Player:
+    """Publishes an open recording.
+
+    Parameters
+    ----------
+    node : Node
+        Makes the publishers.
+    reader : BagReader
+        The open recording.
+    options : PlayOptions
+        How to play it.
+    stop : threading.Event
+        Ends whatever goes on, within milliseconds.
+
+    Raises
+    ------
+    DatasetError
+        If nothing is left to play, a topic is not recorded, or a type is not installed or
+        has another definition.
+    """
+
+    def __init__(
+        self, node: Node, reader: BagReader, options: PlayOptions, stop: threading.Event
+    ) -> None:
+        self._reader, self._options, self._stop = reader, options, stop
+        self.topics = select_topics(reader, options)
+        self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
+        self.end_ns = reader.end_ns
+        if self.start_ns > self.end_ns:
+            length_s = (reader.end_ns - reader.start_ns) / NS_PER_S
+            raise DatasetError(
+                f'{reader.path}: start offset {options.start_offset_s} s lies after its end at '
+                f'{length_s:.3f} s'
+            )
+        self._publishers = {
+            topic.name: create_publisher(node, topic, options.remap.get(topic.name, topic.name))
+            for topic in self.topics
+        }
+        self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
+
+    def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
+        """Wait until each of some topics has a subscriber.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Recorded names; all that are played if empty.
+        timeout_s : float
+            How long to wait at most [s].
+
+        Raises
+        ------
+        DatasetError
+            If a topic is not played, or still has no subscriber; it is named.
+        """
+        publishers = self._named_publishers(list(topics) or list(self._publishers))
+        deadline = time.monotonic() + timeout_s
+        while lonely := [one for one in publishers if not one.get_subscription_count()]:
+            if time.monotonic() >= deadline:
+                names = ', '.join(publisher.topic_name for publisher in lonely)
+                raise DatasetError(f'no subscriber within {timeout_s:g} s on {names}')
+            if self._stop.wait(_POLL_S):
+                return
+        self._stop.wait(_DISCOVERY_S)
+
+    def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
+        """Publish the messages, each when its time has come.
+
+        Parameters
+        ----------
+        on_message : callable
+            Called after each publication, to show how far it is.
+
+        Returns
+        -------
+        PlayReport
+
+        Raises
+        ------
+        DatasetError
+            Where the recording turns out to be broken.
+        """
+        report = PlayReport()
+        self._publish_latched(report)
+        messages = self._read_ahead()
+        origin_ns = time.monotonic_ns()
+        while not self._stop.is_set():
+            played = self._play_once(messages, origin_ns, report, on_message)
+            if self._stop.is_set():
+                break
+            report.passes += 1
+            report.unread = self._count_unread(played)
+            if not self._options.loop:
+                self._wait_until_received()
+                break
+            # go on as if a next message followed at the mean distance, and never spin
+            length_ns = self.end_ns - self.start_ns
+            gap_ns = length_ns // max(played - 1, 1) or NS_PER_S
+            origin_ns += round((length_ns + gap_ns) / self._options.rate)
+            messages = self._read_ahead()
+        return report
+
+    def _read_ahead(self) -> Iterator[BagMessage]:
+        """Read the first message already, so that opening files makes no message late."""
+        messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
+        return chain(list(islice(messages, 1)), messages)
+
+    def _play_once(
+        self,
+        messages: Iterator[BagMessage],
+        origin_ns: int,
+        report: PlayReport,
+        on_message: Callable[[BagMessage], None],
+    ) -> int:
+        timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
+        ticker = None
+        if self._clock is not None and self._options.clock_hz:
+            ticker = _Ticker(self._clock, timeline, self._options.clock_hz)
+        played = 0
+        for message in messages:
+            if not self._wait_for(message.stamp_ns, timeline, ticker):
+                break
+            report.worst_lateness_s = max(
+                report.worst_lateness_s, timeline.lateness_s(message.stamp_ns)
+            )
+            self._publishers[message.topic].publish(message.data)
+            report.counts[message.topic] += 1
+            played += 1
+            on_message(message)
+        return played
+
+    def _wait_for(self, stamp_ns: int, timeline: '_Timeline', ticker: '_Ticker | None') -> bool:
+        """Wait until a stamp's time, ticking meanwhile; False if stopped instead."""
+        while ticker is not None and ticker.next_ns <= stamp_ns:
+            if not timeline.wait_for(ticker.next_ns):
+                return False
+            ticker.tick()
+        return timeline.wait_for(stamp_ns)
+
+    def _publish_latched(self, report: PlayReport) -> None:
+        """Publish what a subscriber would still have got from before the start offset."""
+        latched = [topic.name for topic in self.topics if is_latched(topic.offered_qos)]
+        if self.start_ns == self._reader.start_ns or not latched:
+            return
+        for message in self._reader.messages(latched, stop_ns=self.start_ns):
+            self._publishers[message.topic].publish(message.data)
+            report.counts[message.topic] += 1
+
+    def _count_unread(self, played: int) -> int:
+        if self.start_ns > self._reader.start_ns:
+            return 0  # the recording does not say how many messages it holds from there on
+        return max(sum(topic.message_count for topic in self.topics) - played, 0)
+
+    def _wait_until_received(self) -> None:
+        deadline = time.monotonic() + self._options.linger_s
+        while not self._stop.is_set() and time.monotonic() < deadline:
+            if all(one.wait_for_all_acked(Duration()) for one in self._publishers.values()):
+                return
+            self._stop.wait(_POLL_S)
+
+    def _named_publishers(self, names: Collection[str]) -> list[Publisher]:
+        if unknown := [name for name in names if name not in self._publishers]:
+            there = ', '.join(self._publishers)
+            raise DatasetError(f'{unknown[0]} is not among the topics played: {there}')
+        return [self._publishers[name] for name in names]
+
+
+class _Timeline:
+    """Maps recorded stamps to the monotonic clock from one origin, so that no drift adds up."""
+
+    def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: threading.Event) -> None:
+        self.start_ns, self.rate = start_ns, rate
+        self._origin_ns, self._stop = origin_ns, stop
+
+    def wait_for(self, stamp_ns: int) -> bool:
+        """Sleep until a stamp's time has come; False if stopped instead."""
+        left_s = -self.lateness_s(stamp_ns)
+        return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
+
+    def lateness_s(self, stamp_ns: int) -> float:
+        """Return by how much a stamp's time has passed [s]; negative if it is to come."""
+        due_ns = self._origin_ns + (stamp_ns - self.start_ns) / self.rate
+        return (time.monotonic_ns() - due_ns) / NS_PER_S
+
+    def now_ns(self) -> int:
+        """Return the recording's time now [ns]."""
+        return self.start_ns + round((time.monotonic_ns() - self._origin_ns) * self.rate)
+
+
+class _Ticker:
+    """Publishes /clock on a regular grid of real time."""
+
+    def __init__(self, publisher: Publisher, timeline: _Timeline, clock_hz: float) -> None:
+        self._publisher, self._timeline = publisher, timeline
+        self._step_ns = max(round(timeline.rate * NS_PER_S / clock_hz), 1)
+        self.next_ns = timeline.start_ns
+
+    def tick(self) -> None:
+        """Publish the tick that is due, and skip those already missed."""
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(self.next_ns, NS_PER_S)
+        self._publisher.publish(message)
+        missed = max(self._timeline.now_ns() - self.next_ns, 0) // self._step_ns
+        self.next_ns += self._step_ns * max(missed, 1)
+
+
+def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
+    """Return the topics to play.
+
+    Raises
+    ------
+    DatasetError
+        If a named topic is not recorded, or nothing is left to play.
+    """
+    names = list(reader.topics) if options.topics is None else list(options.topics)
+    for name in (*names, *options.exclude, *options.remap):
+        reader.topic(name)
+    left_out = set(options.exclude)
+    if options.clock_hz:
+        left_out.add(CLOCK_TOPIC)  # two clocks would contradict each other
+    topics = [reader.topic(name) for name in dict.fromkeys(names) if name not in left_out]
+    if not sum(topic.message_count for topic in topics):
+        raise DatasetError(f'{reader.path}: holds no messages on the topics to play')
+    return topics
