@@ -5,7 +5,8 @@
 The outline of each matched landmark shall touch the edges of its box: four residuals a match, in
 shares of the box's size, since both a detector's and a mapper's errors grow with the object.
 Here are one frame's residuals with Cauchy's weights, and the system they make (Triggs et al.,
-"Bundle Adjustment", 1999); cliploc_ros.core.fit.several_frames minimizes them over one frame or several.
+"Bundle Adjustment", 1999); cliploc_ros.core.fit.several_frames minimizes them over one frame or
+several.
 
 Over all 258 recorded frames edges solved most and most exactly, against Wasserstein's distance of
 ellipses, the level sets of Zins et al. ("Level Set-Based Camera Pose Estimation From Multiple
