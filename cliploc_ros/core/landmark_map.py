@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.association.candidates import ClassIndex
 from cliploc_ros.core.association.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
+from cliploc_ros.core.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
@@ -42,6 +43,8 @@ class LandmarkMap:
         Half lengths along each landmark's own axes [m].
     quats_xyzw : ndarray (L, 4)
         Unit quaternions that rotate landmark axes into map axes.
+    details : tuple of LandmarkDetails
+        Optional fields of each landmark; empty where the map has none.
     """
 
     frame_id: str
@@ -51,6 +54,7 @@ class LandmarkMap:
     centers: NDArray[np.float64]
     semi_axes: NDArray[np.float64]
     quats_xyzw: NDArray[np.float64]
+    details: tuple[LandmarkDetails, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -116,20 +120,24 @@ class LandmarkMap:
             raise MapError(f'{source}: map: landmarks: the map is empty')
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
-        labels, class_ids, centers, semi_axes, quats = zip(*rows, strict=True)
+        labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
         quats_xyzw = np.array(quats)
         quats_xyzw /= np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
-                           np.array(centers), np.array(semi_axes), quats_xyzw)
+                           np.array(centers), np.array(semi_axes), quats_xyzw,
+                           details if any(one != LandmarkDetails() for one in details) else ())
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
-    """Return one landmark's validated fields, in the order of _FIELDS."""
+    """Return one landmark's validated fields, in the order of _FIELDS, and its details."""
     where = f"{source}: landmark '{landmark_id}'"
     if not isinstance(landmark_id, str) or not landmark_id or '.' in landmark_id:
         # a dot would part the name when the map comes as ROS parameters
         raise MapError(f'{where}: an id must be text without dots')
-    _check_keys(fields, _FIELDS, where)
+    labelled = isinstance(fields, Mapping) and 'labels' in fields
+    _check_keys(fields, _FIELDS[1:] if labelled else _FIELDS, where, _FIELDS[:1] + OPTIONAL_FIELDS)
+    details = read_details(fields, where)
+    label = fields.get('label', _heaviest_label(details))
     semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
     low, high = _SEMI_AXIS_RANGE_M
     if not all(low <= axis <= high for axis in semi_axes):
@@ -141,20 +149,26 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
         raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has the norm '
                        f'{math.hypot(*quat_xyzw):.3g}, not 1')
-    return (_text(fields['label'], f'{where}: label'),
-            _text(fields['class_id'], f'{where}: class_id'), center, semi_axes, quat_xyzw)
+    return (_text(label, f'{where}: label'), _text(fields['class_id'], f'{where}: class_id'),
+            center, semi_axes, quat_xyzw, details)
 
 
-def _check_keys(tree: Any, expected: tuple[str, ...], where: str) -> None:
+def _heaviest_label(details: LandmarkDetails) -> str:
+    return max(details.labels, key=lambda pair: pair[1])[0] if details.labels else ''
+
+
+def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
+                optional: tuple[str, ...] = ()) -> None:
     if not isinstance(tree, Mapping):
         raise MapError(f'{where}: expected the fields {", ".join(expected)}')
     missing = [key for key in expected if key not in tree]
     if missing:
         raise MapError(f'{where}: missing field: {", ".join(missing)}')
-    unknown = [str(key) for key in tree if key not in expected]
+    known = tuple(dict.fromkeys(expected + optional))
+    unknown = [str(key) for key in tree if key not in known]
     if unknown:
         raise MapError(f'{where}: unknown field: {", ".join(unknown[:5])} '
-                       f'(known: {", ".join(expected)})')
+                       f'(known: {", ".join(known)})')
 
 
 def _text(value: Any, where: str) -> str:

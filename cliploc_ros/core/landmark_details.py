@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a map may say of a landmark besides its ellipsoid: optional fields of the map file."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from cliploc_ros.errors import MapError
+
+
+@dataclass(frozen=True)
+class LandmarkDetails:
+    """Optional fields of one landmark. Each is None where the map has none.
+
+    Parameters
+    ----------
+    labels : tuple of (str, float)
+        Phrases with their weights, all above 0.
+    class_weights : tuple of (str, float)
+        Detector classes with their share of the landmark's boxes, all above 0.
+    position_sigma : float
+        Standard deviation of the centre on each axis [m].
+    support : int
+        Frames that the landmark was fitted to.
+    seen_ratio : float
+        Share of the frames which show the landmark's place in which it was detected, 0 to 1.
+    baseline_deg : float
+        Greatest angle between two directions from which it was seen [deg].
+    last_seen : float
+        Time of the last frame that showed it [s].
+    source : str
+        Where it comes from.
+    """
+
+    labels: tuple[tuple[str, float], ...] | None = None
+    class_weights: tuple[tuple[str, float], ...] | None = None
+    position_sigma: float | None = None
+    support: int | None = None
+    seen_ratio: float | None = None
+    baseline_deg: float | None = None
+    last_seen: float | None = None
+    source: str | None = None
+
+
+OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))
+_NUMBERS = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')
+
+
+def read_details(tree: Mapping[str, Any], where: str) -> LandmarkDetails:
+    """Return the optional fields among a landmark's fields.
+
+    Labels are two lists of equal length, ``{text: [...], weight: [...]}``, since a ROS parameter
+    holds no list of mappings; such a list, ``[{text: ..., weight: ...}, ...]``, is read as well.
+
+    Raises
+    ------
+    MapError
+        Names the landmark and the field to correct.
+    """
+    values: dict[str, Any] = {}
+    for name in OPTIONAL_FIELDS:
+        if tree.get(name) is None:
+            continue
+        value, here = tree[name], f'{where}: {name}'
+        if name in _NUMBERS:
+            values[name] = _number(value, here)
+        elif name == 'labels':
+            values[name] = _weighted(_label_rows(value, here), here)
+        elif name == 'class_weights':
+            if not isinstance(value, Mapping):
+                raise MapError(f'{here}: must map class names to weights, not {value!r}')
+            values[name] = _weighted(list(value.items()), here)
+        else:
+            values[name] = _text(value, here)
+    if 'support' in values:
+        values['support'] = int(values['support'])
+    return LandmarkDetails(**values)
+
+
+def _label_rows(value: Any, where: str) -> list[tuple[Any, Any]]:
+    if isinstance(value, Mapping) and set(value) == {'text', 'weight'}:
+        texts, weights = list(value['text']), list(value['weight'])
+        if len(texts) == len(weights):
+            return list(zip(texts, weights, strict=True))
+    elif isinstance(value, list | tuple) and all(
+            isinstance(row, Mapping) and set(row) == {'text', 'weight'} for row in value):
+        return [(row['text'], row['weight']) for row in value]
+    raise MapError(f'{where}: expected text and weight, two lists of equal length')
+
+
+def _weighted(rows: list[tuple[Any, Any]], where: str) -> tuple[tuple[str, float], ...]:
+    if not rows:
+        raise MapError(f'{where}: is empty; leave the field out')
+    pairs = tuple((_text(text, where), _number(weight, where)) for text, weight in rows)
+    if any(weight <= 0.0 for _, weight in pairs):
+        raise MapError(f'{where}: weights must be above 0')
+    return pairs
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise MapError(f'{where}: must be text that is not empty, not {value!r}')
+    return value
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise MapError(f'{where}: must be a number, not {value!r}')
+    if not math.isfinite(value) or value < 0.0:
+        raise MapError(f'{where}: {value} must be finite and not negative')
+    return float(value)

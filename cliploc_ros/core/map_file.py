@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file."""
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MapError
+from cliploc_ros.replace_file import replace_file
+
+_INDENT = ' ' * 10
+
+
+def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
+              comments: Iterable[str] = ()) -> None:
+    """Write a map file in one step: an existing file is replaced complete, or stays.
+
+    Parameters
+    ----------
+    path : str or path
+        A YAML file.
+    landmark_map : LandmarkMap
+    comments : iterable of str
+        Lines for the head of the file.
+
+    Raises
+    ------
+    MapError
+        The file cannot be written.
+    """
+    path = Path(path)
+    try:
+        with replace_file(path) as partial, partial.open('w', encoding='utf-8') as file:
+            file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
+            file.writelines(f'{line}\n' for line in _lines(landmark_map))
+    except OSError as error:
+        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
+                       ) from error
+
+
+def _lines(landmark_map: LandmarkMap) -> Iterator[str]:
+    yield '/**:'
+    yield '  ros__parameters:'
+    yield '    map:'
+    yield f'      frame_id: {_quoted(landmark_map.frame_id)}'
+    yield '      landmarks:'
+    for row, landmark_id in enumerate(landmark_map.landmark_ids):
+        yield f'        {_quoted(landmark_id)}:'
+        yield f'{_INDENT}label: {_quoted(landmark_map.labels[row])}'
+        yield f'{_INDENT}class_id: {_quoted(landmark_map.class_ids[row])}'
+        yield f'{_INDENT}center: {_floats(landmark_map.centers[row])}'
+        yield f'{_INDENT}semi_axes: {_floats(landmark_map.semi_axes[row])}'
+        yield f'{_INDENT}orientation: {_floats(landmark_map.quats_xyzw[row])}'
+        if landmark_map.details:
+            yield from _detail_lines(landmark_map.details[row])
+
+
+def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
+    if details.labels is not None:
+        yield f'{_INDENT}labels:'
+        yield f'{_INDENT}  text: [{", ".join(_quoted(text) for text, _ in details.labels)}]'
+        yield f'{_INDENT}  weight: {_floats([weight for _, weight in details.labels])}'
+    if details.class_weights is not None:
+        yield f'{_INDENT}class_weights:'
+        for name, weight in details.class_weights:
+            yield f'{_INDENT}  {_quoted(name)}: {weight:.4f}'
+    if details.support is not None:
+        yield f'{_INDENT}support: {details.support}'
+    for name, digits in (('position_sigma', 4), ('seen_ratio', 3), ('baseline_deg', 1),
+                         ('last_seen', 3)):
+        if (value := getattr(details, name)) is not None:
+            yield f'{_INDENT}{name}: {value:.{digits}f}'
+    if details.source is not None:
+        yield f'{_INDENT}source: {_quoted(details.source)}'
+
+
+def _quoted(text: str) -> str:
+    """Return text as YAML: a JSON string is one, whatever the text holds."""
+    return json.dumps(text, ensure_ascii=True)
+
+
+def _floats(values: Iterable[float] | NDArray[np.float64]) -> str:
+    """Return numbers that ROS reads as floats, integers among them, too."""
+    return f'[{", ".join(f"{value:.5f}" for value in values)}]'

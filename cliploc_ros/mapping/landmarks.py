@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks while they are being built: ellipsoids with a class."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Landmarks(NamedTuple):
+    """L ellipsoids of known classes.
+
+    Parameters
+    ----------
+    centers : ndarray (L, 3)
+        [m].
+    bases : ndarray (L, 3, 3)
+        Their columns are the semi-axes [m], see cliploc_ros.mapping.projection.
+    classes : ndarray (L,) of int
+        Detector classes.
+    """
+
+    centers: NDArray[np.float64]
+    bases: NDArray[np.float64]
+    classes: NDArray[np.int64]
+
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
+        """Return some of the landmarks."""
+        return Landmarks(self.centers[rows], self.bases[rows], self.classes[rows])
+
+
+def no_landmarks() -> Landmarks:
+    """Return none."""
+    return Landmarks(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+
+
+def join_landmarks(*parts: Landmarks) -> Landmarks:
+    """Return the landmarks of all parts."""
+    columns = zip(no_landmarks(), *parts, strict=True)
+    return Landmarks(*(np.concatenate(column) for column in columns))

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What mapping starts from: the detections of many frames, and the pose of each frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class PosedDetections:
+    """Detections of F frames with their poses: n boxes of C classes, in the order of time.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the undistorted images.
+    map_from_camera : ndarray (F, 4, 4)
+        The poses to map with.
+    stamps_s : ndarray (F,)
+        Times of the images [s], ascending.
+    frame_offsets : ndarray (F + 1,) of int
+        Frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1].
+    bboxes_xyxy : ndarray (n, 4)
+        Left, top, right, bottom [px], undistorted.
+    class_names : tuple of str
+        The C detector classes.
+    classes : ndarray (n,) of int
+        Index of each box's class.
+    scores : ndarray (n,)
+        Detector confidences, 0 to 1.
+    """
+
+    camera: Camera
+    map_from_camera: NDArray[np.float64]
+    stamps_s: NDArray[np.float64]
+    frame_offsets: NDArray[np.int64]
+    bboxes_xyxy: NDArray[np.float64]
+    class_names: tuple[str, ...]
+    classes: NDArray[np.int64]
+    scores: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.stamps_s)
+
+    @cached_property
+    def frames(self) -> NDArray[np.int64]:
+        """Return the frame (n,) of each box."""
+        return np.repeat(np.arange(len(self)), np.diff(self.frame_offsets))
+
+    def select_frames(self, frames: Sequence[int] | NDArray[np.int64]) -> 'PosedDetections':
+        """Return the detections of some frames, in the order given."""
+        frames = np.asarray(frames, dtype=np.int64)
+        starts, ends = self.frame_offsets[frames], self.frame_offsets[frames + 1]
+        rows = [np.arange(start, end) for start, end in zip(starts, ends, strict=True)]
+        boxes = np.concatenate([np.empty(0, dtype=np.int64), *rows])
+        return replace(
+            self, map_from_camera=self.map_from_camera[frames], stamps_s=self.stamps_s[frames],
+            frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
+            bboxes_xyxy=self.bboxes_xyxy[boxes], classes=self.classes[boxes],
+            scores=self.scores[boxes])
+
+    def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
+        """Return the same detections with other poses (F, 4, 4)."""
+        return replace(self, map_from_camera=map_from_camera)

@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find landmarks among the boxes of one class: sequential RANSAC over pairs of boxes.
+
+A pair of boxes with enough parallax gives a hypothesis: a sphere where the rays of their centres
+meet, fitted to the eight edges. Its support are the frames with a box that it overlaps well. The
+hypothesis with the greatest support is fitted to that support and takes its boxes away; then the
+next. Every box is the seed of some hypotheses, so that rare objects get their share.
+"""
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
+from cliploc_ros.mapping.landmarks import Landmarks, no_landmarks
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.projection import box_iou, project_box
+from cliploc_ros.mapping.views import Views
+
+# Angles between the rays of a pair: less leaves the depth open, more shows other sides.
+_PARALLAX_DEG = (5.0, 75.0)
+_MAX_GAP_S = 30.0
+# The rays of a pair pass each other within this share of the object's radius, and the radii that
+# both boxes suggest differ by at most this factor.
+_MAX_MISS = 0.6
+_MAX_RADIUS_RATIO = 1.6
+_MIN_DEPTH_M = 0.1
+_PAIR_STEPS = 6
+#: A frame supports a landmark that overlaps one of its boxes more than this.
+SUPPORT_IOU = 0.45
+
+
+def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
+                rng: np.random.Generator) -> Landmarks:
+    """Return landmarks that explain boxes of one class.
+
+    Parameters
+    ----------
+    views : Views
+    rows : ndarray (m,) of int
+        Boxes of one class, in the order of time. A box belongs to at most one landmark.
+    options : MappingOptions
+    rng : numpy.random.Generator
+    """
+    if len(rows) < options.min_viewpoints:
+        return no_landmarks()
+    seeds = np.repeat(rows, options.pairs_per_box)
+    centers, bases = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
+    hypotheses = _Hypotheses.of(views, rows, centers, bases)
+    found = _take_greatest(views, rows, hypotheses, options.min_viewpoints)
+    if not found:
+        return no_landmarks()
+    return Landmarks(np.array([center for center, _ in found]),
+                     np.array([basis for _, basis in found]),
+                     np.full(len(found), views.classes[rows[0]]))
+
+
+class _Hypotheses(NamedTuple):
+    """Ellipsoids and the boxes that support each: those from offsets[h] up to offsets[h + 1]."""
+
+    centers: NDArray[np.float64]
+    bases: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    boxes: NDArray[np.int64]
+
+    @staticmethod
+    def of(views: Views, rows: NDArray[np.int64], centers: NDArray[np.float64],
+           bases: NDArray[np.float64]) -> '_Hypotheses':
+        """Return hypotheses with their support among the boxes of some rows."""
+        frames, starts = np.unique(views.frames[rows], return_index=True)
+        starts = np.append(starts, len(rows))
+        support = [_support(views, rows, frames, starts, center, basis)
+                   for center, basis in zip(centers, bases, strict=True)]
+        offsets = np.cumsum([0, *map(len, support)])
+        return _Hypotheses(centers, bases, offsets,
+                           np.concatenate([np.empty(0, dtype=np.int64), *support]))
+
+
+def _take_greatest(views: Views, rows: NDArray[np.int64], hypotheses: _Hypotheses,
+                   min_viewpoints: int) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the ellipsoids that cover the most boxes, one after the other."""
+    found = []
+    is_free = np.zeros(len(views.frames), dtype=np.bool_)
+    is_free[rows] = True
+    of_boxes = np.repeat(np.arange(len(hypotheses.centers)), np.diff(hypotheses.offsets))
+    viewpoints = views.viewpoints[views.frames]
+    discarded = np.zeros(len(hypotheses.centers), dtype=np.bool_)
+    while len(hypotheses.centers):
+        gains = np.bincount(of_boxes[is_free[hypotheses.boxes]],
+                            minlength=len(hypotheses.centers))
+        gains[discarded] = 0
+        best = int(np.argmax(gains))
+        if gains[best] < min_viewpoints:
+            break
+        discarded[best] = True
+        boxes = hypotheses.boxes[hypotheses.offsets[best]:hypotheses.offsets[best + 1]]
+        center, basis, support = _settle(views, rows[is_free[rows]], boxes[is_free[boxes]],
+                                         hypotheses.centers[best], hypotheses.bases[best])
+        if len(np.unique(viewpoints[support])) < min_viewpoints:
+            continue
+        found.append((center, basis))
+        is_free[support] = False
+    return found
+
+
+def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int64],
+            center: NDArray[np.float64], basis: NDArray[np.float64]
+            ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Fit a hypothesis to its support as long as that grows; return ellipsoid and support."""
+    frames, starts = np.unique(views.frames[free_rows], return_index=True)
+    starts = np.append(starts, len(free_rows))
+    for _ in range(5):
+        fit = fit_ellipsoid(views, support, center, basis)
+        wider = _support(views, free_rows, frames, starts, fit.center, fit.basis)
+        if len(wider) < len(support):
+            break
+        grows = len(wider) > len(support)
+        center, basis, support = fit.center, fit.basis, wider
+        if not grows:
+            break
+    return center, basis, support
+
+
+@compiled
+def _pair_hypotheses(views, rows, seeds, draws):
+    """Return centres (h, 3) and bases (h, 3, 3) of pairs: each seed with a random partner."""
+    centers, bases = np.empty((len(seeds), 3)), np.empty((len(seeds), 3, 3))
+    origins, rays, radii = _rays_of(views, rows)
+    stamps = views.stamps_s[views.frames[rows]]
+    places = np.searchsorted(rows, seeds)
+    partners = np.empty(len(rows), dtype=np.int64)
+    information = np.empty((LANDMARK_SIZE, LANDMARK_SIZE))
+    point = np.empty(3)
+    pair = np.empty(2, dtype=np.int64)
+    count, valid = 0, 0
+    for number in range(len(seeds)):
+        first = places[number]
+        if number == 0 or places[number - 1] != first:
+            low = np.searchsorted(stamps, stamps[first] - _MAX_GAP_S)
+            high = np.searchsorted(stamps, stamps[first] + _MAX_GAP_S)
+            valid = 0
+            for second in range(low, high):
+                if _meet(origins, rays, radii, first, second, point) > 0.0:
+                    partners[valid] = second
+                    valid += 1
+        if valid == 0:
+            continue
+        second = partners[min(valid - 1, int(draws[number] * valid))]
+        radius = _meet(origins, rays, radii, first, second, point)
+        centers[count] = point
+        bases[count] = radius * np.eye(3)
+        pair[0], pair[1] = rows[first], rows[second]
+        descend(views, pair, centers[count], bases[count], _PAIR_STEPS, information)
+        count += 1
+    return centers[:count].copy(), bases[:count].copy()
+
+
+@compiled
+def _rays_of(views, rows):
+    """Return origins (m, 3), unit rays (m, 3) in the map, and radii (m,) at distance 1."""
+    origins, rays = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    radii = np.empty(len(rows))
+    for place in range(len(rows)):
+        row = rows[place]
+        rotation = views.rotations[views.frames[row]]
+        box = views.edges[row]
+        ray = np.array([0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), 1.0])
+        length = sqrt((ray * ray).sum())
+        origins[place] = -(rotation.T @ views.translations[views.frames[row]])
+        rays[place] = rotation.T @ (ray / length)
+        radii[place] = 0.5 * sqrt((box[2] - box[0]) * (box[3] - box[1])) / length
+    return origins, rays, radii
+
+
+@compiled
+def _meet(origins, rays, radii, first, second, point):
+    """Write the point where two rays meet; return the object's radius, 0 where they do not."""
+    cosine = (rays[first, 0] * rays[second, 0] + rays[first, 1] * rays[second, 1]
+              + rays[first, 2] * rays[second, 2])
+    if not _LEAST_COSINE <= cosine <= _GREATEST_COSINE:
+        return 0.0
+    along_first = along_second = 0.0
+    for i in range(3):
+        offset = origins[second, i] - origins[first, i]
+        along_first += offset * rays[first, i]
+        along_second += offset * rays[second, i]
+    scale = 1.0 / (1.0 - cosine * cosine)
+    depth_first = (along_first - cosine * along_second) * scale
+    depth_second = (cosine * along_first - along_second) * scale
+    if not (depth_first > _MIN_DEPTH_M and depth_second > _MIN_DEPTH_M):
+        return 0.0
+    radius_first, radius_second = radii[first] * depth_first, radii[second] * depth_second
+    if max(radius_first, radius_second) > _MAX_RADIUS_RATIO * min(radius_first, radius_second):
+        return 0.0
+    radius = 0.5 * (radius_first + radius_second)
+    miss = 0.0
+    for i in range(3):
+        one = origins[first, i] + depth_first * rays[first, i]
+        other = origins[second, i] + depth_second * rays[second, i]
+        miss += (one - other) ** 2
+        point[i] = 0.5 * (one + other)
+    return radius if miss < (_MAX_MISS * radius) ** 2 else 0.0
+
+
+_GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
+
+
+@compiled
+def _support(views, rows, frames, starts, center, basis):
+    """Return the best box (s,) of each frame that overlaps an ellipsoid well."""
+    found = np.empty(len(frames), dtype=np.int64)
+    count = 0
+    box = np.empty(4)
+    for place in range(len(frames)):
+        frame = frames[place]
+        if not project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            continue
+        best = SUPPORT_IOU
+        for row in rows[starts[place]:starts[place + 1]]:
+            iou = box_iou(box, views.edges[row], views.bounds)
+            if iou > best:
+                best = iou
+                found[count] = row
+        if best > SUPPORT_IOU:
+            count += 1
+    return found[:count].copy()

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Posed detections as the kernels of mapping read them: boxes and poses on the plane z = 1."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.posed_detections import PosedDetections
+
+# Two frames less than this apart in both show a landmark from one viewpoint.
+_VIEWPOINT_DISTANCE_M = 0.1
+_VIEWPOINT_ANGLE_DEG = 5.0
+
+
+class Views(NamedTuple):
+    """F frames with n boxes. Everything in the image is on the plane z = 1.
+
+    Parameters
+    ----------
+    rotations, translations : ndarray (F, 3, 3), (F, 3)
+        Of camera_from_map.
+    stamps_s : ndarray (F,)
+        [s].
+    viewpoints : ndarray (F,) of int
+        Number of the viewpoint of each frame, ascending: frames that the camera took without
+        moving share one.
+    offsets : ndarray (F + 1,) of int
+        First box of each frame.
+    frames, classes : ndarray (n,) of int
+        Of each box.
+    edges : ndarray (n, 4)
+        Left, top, right, bottom, clipped to the image.
+    stiffness : ndarray (n, 4)
+        Inverse standard deviation of each edge.
+    is_open : ndarray (n, 4) of bool
+        The edge lies at the image border: the object may extend beyond it.
+    bounds : ndarray (4,)
+        Left, top, right, bottom of the image.
+    """
+
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    stamps_s: NDArray[np.float64]
+    viewpoints: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    frames: NDArray[np.int64]
+    classes: NDArray[np.int64]
+    edges: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    is_open: NDArray[np.bool_]
+    bounds: NDArray[np.float64]
+
+
+def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
+    """Return what the kernels read of posed detections."""
+    camera = detections.camera
+    size = np.array([camera.width, camera.height, camera.width, camera.height], dtype=np.float64)
+    boxes_px = np.clip(detections.bboxes_xyxy, 0.0, size)
+    focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
+    principal = np.array([camera.cx, camera.cy, camera.cx, camera.cy])
+    extents_px = np.tile(boxes_px[:, 2:] - boxes_px[:, :2], 2)
+    deviations_px = np.hypot(options.edge_sigma_px, options.edge_sigma_share * extents_px)
+    is_open = np.zeros(boxes_px.shape, dtype=np.bool_)
+    is_open[:, :2] = boxes_px[:, :2] <= options.border_px
+    is_open[:, 2:] = boxes_px[:, 2:] >= size[2:] - options.border_px
+    rotations, translations = camera_from_map(detections.map_from_camera)
+    return Views(
+        rotations, translations, np.ascontiguousarray(detections.stamps_s, dtype=np.float64),
+        number_viewpoints(detections.map_from_camera), detections.frame_offsets,
+        detections.frames, detections.classes, (boxes_px - principal) / focal,
+        focal / deviations_px, is_open,
+        (np.array([0.0, 0.0, camera.width, camera.height]) - principal) / focal)
+
+
+def camera_from_map(map_from_camera: NDArray[np.float64]
+                    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations (F, 3, 3) and translations (F, 3) of the inverses of poses (F, 4, 4)."""
+    rotations = np.ascontiguousarray(map_from_camera[:, :3, :3].transpose(0, 2, 1))
+    translations = -np.einsum('fij,fj->fi', rotations, map_from_camera[:, :3, 3])
+    return rotations, np.ascontiguousarray(translations)
+
+
+def number_viewpoints(map_from_camera: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return which viewpoint each of F poses (F, 4, 4) belongs to, ascending from 0.
+
+    A viewpoint ends with the first frame that differs from its first one by 10 cm or 5 degrees.
+    """
+    viewpoints = np.zeros(len(map_from_camera), dtype=np.int64)
+    least_cosine = np.cos(np.radians(_VIEWPOINT_ANGLE_DEG))
+    first, number = 0, 0
+    for frame in range(1, len(map_from_camera)):
+        here, there = map_from_camera[frame], map_from_camera[first]
+        cosine = 0.5 * (np.sum(here[:3, :3] * there[:3, :3]) - 1.0)
+        distance = np.linalg.norm(here[:3, 3] - there[:3, 3])
+        if cosine < least_cosine or distance > _VIEWPOINT_DISTANCE_M:
+            first, number = frame, number + 1
+        viewpoints[frame] = number
+    return viewpoints

@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The box of an ellipsoid and its derivatives."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.mapping.projection import box_iou, linearize_box, move_ellipsoid, project_box
+
+SEMI_AXES = np.array([0.3, 0.1, 0.2])
+ROTATION = Rotation.from_rotvec([0.3, -0.5, 0.8])
+BASIS = ROTATION.as_matrix() * SEMI_AXES
+CENTER = np.array([0.4, -0.3, 0.2])
+CAMERA_FROM_MAP = make_transform(Rotation.from_rotvec([0.2, 0.4, -0.3]).as_matrix(),
+                                 np.array([0.1, 0.2, 2.0]))
+
+
+def box_at(center, basis, camera_from_map=CAMERA_FROM_MAP):
+    box = np.empty(4)
+    assert project_box(camera_from_map[:3, :3].copy(), camera_from_map[:3, 3].copy(), center,
+                       basis, box)
+    return box
+
+
+def test_box_of_a_sphere_before_the_camera_is_exact():
+    # a sphere of radius 1 at depth 2 spans 30 degrees to each side
+    box = box_at(np.array([0.0, 0.0, 2.0]), np.eye(3), np.eye(4))
+    assert box == pytest.approx(np.tan(np.pi / 6) * np.array([-1, -1, 1, 1]))
+
+
+def test_box_is_that_of_the_core():
+    shapes = shape_matrices(SEMI_AXES[None], ROTATION.as_quat()[None])
+    expected = ellipse_bboxes(project_ellipsoids(CAMERA_FROM_MAP, CENTER[None], shapes))[0]
+    assert box_at(CENTER, BASIS) == pytest.approx(expected, abs=1e-12)
+
+
+def test_ellipsoid_around_the_camera_has_no_box():
+    box = np.empty(4)
+    assert not project_box(np.eye(3), np.zeros(3), np.array([0.0, 0.0, 0.5]), np.eye(3), box)
+    assert not project_box(np.eye(3), np.zeros(3), np.array([0.0, 0.0, -5.0]), np.eye(3), box)
+
+
+def test_derivatives_are_those_of_small_steps():
+    rotation, translation = CAMERA_FROM_MAP[:3, :3].copy(), CAMERA_FROM_MAP[:3, 3].copy()
+    box, by_landmark, by_pose = np.empty(4), np.empty((4, 9)), np.empty((4, 6))
+    assert linearize_box(rotation, translation, CENTER, BASIS, box, by_landmark, by_pose)
+    size = 1e-6
+    for i in range(9):
+        ends = []
+        for sign in (1, -1):
+            center, basis, step = np.empty(3), np.empty((3, 3)), np.zeros(9)
+            step[i] = sign * size
+            move_ellipsoid(CENTER, BASIS, step, center, basis)
+            ends.append(box_at(center, basis))
+        assert (ends[0] - ends[1]) / (2 * size) == pytest.approx(by_landmark[:, i], abs=1e-7)
+    for i in range(6):
+        ends = []
+        for sign in (1, -1):
+            step = np.zeros(6)
+            step[i] = sign * size
+            motion = make_transform(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3])
+            ends.append(box_at(CENTER, BASIS, motion @ CAMERA_FROM_MAP))
+        assert (ends[0] - ends[1]) / (2 * size) == pytest.approx(by_pose[:, i], abs=1e-7)
+
+
+def test_iou_counts_only_what_lies_in_the_image():
+    bounds = np.array([-1.0, -1.0, 1.0, 1.0])
+    outside = np.array([0.0, 0.0, 3.0, 1.0])
+    assert box_iou(outside, np.array([0.0, 0.0, 1.0, 1.0]), bounds) == pytest.approx(1.0)
+    assert box_iou(outside, np.array([-1.0, 0.0, 0.0, 1.0]), bounds) == 0.0
+    assert box_iou(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.5, 0.0, 1.0, 0.5]),
+                   bounds) == pytest.approx(0.25)
