@@ -20,6 +20,26 @@ class MappingOptions:
         Hypotheses that each box is the seed of.
     min_viewpoints : int
         A landmark needs support from so many viewpoints.
+    discovery_rounds, settling_rounds : int
+        How often boxes without a landmark are searched for new ones, and how often after that
+        landmarks are associated, merged and fitted.
+    association_iou : float
+        A box and a landmark that overlap less do not belong together.
+    merge_distance : float
+        Landmarks of one class nearer than this may be one object, see
+        cliploc_ros.mapping.merging.normalized_distance.
+    max_shared_views : float
+        Unless they are seen together in more than this share of the frames of the rarer one.
+    merge_loss : float
+        Or the mean IoU of their boxes falls by more than this.
+    min_seen_ratio : float
+        Share of the frames showing a landmark's place in which it must be detected.
+    min_baseline_deg : float
+        Least angle between two of its directions [deg].
+    max_position_sigma_m, max_position_sigma_share : float
+        Greatest deviation of a centre: [m], or as a share of the landmark's size.
+    min_median_iou : float
+        Of a landmark's boxes.
     random_seed : int
         Equal seed and input give equal output.
     """
@@ -29,4 +49,15 @@ class MappingOptions:
     border_px: float = 3.0
     pairs_per_box: int = 3
     min_viewpoints: int = 3
+    discovery_rounds: int = 2
+    settling_rounds: int = 3
+    association_iou: float = 0.2
+    merge_distance: float = 0.8
+    max_shared_views: float = 0.15
+    merge_loss: float = 0.1
+    min_seen_ratio: float = 0.03
+    min_baseline_deg: float = 20.0
+    max_position_sigma_m: float = 0.05
+    max_position_sigma_share: float = 0.1
+    min_median_iou: float = 0.5
     random_seed: int = 0

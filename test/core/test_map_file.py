@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing maps, and the optional fields of a map file."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -61,7 +60,7 @@ def test_the_old_map_stays_when_the_new_one_cannot_be_written(tmp_path):
     with pytest.raises(ValueError):
         write_map(path, broken)
     assert path.read_text() == 'old'
-    assert os.listdir(tmp_path) == ['map.yaml']
+    assert [file.name for file in tmp_path.iterdir()] == ['map.yaml']
     with pytest.raises(MapError, match='cannot be written'):
         write_map(tmp_path / 'missing' / 'map.yaml', make_room())
 

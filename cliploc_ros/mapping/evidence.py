@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How well the frames support each landmark."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
+from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.projection import box_iou, project_box
+from cliploc_ros.mapping.views import Views
+
+# A landmark is expected in a frame that shows this share of its box, from no farther away than
+# this times the greatest distance at which it was detected.
+_SHOWN_SHARE = 0.6
+_REACH = 1.2
+
+
+class Evidence(NamedTuple):
+    """What is known of each of L landmarks.
+
+    Parameters
+    ----------
+    support, viewpoints, expected : ndarray (L,) of int
+        Frames that show it, their viewpoints, and frames that should show it.
+    baseline_deg : ndarray (L,)
+        Greatest angle between two directions from which it was seen [deg].
+    position_sigma : ndarray (L,)
+        Standard deviation of the centre on its worst axis [m].
+    median_iou : ndarray (L,)
+        Of its boxes; 0 without any.
+    last_seen : ndarray (L,)
+        [s]; NaN where nothing shows it.
+    """
+
+    support: NDArray[np.int64]
+    viewpoints: NDArray[np.int64]
+    expected: NDArray[np.int64]
+    baseline_deg: NDArray[np.float64]
+    position_sigma: NDArray[np.float64]
+    median_iou: NDArray[np.float64]
+    last_seen: NDArray[np.float64]
+
+    @property
+    def seen_ratio(self) -> NDArray[np.float64]:
+        """Return the share of the expected frames (L,) in which a landmark was detected."""
+        return np.asarray(np.minimum(1.0, self.support / np.maximum(1, self.expected)))
+
+
+def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
+    """Return the evidence for each landmark.
+
+    Parameters
+    ----------
+    views : Views
+    landmarks : Landmarks
+    shown : ndarray (n,) of int
+        The landmark that each box shows, -1 for none.
+    """
+    rows_of = group_boxes(shown, len(landmarks.centers))
+    per_landmark = [_evidence_of(views, landmarks.centers[number], landmarks.bases[number], rows)
+                    for number, rows in enumerate(rows_of)]
+    columns = np.array(per_landmark, dtype=np.float64).reshape(-1, 7).T
+    counts = columns[:3].astype(np.int64)
+    return Evidence(*counts, *columns[3:])
+
+
+def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    """Return the boxes of each of a number of landmarks, in ascending order."""
+    order = np.argsort(shown, kind='stable')
+    bounds = np.searchsorted(shown[order], np.arange(count + 1))
+    return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
+
+
+def _evidence_of(views: Views, center: NDArray[np.float64], basis: NDArray[np.float64],
+                 rows: NDArray[np.int64]) -> tuple[float, ...]:
+    if len(rows) == 0:
+        return 0, 0, 0, 0.0, np.inf, 0.0, np.nan
+    frames = views.frames[rows]
+    offsets = center - camera_centers(views, frames)
+    distances = np.linalg.norm(offsets, axis=1)
+    viewpoints = len(np.unique(views.viewpoints[frames]))
+    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+    accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+    # frames of one viewpoint err alike: they count as one
+    covariance = np.linalg.inv(information)[:3, :3] * (len(rows) / viewpoints)
+    return (len(rows), viewpoints,
+            count_expected(views, center, basis, _REACH * distances.max()),
+            widest_angle_deg(offsets / distances[:, None]),
+            float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+            float(np.median(ious_with(views, rows, center, basis))),
+            float(views.stamps_s[frames].max()))
+
+
+def camera_centers(views: Views, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return where the camera was in some frames (k, 3) [m]."""
+    return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
+                                 views.translations[frames]))
+
+
+def widest_angle_deg(directions: NDArray[np.float64]) -> float:
+    """Return the greatest angle [deg] between two of m unit vectors (m, 3), to 2 degrees."""
+    cells = np.unique(np.round(directions / 0.03), axis=0)
+    cells /= np.linalg.norm(cells, axis=1, keepdims=True)
+    return float(np.degrees(np.arccos(np.clip((cells @ cells.T).min(), -1.0, 1.0))))
+
+
+@compiled
+def ious_with(views, rows, center, basis):
+    """Return the IoU of an ellipsoid with each of some boxes; 0 where it is behind."""
+    ious, box = np.zeros(len(rows)), np.empty(4)
+    for place in range(len(rows)):
+        frame = views.frames[rows[place]]
+        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds)
+    return ious
+
+
+@compiled
+def count_expected(views, center, basis, reach):
+    """Return in how many frames an ellipsoid lies in the image, and no farther than reach [m]."""
+    count, box = 0, np.empty(4)
+    left, top, right, bottom = views.bounds
+    for frame in range(len(views.rotations)):
+        rotation, translation = views.rotations[frame], views.translations[frame]
+        if not project_box(rotation, translation, center, basis, box):
+            continue
+        offset = rotation @ center + translation
+        if (offset * offset).sum() > reach * reach:
+            continue
+        width = min(box[2], right) - max(box[0], left)
+        height = min(box[3], bottom) - max(box[1], top)
+        if width > 0.0 and height > 0.0 and width * height > (
+                _SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1])):
+            count += 1
+    return count
