@@ -46,6 +46,10 @@ class DatasetError(CliplocError):
     """A recording that cannot be read or written."""
 
 
+class MappingError(CliplocError):
+    """Posed detections of which no map can be made."""
+
+
 class InternalError(CliplocError):
     """A defect of this package, not of its input. The traceback is in the log."""
 

@@ -1,95 +1,148 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of mapping: posed detections in, landmarks and a report out."""
+"""The entry point of mapping: posed detections in, a map and a report out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence, group_boxes
 from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.input_checks import check_input
+from cliploc_ros.mapping.joint import pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks, no_landmarks
 from cliploc_ros.mapping.merging import merge_duplicates
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
 from cliploc_ros.mapping.triangulation import triangulate
-from cliploc_ros.mapping.views import Views, make_views
+from cliploc_ros.mapping.views import Views, make_views, map_from_cameras
+
+#: Told the name of a stage and the share of it that is done.
+Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The result of mapping.
+    """The result of mapping: F frames, n boxes.
 
     Parameters
     ----------
-    landmarks : Landmarks
-        L of them.
-    evidence : Evidence
+    landmark_map : LandmarkMap
+    report : MappingReport
     shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
+        Row of the landmark that each box shows, -1 for none.
+    map_from_camera : ndarray (F, 4, 4)
+        The poses, refined where that was asked for.
     """
 
-    landmarks: Landmarks
-    evidence: Evidence
+    landmark_map: LandmarkMap
+    report: MappingReport
     shown: NDArray[np.int64]
-    left_out: Landmarks
-    reasons: tuple[str, ...]
-    left_out_evidence: Evidence
+    map_from_camera: NDArray[np.float64]
 
 
 def build_map(detections: PosedDetections, options: MappingOptions | None = None,
-              progress: Callable[[str, float], None] | None = None) -> BuiltMap:
-    """Build landmarks from posed detections."""
+              progress: Progress | None = None) -> BuiltMap:
+    """Build a map from posed detections.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+    options : MappingOptions, optional
+    progress : callable, optional
+        Called with the name of a stage and the share of it that is done, 0 to 1.
+
+    Raises
+    ------
+    MappingError
+        No map can be made of this input; the message says what to correct.
+    """
     options = options or MappingOptions()
-    views = make_views(detections, options)
+    tell = progress or (lambda stage, share: None)
+    given = make_views(detections, options)
+    notes = check_input(detections, given, options)
     rng = np.random.default_rng(options.random_seed)
+    views = given
+    draft = _draft(views, options, rng, tell)
+    if options.pose_errors is not None:
+        for _ in range(options.rebuilds):
+            tell('refining poses', 0.0)
+            views, _ = refine_jointly(given, views, draft.landmarks, draft.shown,
+                                      options.pose_errors)
+            draft = _draft(views, options, rng, tell)
+        tell('refining poses', 0.5)
+        views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown,
+                                          options.pose_errors)
+        draft = draft._replace(landmarks=landmarks)
+    tell('done', 1.0)
+    if len(draft.landmarks.centers) == 0:
+        raise MappingError(_nothing_found(draft))
+    return _finish(detections, given, views, draft, options, notes)
+
+
+class _Draft(NamedTuple):
+    """Landmarks with the boxes that show them, and what did not become one."""
+
+    landmarks: Landmarks
+    shown: NDArray[np.int64]
+    left_out: Landmarks
+    reasons: list[str]
+    evidence_against: Evidence
+
+
+def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell: Progress
+           ) -> _Draft:
+    """Return the landmarks that the views show, for the poses that they have."""
     landmarks = no_landmarks()
-    for _ in range(options.discovery_rounds):
-        free = (associate(views, landmarks, options.association_iou) < 0 if len(landmarks.centers)
-                else np.ones(len(views.frames), dtype=np.bool_))
-        found = discover(views, free, options, rng)
-        landmarks = settle(views, join_landmarks(landmarks, found), options)
-    shown = associate(views, landmarks, options.association_iou)
-    evidence = gather_evidence(views, landmarks, shown)
+    for number in range(options.discovery_rounds):
+        tell('finding landmarks', number / options.discovery_rounds)
+        free = associate(views, landmarks, options.association_iou) < 0
+        landmarks = join_landmarks(landmarks, _discover(views, free, options, rng))
+        tell('fitting landmarks', number / options.discovery_rounds)
+        landmarks = _settle(views, landmarks, options)
+    evidence = gather_evidence(views, landmarks,
+                               associate(views, landmarks, options.association_iou))
     reasons = reasons_against(landmarks, evidence, options)
-    keep = np.array([reason is None for reason in reasons], dtype=np.bool_)
-    kept = landmarks.select(keep)
-    for _ in range(2):
-        shown = associate(views, kept, options.association_iou)
-        kept = refit(views, kept, shown)
-    shown = associate(views, kept, options.association_iou)
-    return BuiltMap(kept, gather_evidence(views, kept, shown), shown, landmarks.select(~keep),
-                    tuple(reason for reason in reasons if reason is not None),
-                    Evidence(*(column[~keep] for column in evidence)))
+    kept = np.array([reason is None for reason in reasons], dtype=np.bool_)
+    landmarks, left_out = landmarks.select(kept), landmarks.select(~kept)
+    # boxes of what is left out may belong to what stays
+    shown = associate(views, landmarks, options.association_iou)
+    landmarks = _refit(views, landmarks, shown)
+    return _Draft(landmarks, associate(views, landmarks, options.association_iou), left_out,
+                  [reason for reason in reasons if reason is not None],
+                  evidence.select(~kept))
 
 
-def discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
-             rng: np.random.Generator) -> Landmarks:
+def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
+              rng: np.random.Generator) -> Landmarks:
     """Return landmarks that explain the free boxes, class by class."""
     return join_landmarks(*(
         triangulate(views, np.nonzero(free & (views.classes == number))[0], options, rng)
         for number in np.unique(views.classes[free])))
 
 
-def settle(views: Views, landmarks: Landmarks, options: MappingOptions) -> Landmarks:
-    """Associate, merge and refit until landmarks and boxes agree."""
+def _settle(views: Views, landmarks: Landmarks, options: MappingOptions) -> Landmarks:
+    """Associate, merge and fit until landmarks and boxes agree."""
     for _ in range(options.settling_rounds):
         shown = associate(views, landmarks, options.association_iou)
         landmarks, shown = merge_duplicates(views, landmarks, shown, options)
-        landmarks = refit(views, landmarks, shown)
-        shown = associate(views, landmarks, options.association_iou)
-        viewpoints = views.viewpoints[views.frames]
-        seen = np.array([len(np.unique(viewpoints[rows])) >= options.min_viewpoints
-                         for rows in group_boxes(shown, len(landmarks.centers))], dtype=np.bool_)
-        landmarks = landmarks.select(seen)
+        seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
+                for rows in group_boxes(shown, len(landmarks.centers))]
+        landmarks = _refit(views, landmarks, shown).select(np.array(seen, dtype=np.bool_))
     return landmarks
 
 
-def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landmarks:
+def _refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landmarks:
     """Return the landmarks fitted to the boxes that show them."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     for number, rows in enumerate(group_boxes(shown, len(centers))):
@@ -97,3 +150,58 @@ def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landm
             fit = fit_ellipsoid(views, rows, centers[number], bases[number])
             centers[number], bases[number] = fit.center, fit.basis
     return Landmarks(centers, bases, landmarks.classes)
+
+
+def _nothing_found(draft: _Draft) -> str:
+    if draft.reasons:
+        return (f'no landmark is good enough for a map; {len(draft.reasons)} were left out, the '
+                f'first one because: {draft.reasons[0]}')
+    return ('no boxes of one class meet in space; check that poses and stamps belong to these '
+            'images, that the poses are of the camera (z forward), and the intrinsics')
+
+
+def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
+            options: MappingOptions, notes: list[str]) -> BuiltMap:
+    evidence = gather_evidence(views, draft.landmarks, draft.shown)
+    explained, median_iou = explained_boxes(views, draft.landmarks)
+    changes = np.square(pose_errors(given, views))
+    report = MappingReport(
+        frames=len(detections), viewpoints=int(views.viewpoints[-1]) + 1,
+        boxes=len(detections.classes), landmarks=len(draft.landmarks.centers),
+        explained=explained, median_iou=median_iou,
+        pose_change_m=float(np.sqrt(changes[:, :3].sum(axis=1).mean())),
+        pose_change_deg=float(np.degrees(np.sqrt(changes[:, 3:].sum(axis=1).mean()))),
+        left_out=describe_left_out(detections, draft.left_out, draft.evidence_against,
+                                   draft.reasons),
+        notes=tuple(notes))
+    return BuiltMap(make_landmark_map(detections, draft.landmarks, evidence, options), report,
+                    draft.shown, map_from_cameras(views))
+
+
+def make_landmark_map(detections: PosedDetections, landmarks: Landmarks, evidence: Evidence,
+                      options: MappingOptions) -> LandmarkMap:
+    """Return landmarks as a map; labels are the class names."""
+    names = tuple(detections.class_names[number] for number in landmarks.classes)
+    semi_axes = np.linalg.norm(landmarks.bases, axis=1)
+    rotations = landmarks.bases / semi_axes[:, None, :]
+    rotations[np.linalg.det(rotations) < 0.0] *= -1.0
+    details = tuple(
+        LandmarkDetails(
+            position_sigma=float(evidence.position_sigma[row]),
+            support=int(evidence.support[row]), seen_ratio=float(evidence.seen_ratio[row]),
+            baseline_deg=float(evidence.baseline_deg[row]),
+            last_seen=float(evidence.last_seen[row]), source=options.source)
+        for row in range(len(names)))
+    return LandmarkMap(options.frame_id, _landmark_ids(names), names, names, landmarks.centers,
+                       semi_axes, Rotation.from_matrix(rotations).as_quat(), details)
+
+
+def _landmark_ids(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a unique id for each landmark: its class and a number."""
+    counts: dict[str, int] = {}
+    ids = []
+    for name in names:
+        word = ''.join(char if char.isalnum() else '_' for char in name)
+        counts[word] = counts.get(word, 0) + 1
+        ids.append(f'{word}_{counts[word]}')
+    return tuple(ids)

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import box_iou, project_box
-from cliploc_ros.mapping.views import Views
+from cliploc_ros.mapping.views import Views, camera_centers
 
 # A landmark is expected in a frame that shows this share of its box, from no farther away than
 # this times the greatest distance at which it was detected.
@@ -48,6 +49,12 @@ class Evidence(NamedTuple):
     def seen_ratio(self) -> NDArray[np.float64]:
         """Return the share of the expected frames (L,) in which a landmark was detected."""
         return np.asarray(np.minimum(1.0, self.support / np.maximum(1, self.expected)))
+
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
+        """Return the evidence for some of the landmarks."""
+        return Evidence(self.support[rows], self.viewpoints[rows], self.expected[rows],
+                        self.baseline_deg[rows], self.position_sigma[rows],
+                        self.median_iou[rows], self.last_seen[rows])
 
 
 def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
@@ -95,10 +102,12 @@ def _evidence_of(views: Views, center: NDArray[np.float64], basis: NDArray[np.fl
             float(views.stamps_s[frames].max()))
 
 
-def camera_centers(views: Views, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return where the camera was in some frames (k, 3) [m]."""
-    return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
-                                 views.translations[frames]))
+def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
+    """Return the greatest IoU (n,) of each box with any landmark of its class, 0 for none."""
+    overlaps = find_overlaps(views, landmarks, 0.0)
+    best = np.zeros(len(views.frames))
+    np.maximum.at(best, overlaps.boxes, overlaps.ious)
+    return best
 
 
 def widest_angle_deg(directions: NDArray[np.float64]) -> float:

@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Landmarks while they are being built: ellipsoids with a class."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.landmark_map import LandmarkMap
 
 
 class Landmarks(NamedTuple):
@@ -28,6 +32,14 @@ class Landmarks(NamedTuple):
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
         """Return some of the landmarks."""
         return Landmarks(self.centers[rows], self.bases[rows], self.classes[rows])
+
+
+def landmarks_of_map(landmark_map: LandmarkMap, class_names: Sequence[str]) -> Landmarks:
+    """Return the landmarks of a map; those of other classes than the named ones get -1."""
+    numbers = {name: number for number, name in enumerate(class_names)}
+    rotations = Rotation.from_quat(landmark_map.quats_xyzw).as_matrix()
+    return Landmarks(landmark_map.centers, rotations * landmark_map.semi_axes[:, None, :],
+                     np.array([numbers.get(name, -1) for name in landmark_map.class_ids]))
 
 
 def no_landmarks() -> Landmarks:

@@ -4,6 +4,31 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """How the errors of given poses behave.
+
+    Parameters
+    ----------
+    sigma_m, sigma_deg : float
+        Standard deviations on each axis [m] [deg].
+    correlation_s : float
+        Time constant with which an error forgets itself [s]; 0: every frame errs on its own.
+    """
+
+    sigma_m: float
+    sigma_deg: float
+    correlation_s: float = 3.0
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """Return the standard deviations (6,) [m] [rad]."""
+        return np.repeat([self.sigma_m, np.radians(self.sigma_deg)], 3)
+
 
 @dataclass(frozen=True)
 class MappingOptions:
@@ -40,6 +65,12 @@ class MappingOptions:
         Greatest deviation of a centre: [m], or as a share of the landmark's size.
     min_median_iou : float
         Of a landmark's boxes.
+    pose_errors : PoseErrors, optional
+        Refine the poses with the landmarks, as far as they may be off; None: poses are exact.
+    rebuilds : int
+        How often the map is built anew with refined poses.
+    frame_id, source : str
+        What the map says of itself: its coordinate frame, and where it comes from.
     random_seed : int
         Equal seed and input give equal output.
     """
@@ -60,4 +91,8 @@ class MappingOptions:
     max_position_sigma_m: float = 0.05
     max_position_sigma_share: float = 0.1
     min_median_iou: float = 0.5
+    pose_errors: PoseErrors | None = None
+    rebuilds: int = 1
+    frame_id: str = 'map'
+    source: str = 'build_map'
     random_seed: int = 0

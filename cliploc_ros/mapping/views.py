@@ -83,6 +83,20 @@ def camera_from_map(map_from_camera: NDArray[np.float64]
     return rotations, np.ascontiguousarray(translations)
 
 
+def map_from_cameras(views: Views) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (F, 4, 4) of all frames."""
+    poses = np.tile(np.eye(4), (len(views.rotations), 1, 1))
+    poses[:, :3, :3] = views.rotations.transpose(0, 2, 1)
+    poses[:, :3, 3] = camera_centers(views, np.arange(len(poses)))
+    return poses
+
+
+def camera_centers(views: Views, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return where the camera was in some frames (k, 3) [m]."""
+    return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
+                                 views.translations[frames]))
+
+
 def number_viewpoints(map_from_camera: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return which viewpoint each of F poses (F, 4, 4) belongs to, ascending from 0.
 

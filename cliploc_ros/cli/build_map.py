@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``build_map``: posed detections become a map file."""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.errors import DatasetError, MappingError, OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.mapping.building import BuiltMap
+    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+
+EPILOG = """\
+examples:
+  build_map --observations office.npz --out office.yaml
+  build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
+  build_map --observations office.npz --out office.yaml --every 5 --report office.json
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Build a map; return the exit code."""
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
+    interrupt_on_sigterm()
+    return run_command(lambda: build(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='build_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Build a map of ellipsoids from detections with poses. An existing map is '
+        'replaced only when the new one is complete. Needs no sourced ROS.')
+    parser.add_argument('--observations', type=Path, required=True, metavar='NPZ',
+                        help='boxes and poses of a recording')
+    parser.add_argument('--out', type=Path, required=True, metavar='YAML',
+                        help='the map to write')
+    parser.add_argument('--report', type=Path, metavar='JSON',
+                        help='also write what was found and left out, and why')
+    parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
+    parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
+                        help='use each N-th frame only (%(default)s)')
+    parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    poses = parser.add_argument_group('poses with errors')
+    poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
+                       help='refine the poses together with the landmarks (default: if '
+                       '--pose-noise is given)')
+    poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
+                       help='standard deviations of the poses on each axis (0.02 0.5 with '
+                       '--joint)')
+    poses.add_argument('--pose-correlation', type=_seconds, default=3.0, metavar='SECONDS',
+                       help='time after which a pose error is another one (%(default)s)')
+    limits = parser.add_argument_group('which landmarks belong into the map')
+    limits.add_argument('--min-viewpoints', type=_positive_int, default=3, metavar='N',
+                        help='10 cm or 5 degrees apart (%(default)s)')
+    limits.add_argument('--min-baseline', type=float, default=20.0, metavar='DEG',
+                        help='angle between two of its directions (%(default)s)')
+    return parser
+
+
+def build(options: argparse.Namespace) -> int:
+    """Build as the command line asks; return the exit code."""
+    # Late, so that --help is fast.
+    from cliploc_ros.core.map_file import write_map
+    from cliploc_ros.datasets.observations import load_observations
+    from cliploc_ros.mapping.building import build_map
+
+    begin = time.monotonic()
+    _check_folder(options.out)
+    detections = load_observations(options.observations)
+    if options.every > 1:
+        detections = detections.select_frames(range(0, len(detections), options.every))
+    with _ProgressBar() as bar:
+        built = build_map(detections, _mapping_options(options), bar.show)
+    head = [f'built by build_map from {options.observations.name}', *built.report.lines()[:2]]
+    write_map(options.out, built.landmark_map, head)
+    if options.report is not None:
+        _write_report(options.report, built)
+    print('\n'.join(built.report.lines()))
+    print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')
+    return 0
+
+
+def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
+    from cliploc_ros.mapping.options import MappingOptions
+
+    return MappingOptions(
+        pose_errors=_pose_errors(options), min_viewpoints=options.min_viewpoints,
+        min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
+        source=f'build_map {options.observations.name}', random_seed=options.seed)
+
+
+def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
+    """Return how the poses may be off; None where they are not to be refined."""
+    from cliploc_ros.mapping.options import PoseErrors
+
+    if options.joint is False:
+        if options.pose_noise is not None:
+            raise OptionsError('--pose-noise is for --joint, not for --no-joint')
+        return None
+    if options.joint is None and options.pose_noise is None:
+        return None
+    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
+    return PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
+
+
+def _check_folder(path: Path) -> None:
+    """Refuse an output whose folder is missing, before the work is done."""
+    if not path.parent.is_dir():
+        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
+    if path.is_dir():
+        raise MappingError(f'{path} is a folder; name the map file to write')
+
+
+def _write_report(path: Path, built: 'BuiltMap') -> None:
+    from cliploc_ros.replace_file import replace_file
+
+    try:
+        with replace_file(path) as partial:
+            partial.write_text(json.dumps(built.report.as_dict(), indent=1))
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+class _ProgressBar:
+    """A bar on the terminal that names the stage; nothing where there is no terminal."""
+
+    def __enter__(self) -> '_ProgressBar':
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def show(self, stage: str, share: float) -> None:
+        """Show a stage and how much of it is done."""
+        self._bar.set_description_str(stage)
+        self._bar.n = round(100 * share)
+        self._bar.refresh()
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
+    return value
+
+
+def _deviation(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    return value
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Observation files: what a detector said about a recording, and where the camera was.
+
+Mapping, evaluation and the map editor read the same file, so that the networks run once.
+"""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.errors import CameraError, DatasetError
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.replace_file import replace_file
+
+#: Arrays of the file, by name: shape in terms of F frames and n boxes, and kinds of dtype.
+LAYOUT = {
+    'intrinsics_fx_fy_cx_cy': ((4,), 'fiu'),
+    'image_size': ((2,), 'iu'),
+    'frame_offsets': (('F+1',), 'iu'),
+    'boxes_xyxy': (('n', 4), 'fiu'),
+    'class_ids': (('n',), 'US'),
+    'scores': (('n',), 'fiu'),
+    'map_from_camera': (('F', 4, 4), 'fiu'),
+    'timestamps': (('F',), 'fiu'),
+}
+_KIND_NAMES = {'fiu': 'numbers', 'iu': 'integers', 'US': 'strings'}
+_MAX_ROTATION_ERROR = 1e-3
+
+
+def load_observations(path: str | Path) -> PosedDetections:
+    """Read and validate an observation file.
+
+    Frames are put in the order of time. A frame may lack boxes; a file may lack frames with
+    boxes only if mapping is told so later.
+
+    Parameters
+    ----------
+    path : str or Path
+        An npz file without pickles.
+
+    Raises
+    ------
+    DatasetError
+        Names the file, the array, what is wrong with it, and what to do.
+    """
+    path = Path(path)
+    try:
+        arrays = _read_arrays(path)
+        _check_layout(arrays)
+        _check_values(arrays)
+        return _make_detections(arrays)
+    except (_ArrayError, CameraError) as error:
+        raise DatasetError(f'{path}: {error}') from error
+
+
+def save_observations(path: str | Path, detections: PosedDetections) -> None:
+    """Write an observation file in one step: an existing file is replaced complete, or stays.
+
+    Raises
+    ------
+    DatasetError
+        The detections are malformed, or the file cannot be written.
+    """
+    path = Path(path)
+    camera = detections.camera
+    names = np.array(detections.class_names, dtype=np.str_)
+    arrays: dict[str, NDArray[Any]] = {
+        'intrinsics_fx_fy_cx_cy': np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        'image_size': np.array([camera.width, camera.height]),
+        'frame_offsets': detections.frame_offsets,
+        'boxes_xyxy': detections.bboxes_xyxy,
+        'class_ids': names[detections.classes] if len(names) else np.empty(0, dtype=np.str_),
+        'scores': detections.scores,
+        'map_from_camera': detections.map_from_camera,
+        'timestamps': detections.stamps_s,
+    }
+    try:
+        _check_layout(arrays)
+        _check_values(arrays)
+        with replace_file(path) as partial, partial.open('wb') as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    except _ArrayError as error:
+        raise DatasetError(f'{path}: cannot be written: {error}') from error
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
+                           ) from error
+
+
+class _ArrayError(Exception):
+    """What is wrong with an array; the caller adds the file's name."""
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    if not path.is_file():
+        raise _ArrayError('no such observation file')
+    try:
+        content = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _ArrayError('is no complete npz file; record the observations again') from error
+    if not isinstance(content, np.lib.npyio.NpzFile):
+        raise _ArrayError('is a single array, not an npz file of named arrays')
+    with content:
+        if missing := [name for name in LAYOUT if name not in content.files]:
+            hint = (' (this is a query file: map from an observation file)'
+                    if 'similarities' in content.files else '')
+            raise _ArrayError(f'array {missing[0]} is missing{hint}')
+        return {name: _read_array(content, name) for name in LAYOUT}
+
+
+def _read_array(content: Any, name: str) -> NDArray[Any]:
+    try:
+        array = np.asarray(content[name])
+        return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
+    except Exception as error:  # whatever numpy and zipfile meet in a broken file
+        raise _ArrayError(f'array {name} cannot be read: {error}; record the observations again'
+                          ) from error
+
+
+def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
+    sizes: dict[object, int] = {}
+    for letter, name in (('F', 'timestamps'), ('n', 'boxes_xyxy')):
+        if arrays[name].ndim == 0:
+            raise _ArrayError(f'array {name} is a single value')
+        sizes[letter] = len(arrays[name])
+    sizes['F+1'] = sizes['F'] + 1
+    for name, (letters, kinds) in LAYOUT.items():
+        array, shape = arrays[name], tuple(sizes.get(letter, letter) for letter in letters)
+        if array.shape != shape:
+            raise _ArrayError(f'array {name} has shape {array.shape}, expected {shape}')
+        if array.dtype.kind not in kinds:
+            raise _ArrayError(f'array {name} has type {array.dtype}, expected '
+                              f'{_KIND_NAMES[kinds]}')
+    if sizes['F'] == 0:
+        raise _ArrayError('holds no frames')
+
+
+def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
+    for name, (_, kinds) in LAYOUT.items():
+        if kinds == 'fiu':
+            rows = arrays[name].reshape(len(arrays[name]), -1)
+            _refuse(name, 'is not finite', ~np.isfinite(rows).all(axis=1))
+    offsets = arrays['frame_offsets'].astype(np.int64)
+    boxes, scores = arrays['boxes_xyxy'], arrays['scores']
+    if offsets[0] != 0 or offsets[-1] != len(boxes):
+        raise _ArrayError(f'array frame_offsets goes from {offsets[0]} to {offsets[-1]}, expected '
+                          f'0 to {len(boxes)}, the number of boxes')
+    _refuse('frame_offsets', 'decreases', np.diff(offsets, prepend=0) < 0)
+    _refuse('boxes_xyxy', 'is not left, top, right, bottom',
+            (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
+    _refuse('scores', 'is outside 0 to 1', (scores < 0) | (scores > 1))
+    poses = arrays['map_from_camera']
+    rotations = poses[:, :3, :3]
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    _refuse('map_from_camera', 'is no rigid transform',
+            (error > _MAX_ROTATION_ERROR) | (np.linalg.det(rotations) < 0)
+            | (poses[:, 3] != [0, 0, 0, 1]).any(axis=1))
+
+
+def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
+    if is_wrong.any():
+        raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
+
+
+def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
+    width, height = map(int, arrays['image_size'])
+    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
+    names, classes = np.unique(arrays['class_ids'], return_inverse=True)
+    detections = PosedDetections(
+        camera=Camera(width, height, fx, fy, cx, cy),
+        map_from_camera=arrays['map_from_camera'].astype(np.float64),
+        stamps_s=arrays['timestamps'].astype(np.float64),
+        frame_offsets=arrays['frame_offsets'].astype(np.int64),
+        bboxes_xyxy=arrays['boxes_xyxy'].astype(np.float64),
+        class_names=tuple(str(name) for name in names),
+        classes=classes.astype(np.int64).reshape(-1),
+        scores=arrays['scores'].astype(np.float64))
+    order = np.argsort(detections.stamps_s, kind='stable')
+    if (order == np.arange(len(order))).all():
+        return detections
+    return detections.select_frames(order)
