@@ -215,7 +215,7 @@ class NodeParameters:
 
 
 def markdown_table(table: Iterable[ParameterRow]) -> str:
-    """Return a table of parameters in Markdown, as it stands in the README."""
+    """Return a table of parameters in Markdown, as in doc/parameters.md."""
     lines = ['| parameter | default | unit | allowed | at run time | what it does |',
              '|---|---|---|---|---|---|']
     lines += [f'| `{row.name}` | `{_yaml_value(row.default)}` | {row.unit} | {row.allowed} | '
