@@ -6,7 +6,7 @@ import yaml
 from scene import make_room, write_map
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.node.map_parameters import load_map
+from cliploc_ros.ros.map_parameters import load_map
 
 CUP = {'label': 'a red cup', 'class_id': 'cup', 'center': [1.0, 2.0, 3.0],
        'semi_axes': [0.1, 0.2, 0.3], 'orientation': [0.0, 0.0, 0.0, 1.0]}

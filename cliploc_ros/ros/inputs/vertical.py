@@ -5,8 +5,7 @@
 import math
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,29 +78,20 @@ class VerticalSource:
         self._lock = threading.Lock()
         self._samples: deque[Sample] = deque(maxlen=_MAX_SAMPLES)
         self._imu_frame = ''
-        self._listeners = 0
         self._subscription: AdaptiveSubscription | None = None
 
-    @contextmanager
-    def listening(self, source: str) -> Iterator[None]:
-        """Listen to the IMU for the length of a with statement, where that is the source."""
-        if source != 'imu':
-            yield
-            return
+    def open(self, source: str) -> None:
+        """Subscribe to the IMU where it is the source."""
+        if source == 'imu':
+            self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take, qos.IMU)
+
+    def close(self) -> None:
+        """Unsubscribe, and forget what was heard."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
         with self._lock:
-            self._listeners += 1
-            if self._subscription is None:
-                self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take,
-                                                          qos.IMU)
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._listeners -= 1
-                if self._listeners == 0:
-                    self._subscription.destroy()
-                    self._subscription = None
-                    self._samples.clear()
+            self._samples.clear()
 
     def take(self, msg: Imu) -> None:
         """Take a message of the IMU in."""

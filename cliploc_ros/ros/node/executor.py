@@ -13,7 +13,7 @@ from rclpy.service import Service
 from rclpy.task import Task
 from rclpy.timer import Timer
 
-from cliploc_ros.ros.node.requests import MAX_REQUESTS
+from cliploc_ros.ros.node.callback_group import MAX_REQUESTS
 
 # For the requests that may wait, for transitions, parameters, timers and the rest. Threads are
 # made when they are first needed.

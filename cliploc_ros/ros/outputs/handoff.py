@@ -61,7 +61,8 @@ class HandOff:
         """Let go a hand-off that is under way."""
         self._stopped.set()
 
-    def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any]) -> None:
+    def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
+                  deadline: float) -> None:
         """Publish a pose on `initialpose`, and return when the localizer had time to settle.
 
         Parameters
@@ -102,7 +103,7 @@ class HandOff:
             raise HandOffError(f'{self._odometry.topic} has a publisher that says nothing, so the '
                                'robot may be moving: initialpose is withheld')
         # np.maximum passes NaN on, which no limit allows
-        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), self._odometry.speeds_by_poses())
+        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), self._odometry.speeds_by_poses(2.0))
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                'rad/s: initialpose is withheld, ask again when it stands')
