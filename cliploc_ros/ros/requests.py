@@ -18,6 +18,8 @@ from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
 
 # Every frame that odometry does not link is another chance of a false accept.
 _MAX_UNLINKED = 3
+# An earlier request ends at its own deadline, shortly before those that wait for it.
+_GRACE_S = 0.2
 
 
 class _Look(NamedTuple):
@@ -58,7 +60,7 @@ class Requests:
         """Return the answer to a request that arrives now, within timeout_s."""
         arrived_at = time.monotonic()
         deadline = arrived_at + self._node.settings['timeout_s']
-        if not self._turn.acquire(timeout=deadline - arrived_at):
+        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
             return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
         try:
             if self._previous.received_at <= arrived_at:
@@ -105,7 +107,7 @@ class Requests:
         if answer.pose is not None:
             answer = self._handed_over(answer, deadline)
         return _Look(answer, answer.pose is None
-                     and self._robot.is_linked_soon(frame.image.header.stamp))
+                     and self._robot.is_linked_soon(frame.image.header.stamp, deadline))
 
     def _handed_over(self, answer: Answer, deadline: float) -> Answer:
         try:

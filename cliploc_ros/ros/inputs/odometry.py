@@ -27,8 +27,6 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of the poses would look like a speed.
 _MOMENT_NS = 300_000_000
-# Time for a publisher that has just been discovered to deliver its first message.
-_DISCOVERY_S = 1.0
 
 
 class BodyPose(NamedTuple):
@@ -144,12 +142,15 @@ class OdometrySource:
         except NoOdometryError:
             return None
 
-    def covers_soon(self, stamp: Time) -> bool:
-        """Return whether odometry covers about the time of an image, and so of the next."""
+    def covers_soon(self, stamp: Time, patience_s: float) -> bool:
+        """Return whether odometry covers about the time of an image, and so of the next.
+
+        A publisher that has just been discovered may take `patience_s` for its first message.
+        """
         at_ns = stamp_ns(stamp)
         with self._heard:
             if self.is_published:
-                self._heard.wait_for(lambda: len(self._window), _DISCOVERY_S)
+                self._heard.wait_for(lambda: len(self._window), patience_s)
             return self._window.spans(at_ns, _NEARLY_NS)
 
     def pose_at(self, stamp: Time) -> BodyPose:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the robot knows besides its image: the camera's mount, the vertical and odometry."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,8 @@ from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _LOG_PERIOD_S = 5.0
+# Time for a publisher of odometry that has just been discovered to deliver its first message.
+_DISCOVERY_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,19 @@ class RobotStateSource:
         self._vertical.close()
         self._node.worker.submit(self.base.forget)  # after a search that may be under way
 
-    def is_linked_soon(self, stamp: Time) -> bool:
-        """Return whether odometry can link the frame that follows an image."""
-        return self._node.settings['fuse_frames'] > 1 and self.odometry.covers_soon(stamp)
+    def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
+        """Return whether odometry can link the frame that follows an image.
+
+        Parameters
+        ----------
+        stamp : Time
+            Of the image.
+        deadline : float
+            When to stop waiting for odometry that has just begun (monotonic clock) [s].
+        """
+        patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
+        return (self._node.settings['fuse_frames'] > 1
+                and self.odometry.covers_soon(stamp, patience_s))
 
     def at(self, image: Header, values: Mapping[str, Any]) -> RobotState:
         """Return the robot's state at the stamp of an image.
