@@ -22,10 +22,11 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.odometry import CameraPlace, OdometrySource
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.lingering import Lingering
 from cliploc_ros.ros.localizer import Localizer, load_localizer
@@ -34,9 +35,9 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.node.worker import LatestOnly
-from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
-from cliploc_ros.ros.outputs.map_to_odom import OdomFrame
+from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
 from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
@@ -66,17 +67,18 @@ class RelocalizerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__('relocalizer', RELOCALIZER, relocalizer_options)
         self._localizer: Localizer | None = None
-        self._base = BaseFrame(self)
-        self._vertical = VerticalSource(self, self._base)
+        self._transforms = CoordinateFrames(self)
+        self._vertical = VerticalSource(self, self._transforms)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
-        self._odom_frame = OdomFrame(self, self._base)
-        self._odometry = OdometrySource(self, self._base)
+        self._map_to_odom = MapToOdom(self, self._transforms)
+        self._odometry = OdometrySource(self, self._transforms)
         self._handoff = HandOff(self, self._odometry)
         self._visualization = Visualization(self)
         self._continuous = LatestOnly(self.worker, self._localize_and_log)
         self._frames: FrameSource | None = None
         self._listening = ExitStack()
         self._lingering = Lingering(self)
+        self._jumps = TimeJumps(self, self._forget)
         self._verdict = 'none yet'
         self._verdicts = dict.fromkeys((*_VERDICTS, 'failed'), 0)
         self._flights: Flights[Answer] = Flights(self._wake_up)
@@ -105,9 +107,10 @@ class RelocalizerNode(ManagedNode):
         self._lingering.open()
         if self.settings['publish_tf'] or (self.settings['base_frame']
                                            and not any(self.settings['base_from_camera'])):
-            self.worker.run(self._base.listen)
+            self.worker.run(self._transforms.open)
         if self.settings['publish_tf']:
-            self._odom_frame.open()
+            self._map_to_odom.open()
+        self._vertical.open(self.settings['gravity'])
         self._frames = FrameSource(self, self.settings['image_transport'], self._on_frame)
         if (re.search('[/_]rect', self._frames.image_topic)
                 and not self.settings['rectified']):
@@ -120,12 +123,20 @@ class RelocalizerNode(ManagedNode):
     def close(self) -> None:
         """Let go the request that waits for frames, and stop to listen."""
         self._handoff.stop()
-        self._odom_frame.close()
+        self._map_to_odom.close()
+        self._vertical.close()
         if self._frames is not None:
             self._frames.stop('the node was deactivated')
         self._listening.close()
         self._lingering.close()
-        self.worker.submit(self._base.forget)  # after a search that may be under way
+        self.worker.submit(self._transforms.close)  # after a search that may be under way
+
+    def _forget(self) -> None:
+        """Forget all input: time jumped."""
+        for part in (self._frames, self._transforms, self._odometry, self._vertical,
+                     self._map_to_odom, self._handoff):
+            if part is not None:
+                part.forget()
 
     def release(self) -> None:
         """Let go the request that waits for frames: the process ends."""
@@ -185,7 +196,6 @@ class RelocalizerNode(ManagedNode):
 
     def _listen(self, listening: ExitStack, frames: FrameSource) -> None:
         """Listen to all that an answer is made from; frames are the last to begin."""
-        listening.enter_context(self._vertical.listening(self.settings['gravity']))
         listening.enter_context(self._odometry.listening())
         listening.enter_context(frames.listening())
 
@@ -195,6 +205,7 @@ class RelocalizerNode(ManagedNode):
         Called once for all requests that wait at the same time: those that come after depart
         ask for a frame newer than this one.
         """
+        deadline = time.monotonic() + timeout_s
         try:
             # A map or weights that were missing may have been mended since.
             self.bring_up()
@@ -203,12 +214,15 @@ class RelocalizerNode(ManagedNode):
                 self._listen(listening, self._frames)
                 frame = self._frames.wait_for_fresh(timeout_s)
                 depart()
-                answer = self._handed_over(self.worker.run(lambda: self._localize(frame)))
+                answer = self._handed_over(self.worker.run(lambda: self._localize(frame)),
+                                           deadline)
                 if answer.is_open:
                     answer = replace(answer, is_open=self._odometry.follows(
                         frame.image.header.stamp))
-        except NoFrameError as error:
+        except (NoFrameError, TimeJumpError) as error:
             answer = Answer(None, str(error), has_frame=False)
+        except NoTransformError as error:
+            answer = Answer(None, str(error), has_frame=not self._jumps.is_settling)
         except CliplocError as error:
             answer = Answer(None, str(error))
         except Exception as error:
@@ -221,12 +235,12 @@ class RelocalizerNode(ManagedNode):
             self.get_logger().info(answer.message)
         return answer
 
-    def _handed_over(self, answer: Answer) -> Answer:
+    def _handed_over(self, answer: Answer, deadline: float) -> Answer:
         """Tell a running localizer of an accepted pose; who waits learns if that cannot be."""
         if answer.pose is None:
             return answer
         try:
-            self._handoff.hand_over(answer.pose, self.settings.snapshot())
+            self._handoff.hand_over(answer.pose, self.settings.snapshot(), deadline)
         except HandOffError as error:
             return Answer(None, f'withheld: {error} ({answer.message})',
                           is_open=self.settings['fuse_frames'] > 1)
@@ -264,29 +278,32 @@ class RelocalizerNode(ManagedNode):
         """Localize from one frame and publish what was found; in the worker's thread."""
         values: Mapping[str, Any] = self.settings.snapshot()
         self.check_active()
+        self._jumps.check(frame.image.header.stamp, frame.received_at)
         localizer = self._localizer
         assert localizer is not None  # an active node has one
         header = Header(stamp=frame.image.header.stamp, frame_id=localizer.map_frame)
-        camera_from_base = self._base.camera_from_base(
+        camera_from_base = self._transforms.camera_from_base(
             values['base_frame'], values['base_from_camera'], frame.image.header.frame_id,
             header.stamp, values['tf_timeout_s'])
-        views: list[View] | None = [] if self._visualization.wants_view else None
+        views: list[SeenImage] | None = [] if self._visualization.wants_debug_image else None
         place = self._place(frame, values, camera_from_base)
         found, times = localizer.localize(
             frame, values, self._up_in_camera(frame, values, camera_from_base), views, place)
         self.stages.add(times.ms)
         self.check_active()
+        self._jumps.check(frame.image.header.stamp, frame.received_at)
         self._visualization.show(header, localizer.landmark_map, found, camera_from_base)
-        answer = replace(self._answer(header, found, times, camera_from_base),
+        answer = replace(self._answer(header, found, times, camera_from_base,
+                                      frame.received_at),
                          is_alone=place is None and not found.accepted)
         for view in views or []:  # who waits for the answer does not wait for its picture
             self.worker.submit(partial(
-                self._visualization.show_view, frame.image.header, view, localizer.landmark_map,
-                found, answer.message))
+                self._visualization.show_debug_image, frame.image.header, view,
+                localizer.landmark_map, found, answer.message))
         return answer
 
     def _answer(self, header: Header, found: Relocalization, times: StageTimes,
-                camera_from_base: NDArray[np.float64]) -> Answer:
+                camera_from_base: NDArray[np.float64], received_at: float) -> Answer:
         """Publish what was found if it is accepted, and say it in a line."""
         if not found.accepted:
             return Answer(None, f'refused: {found.reason} [{_summary(found)}; {times}]',
@@ -298,8 +315,9 @@ class RelocalizerNode(ManagedNode):
             found.covariance, map_from_base[:3, 3] - map_from_camera[:3, 3]))
         self._pose.publish(pose)
         try:
-            self._odom_frame.update(header, map_from_base, self.settings.snapshot())
-        except FrameError as error:
+            self._map_to_odom.update(header, map_from_base, self.settings.snapshot(),
+                                     received_at)
+        except NoTransformError as error:
             self.get_logger().warning(f'publish_tf: {error}', throttle_duration_sec=_LOG_PERIOD_S)
         x, y, z = map_from_base[:3, 3]
         return Answer(pose, f'accepted: x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
@@ -312,7 +330,7 @@ class RelocalizerNode(ManagedNode):
         try:
             return self._vertical.up_in_camera(values, camera_from_base, header.frame_id,
                                                header.stamp)
-        except (NoVerticalError, FrameError) as error:
+        except (NoVerticalError, NoTransformError) as error:
             self.get_logger().warning(f'localizing without a vertical: {error}',
                                       throttle_duration_sec=_LOG_PERIOD_S)
             return None
@@ -328,7 +346,7 @@ class RelocalizerNode(ManagedNode):
                                                header.stamp)
         except NoOdometryError as error:
             self.get_logger().debug(f'one frame alone: {error}')
-        except FrameError as error:
+        except NoTransformError as error:
             self.get_logger().warning(f'one frame alone: {error}',
                                       throttle_duration_sec=_LOG_PERIOD_S)
         return None

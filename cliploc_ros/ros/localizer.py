@@ -28,7 +28,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.odometry import CameraPlace
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.map_parameters import load_map
-from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
 
 
@@ -92,7 +92,7 @@ class Localizer:
 
     def localize(self, frame: Frame, values: Mapping[str, Any],
                  up_in_camera: NDArray[np.float64] | None = None,
-                 views: list[View] | None = None, place: CameraPlace | None = None
+                 views: list[SeenImage] | None = None, place: CameraPlace | None = None
                  ) -> tuple[Relocalization, StageTimes]:
         """Find where the camera was, by a frame and those before that odometry joins to it.
 
@@ -103,7 +103,7 @@ class Localizer:
             Of the relocalizer's parameters, as they are now.
         up_in_camera : ndarray (3,) or None
             The vertical, where it is known.
-        views : list of View or None
+        views : list of SeenImage or None
             Takes what was seen, for pictures of it.
         place : CameraPlace or None
             Where odometry has the camera; None: the frame is asked about alone.
@@ -127,7 +127,7 @@ class Localizer:
             else self._observer.observe(image, camera, detections, stamp)
         times.mark('CLIP')
         if views is not None:
-            views.append(View(image, observation))
+            views.append(SeenImage(image, observation))
         found = self._relocalize(replace(observation, up_in_camera=up_in_camera), place, values)
         times.mark('search')
         return found, times

@@ -134,6 +134,12 @@ class FrameSource:
             self._stopped = reason
             self._changed.notify_all()
 
+    def forget(self) -> None:
+        """Forget all messages: time jumped."""
+        with self._changed:
+            self._pairing.clear()
+            self._newest = None
+
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Say what is missing of the input, how often it comes, and what waits or was lost."""
         now = time.monotonic()

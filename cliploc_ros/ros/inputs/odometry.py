@@ -18,7 +18,7 @@ from rclpy.node import Node
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError, OdometryWindow
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 
@@ -57,11 +57,11 @@ class OdometrySource:
     Parameters
     ----------
     node : Node
-    base : BaseFrame
+    base : CoordinateFrames
         Knows how the camera is mounted.
     """
 
-    def __init__(self, node: Node, base: BaseFrame) -> None:
+    def __init__(self, node: Node, base: CoordinateFrames) -> None:
         self._node = node
         self._base = base
         self._heard = threading.Condition()
@@ -102,6 +102,12 @@ class OdometrySource:
                     self._newest = None
                     self._window.clear()
 
+    def forget(self) -> None:
+        """Forget all messages: time jumped."""
+        with self._heard:
+            self._newest = None
+            self._window.clear()
+
     def take(self, msg: Odometry) -> None:
         """Take a message in."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
@@ -128,14 +134,15 @@ class OdometrySource:
                 self._heard.wait_for(is_recent, patience_s)
             return self._newest if is_recent() else None
 
-    def speeds_by_poses(self) -> tuple[float, float]:
+    def speeds_by_poses(self, patience_s: float = _MOMENT_PATIENCE_S) -> tuple[float, float]:
         """Return how fast the poses of the last moment drove [m/s] and turned [rad/s].
 
         Many sources of poses leave the twist empty. Where poses do not tell, it is 0; what has
         just begun is waited for.
         """
         with self._heard:
-            self._heard.wait_for(lambda: self._last_moment() is not None, _MOMENT_PATIENCE_S)
+            self._heard.wait_for(lambda: self._last_moment() is not None,
+                                 min(patience_s, _MOMENT_PATIENCE_S))
             moment = self._last_moment()
         if moment is None:
             return 0.0, 0.0
@@ -180,8 +187,8 @@ class OdometrySource:
         ------
         NoOdometryError
             Odometry says nothing of that time.
-        FrameError
-            Nobody says how the camera is mounted on what odometry tells of.
+        NoTransformError
+            How the camera is mounted on the body of odometry is unknown.
         """
         at_ns = stamp_ns(stamp)
         with self._heard:
