@@ -19,6 +19,7 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
@@ -35,7 +36,7 @@ class Answering(ManagedNode):
                                              received_at=frame.received_at)
         self.robot = RobotStateSource(self)
         self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
-        self.requests = Requests(self, self.frames, self.robot,
+        self.requests = Requests(self, self.frames, self.robot, TimeJumps(self, lambda: None),
                                  lambda frame: self.localize(frame),
                                  HandOff(self, self.robot.odometry))
 
