@@ -13,6 +13,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -33,14 +34,15 @@ class RelocalizerNode(ManagedNode):
         super().__init__('relocalizer', RELOCALIZER, relocalizer_options)
         continuous = self.settings['mode'] == 'continuous'
         self._robot = RobotStateSource(self)
-        self._pipeline = Pipeline(self, self._robot)
+        self._jumps = TimeJumps(self, self._forget)
+        self._pipeline = Pipeline(self, self._robot, self._jumps)
         self._newest = LatestOnly(self.worker, self._localize_and_log)
         self._frames = FrameSource(self, self.settings['image_transport'],
                                    math.inf if continuous else LINGER_S,
                                    self._newest.offer if continuous else lambda frame: None)
         self._handoff = HandOff(self, self._robot.odometry)
-        self._requests = Requests(self, self._frames, self._robot, self._pipeline.localize,
-                                  self._handoff)
+        self._requests = Requests(self, self._frames, self._robot, self._jumps,
+                                  self._pipeline.localize, self._handoff)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
         group = BoundedCallbackGroup(MAX_REQUESTS)
@@ -82,6 +84,11 @@ class RelocalizerNode(ManagedNode):
         """Release the request that waits for frames: the process ends."""
         self._handoff.stop()
         self._frames.close('the node is shutting down')
+
+    def _forget(self) -> None:
+        """Forget all input: time jumped."""
+        for part in (self._frames, self._robot, self._pipeline, self._handoff):
+            part.forget()
 
     def examine(self, health: Health) -> None:
         """Report the inputs, the last verdict and the device."""

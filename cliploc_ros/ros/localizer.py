@@ -26,7 +26,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
 from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
 
 
@@ -34,7 +34,7 @@ class Localized(NamedTuple):
     """The result of one frame, what was seen in it, and how long each stage took."""
 
     found: Relocalization
-    view: View
+    seen: SeenImage
     times: StageTimes
 
 
@@ -128,7 +128,7 @@ class Localizer:
         found = self._relocalize(replace(observation, up_in_camera=state.up_in_camera),
                                  state.place, values)
         times.mark('search')
-        return Localized(found, View(image, observation), times)
+        return Localized(found, SeenImage(image, observation), times)
 
     def _relocalize(self, observation: Observation, place: CameraPlace | None,
                     values: Mapping[str, Any]) -> Relocalization:

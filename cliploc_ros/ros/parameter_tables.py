@@ -114,9 +114,11 @@ RELOCALIZER = (
                  'robot.', unit='m/s', low=0.0, high=100.0),
     ParameterRow('max_turn_rad_s', 0.2, 'No initialpose is published while odom tells of a faster '
                  'turn.', unit='rad/s', low=0.0, high=100.0),
-    ParameterRow('nomotion_updates', 5, 'How often request_nomotion_update is called after an '
+    ParameterRow('nomotion_updates', 10, 'How often request_nomotion_update is called after an '
                  'initialpose, where AMCL serves it, so that a standing robot converges.',
                  low=0, high=100),
+    ParameterRow('require_localizer', True, 'A request succeeds only if a localizer such as AMCL '
+                 'subscribes initialpose; false: ~/pose or publish_tf is all that is wanted.'),
     ParameterRow('publish_tf', False, 'Broadcast the transform from odom_frame to the map (REP '
                  '105) after each accepted pose; only if no other localizer does.',
                  read_only=True),

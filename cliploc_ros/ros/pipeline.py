@@ -12,12 +12,13 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
-from cliploc_ros.ros.inputs.coordinate_frames import FrameError
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.localizer import Localized, Localizer, load_localizer
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
-from cliploc_ros.ros.outputs.map_to_odom import OdomFrame
+from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
 
 _LOG_PERIOD_S = 5.0
@@ -32,14 +33,16 @@ class Pipeline:
     ----------
     node : ManagedNode
     robot : RobotStateSource
+    jumps : TimeJumps
     """
 
-    def __init__(self, node: ManagedNode, robot: RobotStateSource) -> None:
+    def __init__(self, node: ManagedNode, robot: RobotStateSource, jumps: TimeJumps) -> None:
         self._node = node
+        self._jumps = jumps
         self._robot = robot
         self.localizer: Localizer | None = None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
-        self._map_to_odom = OdomFrame(node, robot.base)
+        self._map_to_odom = MapToOdom(node, robot.transforms)
         self._visualization = Visualization(node)
 
     def load(self) -> str:
@@ -66,11 +69,17 @@ class Pipeline:
         """Stop broadcasting."""
         self._map_to_odom.close()
 
+    def forget(self) -> None:
+        """Drop map -> odom until the next accepted pose: time jumped."""
+        self._map_to_odom.forget()
+
     def localize(self, frame: Frame) -> Answer:
         """Localize with one frame and publish what was found.
 
         Raises
         ------
+        TimeJumpError
+            Time jumped back since the frame arrived; nothing was published.
         CliplocError
             Names what to fix in the frame or in the parameters.
         """
@@ -79,10 +88,12 @@ class Pipeline:
         localizer = self.localizer
         assert localizer is not None  # an active node has one
         image = frame.image.header
+        self._jumps.check(image.stamp, frame.received_at)
         state = self._robot.at(image, values)
         localized = localizer.localize(frame, values, state)
         self._node.stages.add(localized.times.ms)
         self._node.check_active()
+        self._jumps.check(image.stamp, frame.received_at)
         header = Header(stamp=image.stamp, frame_id=localizer.map_frame)
         answer = self._answer(header, localized, state, frame.received_at)
         self._show(image, header, localizer, localized, state, answer)
@@ -107,8 +118,9 @@ class Pipeline:
             found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
         self._pose.publish(pose)
         try:
-            self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot())
-        except FrameError as error:
+            self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
+                                     received_at)
+        except NoTransformError as error:
             self._node.get_logger().warning(f'publish_tf: {error}',
                                             throttle_duration_sec=_LOG_PERIOD_S)
         x, y, z = map_from_base[:3, 3]
@@ -120,10 +132,10 @@ class Pipeline:
         """Publish hypotheses and matches, and queue the debug image behind the answer."""
         self._visualization.show(header, localizer.landmark_map, localized.found,
                                  state.camera_from_base)
-        if self._visualization.wants_view:
+        if self._visualization.wants_debug_image:
             self._node.worker.submit(partial(
-                self._visualization.show_view, image, localized.view, localizer.landmark_map,
-                localized.found, answer.message))
+                self._visualization.show_debug_image, image, localized.seen,
+                localizer.landmark_map, localized.found, answer.message))
 
 
 def _summary(found: Relocalization) -> str:

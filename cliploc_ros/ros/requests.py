@@ -11,13 +11,17 @@ from typing import NamedTuple
 
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
 
 # Every frame that odometry does not link is another chance of a false accept.
 _MAX_UNLINKED = 3
+# An earlier request ends at its own deadline, shortly before those that wait for it.
+_GRACE_S = 0.2
 
 
 class _Look(NamedTuple):
@@ -39,16 +43,19 @@ class Requests:
     node : ManagedNode
     frames : FrameSource
     robot : RobotStateSource
+    jumps : TimeJumps
     localize : callable
         Takes a frame and returns its Answer; called in the worker's thread.
     handoff : HandOff
     """
 
     def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
-                 localize: Callable[[Frame], Answer], handoff: HandOff) -> None:
+                 jumps: TimeJumps, localize: Callable[[Frame], Answer], handoff: HandOff
+                 ) -> None:
         self._node = node
         self._frames = frames
         self._robot = robot
+        self._jumps = jumps
         self._localize = localize
         self._handoff = handoff
         self._turn = threading.Lock()
@@ -58,7 +65,7 @@ class Requests:
         """Return the answer to a request that arrives now, within timeout_s."""
         arrived_at = time.monotonic()
         deadline = arrived_at + self._node.settings['timeout_s']
-        if not self._turn.acquire(timeout=deadline - arrived_at):
+        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
             return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
         try:
             if self._previous.received_at <= arrived_at:
@@ -84,12 +91,12 @@ class Requests:
 
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
         """Look at one frame after another while another frame can change the answer."""
-        look, looks = self._look(arrived_at, deadline), 1
+        look, looks = self._look_past_jumps(arrived_at, deadline), 1
         unlinked = int(not look.answer.is_linked)
         while look.may_go_on and unlinked < _MAX_UNLINKED:
             try:
-                look = self._look(time.monotonic(), deadline)
-            except (NoFrameError, TimeUpError):
+                look = self._look_past_jumps(time.monotonic(), deadline)
+            except (NoFrameError, TimeUpError, TimeJumpError):
                 break
             looks += 1
             unlinked += not look.answer.is_linked
@@ -105,7 +112,21 @@ class Requests:
         if answer.pose is not None:
             answer = self._handed_over(answer, deadline)
         return _Look(answer, answer.pose is None
-                     and self._robot.is_linked_soon(frame.image.header.stamp))
+                     and self._robot.is_linked_soon(frame.image.header.stamp, deadline))
+
+    def _look_past_jumps(self, after: float, deadline: float) -> _Look:
+        """Look at the next frame, and again after each jump in time until the deadline."""
+        jump: CliplocError | None = None
+        while True:
+            try:
+                return self._look(after, deadline)
+            except NoFrameError as error:
+                raise jump or error from error
+            except (TimeJumpError, NoTransformError) as error:
+                # right after a jump, transforms may be missing
+                if isinstance(error, NoTransformError) and not self._jumps.is_settling:
+                    raise
+                jump, after = error, time.monotonic()
 
     def _handed_over(self, answer: Answer, deadline: float) -> Answer:
         try:

@@ -27,8 +27,8 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of the poses would look like a speed.
 _MOMENT_NS = 300_000_000
-# Time for a publisher that has just been discovered to deliver its first message.
-_DISCOVERY_S = 1.0
+# A late answer is better than taking a moving robot on a busy machine for one at rest.
+_MOMENT_PATIENCE_S = 2.0
 
 
 class BodyPose(NamedTuple):
@@ -123,10 +123,11 @@ class OdometrySource:
         """Return speed [m/s] and turn rate [rad/s] over the last 0.3 s of poses.
 
         Many sources of poses leave the twist empty. Odometry that has just begun may take
-        `patience_s` to cover that time; 0 where it does not.
+        `patience_s`, at most 2 s, to cover that time; 0 where it does not.
         """
         with self._heard:
-            self._heard.wait_for(lambda: self._last_moment() is not None, patience_s)
+            self._heard.wait_for(lambda: self._last_moment() is not None,
+                                 min(patience_s, _MOMENT_PATIENCE_S))
             moment = self._last_moment()
         if moment is None:
             return 0.0, 0.0
@@ -144,12 +145,15 @@ class OdometrySource:
         except NoOdometryError:
             return None
 
-    def covers_soon(self, stamp: Time) -> bool:
-        """Return whether odometry covers about the time of an image, and so of the next."""
+    def covers_soon(self, stamp: Time, patience_s: float) -> bool:
+        """Return whether odometry covers about the time of an image, and so of the next.
+
+        A publisher that has just been discovered may take `patience_s` for its first message.
+        """
         at_ns = stamp_ns(stamp)
         with self._heard:
             if self.is_published:
-                self._heard.wait_for(lambda: len(self._window), _DISCOVERY_S)
+                self._heard.wait_for(lambda: len(self._window), patience_s)
             return self._window.spans(at_ns, _NEARLY_NS)
 
     def pose_at(self, stamp: Time) -> BodyPose:

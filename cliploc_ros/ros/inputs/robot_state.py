@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the robot knows besides its image: the camera's mount, the vertical and odometry."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,13 +13,15 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _LOG_PERIOD_S = 5.0
+# Time for a publisher of odometry that has just been discovered to deliver its first message.
+_DISCOVERY_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,9 @@ class RobotStateSource:
 
     def __init__(self, node: ManagedNode) -> None:
         self._node = node
-        self.base = BaseFrame(node)
+        self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
-        self._vertical = VerticalSource(node, self.base)
+        self._vertical = VerticalSource(node, self.transforms)
         self._unmounted = ''
 
     def open(self) -> None:
@@ -75,7 +78,7 @@ class RobotStateSource:
         values = self._node.settings
         if values['publish_tf'] or (values['base_frame'] and not any(values['base_from_camera'])):
             # in the worker, for importing tf2 takes a while
-            self._node.worker.run(self.base.listen)
+            self._node.worker.run(self.transforms.open)
         self._vertical.open(values['gravity'])
         self.odometry.open()
 
@@ -83,11 +86,27 @@ class RobotStateSource:
         """Unsubscribe."""
         self.odometry.close()
         self._vertical.close()
-        self._node.worker.submit(self.base.forget)  # after a search that may be under way
+        self._node.worker.submit(self.transforms.close)  # after a search that may be under way
 
-    def is_linked_soon(self, stamp: Time) -> bool:
-        """Return whether odometry can link the frame that follows an image."""
-        return self._node.settings['fuse_frames'] > 1 and self.odometry.covers_soon(stamp)
+    def forget(self) -> None:
+        """Forget what was heard: time jumped."""
+        self.transforms.forget()
+        self._vertical.forget()
+        self.odometry.forget()
+
+    def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
+        """Return whether odometry can link the frame that follows an image.
+
+        Parameters
+        ----------
+        stamp : Time
+            Of the image.
+        deadline : float
+            When to stop waiting for odometry that has just begun (monotonic clock) [s].
+        """
+        patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
+        return (self._node.settings['fuse_frames'] > 1
+                and self.odometry.covers_soon(stamp, patience_s))
 
     def at(self, image: Header, values: Mapping[str, Any]) -> RobotState:
         """Return the robot's state at the stamp of an image.
@@ -103,10 +122,10 @@ class RobotStateSource:
 
         Raises
         ------
-        FrameError
+        NoTransformError
             The mount is not known.
         """
-        camera_from_base = self.base.camera_from_base(
+        camera_from_base = self.transforms.camera_from_base(
             values['base_frame'], values['base_from_camera'], image.frame_id, image.stamp,
             values['tf_timeout_s'])
         return RobotState(camera_from_base, self._up(image, values, camera_from_base),
@@ -117,7 +136,7 @@ class RobotStateSource:
         try:
             return self._vertical.up_in_camera(values, camera_from_base, image.frame_id,
                                                image.stamp)
-        except (NoVerticalError, FrameError) as error:
+        except (NoVerticalError, NoTransformError) as error:
             self._warn(f'localizing without the vertical: {error}')
             return None
 
@@ -134,7 +153,7 @@ class RobotStateSource:
         except NoOdometryError as error:
             self._node.get_logger().debug(f'one frame alone: {error}')
             return None
-        except FrameError as error:
+        except NoTransformError as error:
             self._warn(f'one frame alone: {error}')
             return None
         return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run)
@@ -144,7 +163,7 @@ class RobotStateSource:
         """Ask tf2; do not wait again for what it did not know the last time."""
         known = self._unmounted != body_frame
         self._unmounted = body_frame
-        camera_from_body = self.base.lookup(image.frame_id, body_frame, image.stamp,
+        camera_from_body = self.transforms.lookup(image.frame_id, body_frame, image.stamp,
                                             timeout_s if known else 0.0)
         self._unmounted = ''
         return camera_from_body
