@@ -16,6 +16,9 @@ from cliploc_ros.ros.node.parameters import ParameterRow, Value
 TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 
+# Of timeout_s, for algorithms other than auto.
+_SEARCH_SHARE = 0.5
+
 _AUTOSTART = ParameterRow(
     'autostart', True, 'Configure and activate by itself; false: a lifecycle manager does.',
     read_only=True)
@@ -69,8 +72,8 @@ RELOCALIZER = (
     ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
                  low=0.0, high=1.0),
     ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
-    ParameterRow('time_budget_ms', 50.0, 'Search and refinement of auto take no longer; the other '
-                 'algorithms have timeout_s, and what they are cut short in is refused.',
+    ParameterRow('time_budget_ms', 50.0, 'Search and refinement of auto take no longer. The other '
+                 'algorithms have half of timeout_s; a search that is cut short is refused.',
                  unit='ms', low=1.0, high=3.6e6),
     ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
                  'base_frame, or the topic imu. auto then needs two objects in place of three.',
@@ -146,8 +149,10 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     given: dict[str, Any] = {name: values[name] for name in names}
     budget_ms, timeout_s = values['time_budget_ms'], values['timeout_s']
     assert isinstance(budget_ms, float) and isinstance(timeout_s, float)
-    # what the paper's algorithms are cut short in is refused: they get what a request may take
-    given['time_budget_s'] = budget_ms / 1e3 if values['algorithm'] == 'auto' else timeout_s
+    # A search of the paper's algorithms that is cut short is refused, so they get more time; the
+    # rest of the request waits for frames, runs the networks and hands over.
+    given['time_budget_s'] = budget_ms / 1e3 if values['algorithm'] == 'auto' \
+        else _SEARCH_SHARE * timeout_s
     given['height_range_m'] = _height_range(values['height_range_m'])
     return RelocalizerOptions(**given)
 
