@@ -36,7 +36,7 @@ from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.requests import MAX_REQUESTS, BoundedCallbackGroup, Flights
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.debug_image import SeenImage
-from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
 from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
@@ -243,7 +243,8 @@ class RelocalizerNode(ManagedNode):
             self._handoff.hand_over(answer.pose, self.settings.snapshot(), deadline)
         except HandOffError as error:
             return Answer(None, f'withheld: {error} ({answer.message})',
-                          is_open=self.settings['fuse_frames'] > 1)
+                          is_open=(self.settings['fuse_frames'] > 1
+                                   and not isinstance(error, NoLocalizerError)))
         return answer
 
     def _conclude(self, verdict: str) -> None:

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_to_msg
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 
@@ -44,7 +44,7 @@ def message(seconds, child_frame='base_link', frame='odom'):
 @pytest.fixture
 def source(make_node):
     node = make_node()
-    return OdometrySource(node, BaseFrame(node))
+    return OdometrySource(node, CoordinateFrames(node))
 
 
 def talk(source, *seconds, **frames):

@@ -39,6 +39,10 @@ class HandOffError(CliplocError):
     """The localizer did not get the pose; the message says why."""
 
 
+class NoLocalizerError(HandOffError):
+    """Nobody subscribes `initialpose`: another pose would not help."""
+
+
 class HandOff:
     """Publishes `initialpose` for a robot at rest, and has its localizer settle there.
 
@@ -91,7 +95,9 @@ class HandOff:
         Raises
         ------
         HandOffError
-            The robot moves or may do so, or there is no localizer; nothing was published.
+            The robot moves or may do so; nothing was published.
+        NoLocalizerError
+            Nobody subscribes `initialpose`; nothing was published.
         TimeJumpError
             Time jumped back meanwhile; nothing was published.
         """
@@ -122,8 +128,8 @@ class HandOff:
             self._changed.wait_for(lambda: subscribed() or self._stopped.is_set(),
                                    min(_SUBSCRIBER_PATIENCE_S, _left_s(deadline)))
         if not subscribed():
-            raise HandOffError(f'nobody subscribes {self._publisher.topic_name}: start the '
-                               'localizer (AMCL), or set require_localizer: false')
+            raise NoLocalizerError(f'nobody subscribes {self._publisher.topic_name}: start the '
+                                   'localizer (AMCL), or set require_localizer: false')
 
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""
