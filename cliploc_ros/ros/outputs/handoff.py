@@ -32,7 +32,7 @@ _ODOM_PATIENCE_S = 2.0
 _SUBSCRIBER_PATIENCE_S = 2.0
 # AMCL updates with its next scan; two calls before that count as one. Scans come at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
-_UPDATE_PATIENCE_S = 1.0
+_UPDATE_PATIENCE_S = 2.0
 
 
 class HandOffError(CliplocError):
