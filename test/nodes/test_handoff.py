@@ -55,7 +55,7 @@ def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates
     tester.wait(lambda: tester.count_clients('/request_nomotion_update') == 1, 'the client')
     answer = odom(make_frame(), drive=0.0)
     assert answer.success
-    assert len(updates) == 10
+    assert len(updates) == 10, relocalizer.output()
     gaps_s = [later[0] - earlier[0] for earlier, later in pairwise(updates)]
     assert min(gaps_s) > 0.1, 'a scan lies between them'
     assert len(tester.initial_poses) == 1
