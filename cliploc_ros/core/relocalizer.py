@@ -196,7 +196,8 @@ class Relocalizer:
         coverage = _coverage(frames)
         rivals = likely[~agreeing_poses(poses)[0]]
         return Evidence(
-            its_support.inliers, likely[0], max(rivals, default=0.0), coverage,
+            its_support.inliers, likely[0], min(max(rivals, default=0.0), 1.0 - likely[0]),
+            coverage,
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
             else meetings_of(frames, best, matches),

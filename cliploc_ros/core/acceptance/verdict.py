@@ -9,8 +9,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 
 # A search that tried fewer samples has not looked for rivals: its confidence means nothing.
 _MIN_ITERATIONS = 500
-# Chance that the best pose is wrong although it looks likely, where the search met it only once
-# or never. A guess on the safe side, see missed_rival in this module's Evidence.
+# Chance that a likely pose is wrong where the search hardly met it. A guess on the safe side: of
+# the poses of likelihood .99 that 100 to 1,000 samples (ransac, b-prosac, auto) met once or never,
+# 9 of 813 were wrong on the 258 TUM frames, which also fitted the confidence.
 _MISSED_IS_RIGHT = 0.2
 _LOOK_ABOUT = 'turn the camera to more objects'
 
@@ -27,7 +28,8 @@ class Evidence:
         Probability that it is right, given the hypotheses found, see
         cliploc_ros.core.acceptance.confidence.
     rival : float
-        The same of the likeliest hypothesis that does not agree with it; 0 without one.
+        Probability that the likeliest hypothesis that does not agree with it is right instead; 0
+        without one.
     coverage : float
         Share of its samples that the search tried, 0 to 1.
     tried : int
@@ -57,9 +59,11 @@ class Evidence:
     def found(self) -> float:
         """Return the probability that the search has not missed a better pose.
 
-        A rival with as many inliers is met about as often as the best pose. Of random draws, a
-        search misses it with probability exp(-meetings) (Fischler and Bolles 1981). This holds
-        for ransac. auto and PROSAC try samples in a fixed order, so for them it is an assumption.
+        A rival with as many inliers is met about as often as the best pose. Random draws miss it
+        with probability exp(-meetings) (Fischler and Bolles 1981). That holds for ransac. For
+        auto and PROSAC, whose order is not random, it is an assumption: of the likely poses of
+        auto that it met once or never, 1 of 93 was wrong, of the others 0 of 454 (100, 300 and
+        1,000 samples; same frames as above).
         """
         return 1.0 - _MISSED_IS_RIGHT * math.exp(-self.meetings)
 
