@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cliploc_ros.core.association.candidates import MATCHINGS
-from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
+from cliploc_ros.core.options import ALGORITHMS, MATCHINGS, RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.inputs.vertical import SOURCES

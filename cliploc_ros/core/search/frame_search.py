@@ -38,12 +38,14 @@ _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
 
 
-class Searched(NamedTuple):
-    """A frame, and what the search among its samples found.
+class SearchedFrame(NamedTuple):
+    """A frame and the result of the search among its samples.
 
     Parameters
     ----------
+    observation : Observation
     scene : Scene
+        Of the observation.
     vertical : ndarray (7,)
         See make_rig.
     leaders : Leaders
@@ -55,6 +57,7 @@ class Searched(NamedTuple):
         What was tried; None: all samples of the first candidates, as far as progress reaches.
     """
 
+    observation: Observation
     scene: Scene
     vertical: NDArray[np.float64]
     leaders: Leaders
@@ -79,7 +82,7 @@ class Searched(NamedTuple):
 
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
-                 options: RelocalizerOptions, deadline: float) -> Searched:
+                 options: RelocalizerOptions, deadline: float) -> SearchedFrame:
     """Search one frame.
 
     Parameters
@@ -116,7 +119,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         else:
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
         progress = progress._replace(coverage=progress.coverage * share)
-    return Searched(scene, vertical, leaders, tilted, progress, samples)
+    return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples)
 
 
 def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
