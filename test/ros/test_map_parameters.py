@@ -101,5 +101,5 @@ def test_a_value_beside_its_own_fields_is_named(make_node):
     node = make_node()
     node.declare_parameter('map.frame_id', 'map')
     node.declare_parameter('map.frame_id.name', 'map')
-    with pytest.raises(MapError, match="'frame_id' is a value and holds fields"):
+    with pytest.raises(MapError, match="'frame_id' has both a value and fields"):
         load_map(node, '')
