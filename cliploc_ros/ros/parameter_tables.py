@@ -110,7 +110,7 @@ RELOCALIZER = (
     _STALE_AFTER,
     ParameterRow('rectified', False, 'The image is rectified: use P of camera_info and no '
                  'distortion.'),
-    ParameterRow('base_frame', '', "Coordinate frame to publish the pose of; empty: the camera."),
+    ParameterRow('base_frame', '', 'Coordinate frame to publish the pose of; empty: the camera.'),
     ParameterRow('base_from_camera', [0.0] * 7, 'Mount of the camera on base_frame: x, y, z [m] '
                  'and quaternion x, y, z, w; all zeros: ask tf2.', unit='m'),
     ParameterRow('max_speed_m_s', 0.1, 'Withhold initialpose while odom shows a faster '

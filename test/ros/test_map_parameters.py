@@ -61,7 +61,7 @@ def test_whole_numbers_are_numbers(load):
 
 
 def test_a_node_without_any_map_says_what_to_do(make_node):
-    with pytest.raises(MapError, match=r'set map_file, or give .* with --params-file'):
+    with pytest.raises(MapError, match=r'set map_file, or load a map with --params-file'):
         load_map(make_node(), '')
 
 
