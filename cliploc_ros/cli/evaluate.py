@@ -79,7 +79,7 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("of the paper's methods")
     group.add_argument('--iterations', type=int, default=500, help='(%(default)s)')
-    group.add_argument('--k', type=int, default=3, help='(%(default)s); 0: adaptive')
+    group.add_argument('--k', type=int, default=3, help='(%(default)s)')
     group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
     group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
                        help='cut each search short (never; results then vary)')

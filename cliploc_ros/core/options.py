@@ -5,9 +5,9 @@
 import math
 from dataclasses import dataclass
 
-from cliploc_ros.core.association.candidates import ADAPTIVE, MATCHINGS
 from cliploc_ros.errors import OptionsError
 
+MATCHINGS = ('class', 'clip', 'hybrid')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
 
 
@@ -25,7 +25,7 @@ class RelocalizerOptions:
         repetition, as far as `iterations` and `time_budget_s` reach. In hybrid matching it goes
         on to candidates of equal class when those of CLIP are done.
     k : int
-        Landmarks retrieved for each crop; 0: two to eight, as many as may as well be the best.
+        Landmarks retrieved for each crop, at least 1.
     iterations : int
         Minimal samples drawn, of auto the most that are tried; bf tries them all instead. The
         paper's 500 find the best pose less often, and then not its rivals either.
@@ -83,7 +83,7 @@ class RelocalizerOptions:
         if self.matching == 'class' and 'prosac' in self.algorithm:
             raise OptionsError(f"algorithm '{self.algorithm}' orders candidates by similarity, "
                                "which matching 'class' has none of: use bf or ransac")
-        _check_range('k', self.k, ADAPTIVE, math.inf)
+        _check_range('k', self.k, 1, math.inf)
         _check_range('iterations', self.iterations, 1, 1_000_000)
         _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)
         _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import Support
-from cliploc_ros.core.acceptance.verdict import Match
+from cliploc_ros.core.fit.finalists import Match
 
 
 @dataclass(frozen=True)

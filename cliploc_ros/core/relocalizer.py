@@ -11,25 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import Support, View, confidences, support
-from cliploc_ros.core.acceptance.verdict import Evidence, Match, is_exhaustive, refusal
-from cliploc_ros.core.association.candidates import ADAPTIVE, check_k
-from cliploc_ros.core.association.scene import Workspace, make_scene
+from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
+from cliploc_ros.core.association.candidates import check_k
+from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.fit.finalists import (
     Finalist,
+    Match,
     covariance_of,
     find_finalists,
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
-from cliploc_ros.core.fit.several_frames import (
-    Rig,
-    choose_distinct,
-    make_rig,
-    refine_all,
-    verify_rig,
-)
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import Rig, make_rig
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
@@ -39,11 +35,10 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
 from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.search.frame_search import REFINED, Searched, search_frame
+from cliploc_ros.core.search.leaders import MAX_DISTINCT, Leaders, same_place
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.search import (
-    MAX_DISTINCT,
-    Leaders,
-    same_place,
+from cliploc_ros.core.search.strategies import (
     search_exhaustively,
     search_progressively,
     search_samples,
@@ -75,7 +70,7 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities and options.k != ADAPTIVE:
+        if options.needs_similarities:
             check_k(options.k, len(landmark_map))
         self._map = landmark_map
         landmark_map.prepare()
@@ -100,9 +95,9 @@ class Relocalizer:
         list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
         list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
         rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
-        choose_distinct(rig, np.eye(3)[None], np.zeros((1, 3)), 1, Workspace.allocate(3))
-        refine_all(rig, np.eye(3)[None], np.zeros((1, 3)), Workspace.allocate(3))
-        verify_rig(rig, np.eye(3), np.zeros(3), Workspace.allocate(3))
+        scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
+        choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+        refine_rig(rig, np.eye(3), np.zeros(3))
         same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
         project_ellipsoids(np.eye(4), centers, shapes)
 

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cliploc_ros.core.association.candidates import MATCHINGS
-from cliploc_ros.core.options import ALGORITHMS, RelocalizerOptions
+from cliploc_ros.core.options import ALGORITHMS, MATCHINGS, RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.inputs.vertical import SOURCES
@@ -62,8 +61,7 @@ RELOCALIZER = (
     ParameterRow('algorithm', 'auto', 'How minimal samples are chosen: auto goes through all '
                  "that can be, the likeliest first; bf tries all; the others are the paper's.",
                  choices=ALGORITHMS),
-    ParameterRow('k', 3, 'Landmarks retrieved for each crop; 0: two to eight, as many as may as '
-                 'well be the best.', low=0, high=1000),
+    ParameterRow('k', 3, 'Landmarks retrieved for each crop.', low=1, high=1000),
     ParameterRow('iterations', 10_000, 'The most minimal samples tried for a request.', low=1,
                  high=1_000_000),
     ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',

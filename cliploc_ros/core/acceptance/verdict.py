@@ -14,15 +14,6 @@ _MISSED_IS_RIGHT = 0.2
 
 
 @dataclass(frozen=True)
-class Match:
-    """A detection explained by a landmark: row of the detection, row in the map, IoU."""
-
-    detection: int
-    landmark: int
-    iou: float
-
-
-@dataclass(frozen=True)
 class Evidence:
     """What speaks for the best hypothesis, and what against it.
 
