@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import takewhile
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
@@ -14,6 +13,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
@@ -21,7 +21,6 @@ from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
 )
-from cliploc_ros.ros.frame_window import FrameWindow
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
 from cliploc_ros.ros.map_parameters import load_map
@@ -57,9 +56,8 @@ class Localizer:
         self.device = device
         self._map = landmark_map
         self._observer = observer
-        self._relocalizer = relocalizer
         self._options = options
-        self._window = FrameWindow()
+        self._session = Session(relocalizer)
         relocalizer.warm_up()
 
     @property
@@ -132,27 +130,18 @@ class Localizer:
 
     def _relocalize(self, observation: Observation, place: CameraPlace | None,
                     values: Mapping[str, Any]) -> Relocalization:
-        """Ask about a frame, together with those before that are still of use."""
-        relocalizer = self._with_options(values)
+        """Localize with a frame and those before it that odometry links to it."""
+        session = self._session_for(relocalizer_options(values))
         if place is None:
-            return relocalizer.relocalize([observation])
-        frames = self._window.join(
-            replace(observation, odom_from_camera=place.odom_from_camera), place.run,
-            values['fuse_frames'], values['fuse_window_s'])
-        searched = [one for one in takewhile(lambda one: one is not None,
-                                             (frame.searched for frame in frames)) if one]
-        found = relocalizer.relocalize([frame.observation for frame in frames], searched)
-        for frame, one in zip(frames, searched, strict=True):
-            frame.searched = one
-        return self._window.judge(found)
+            return session.localize(observation)
+        return session.localize(replace(observation, odom_from_camera=place.odom_from_camera),
+                                place.run, values['fuse_frames'], values['fuse_window_s'])
 
-    def _with_options(self, values: Mapping[str, Any]) -> Relocalizer:
-        """Return the relocalizer for the options as they are now."""
-        options = relocalizer_options(values)
+    def _session_for(self, options: RelocalizerOptions) -> Session:
+        """Return the session; other options begin a new one."""
         if options != self._options:
-            self._relocalizer, self._options = Relocalizer(self._map, options), options
-            self._window.forget_searches()
-        return self._relocalizer
+            self._session, self._options = Session(Relocalizer(self._map, options)), options
+        return self._session
 
 
 def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:

@@ -16,7 +16,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
 
 # Every frame that odometry does not link is another chance of a false accept.
 _MAX_UNLINKED = 3
@@ -109,9 +109,15 @@ class Requests:
         """Localize with the next frame and hand an accepted pose to the localizer."""
         frame = self._frames.next_frame(after, deadline)
         answer = self._node.worker.run(lambda: self._localize(frame), deadline)
+        may_go_on = answer.pose is None
         if answer.pose is not None:
-            answer = self._handed_over(answer, deadline)
-        return _Look(answer, answer.pose is None
+            try:
+                self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline)
+            except HandOffError as error:
+                answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                                 detail=f'{error} ({answer.message})')
+                may_go_on = not isinstance(error, NoLocalizerError)
+        return _Look(answer, may_go_on
                      and self._robot.is_linked_soon(frame.image.header.stamp, deadline))
 
     def _look_past_jumps(self, after: float, deadline: float) -> _Look:
@@ -127,11 +133,3 @@ class Requests:
                 if isinstance(error, NoTransformError) and not self._jumps.is_settling:
                     raise
                 jump, after = error, time.monotonic()
-
-    def _handed_over(self, answer: Answer, deadline: float) -> Answer:
-        try:
-            self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline)
-        except HandOffError as error:
-            return replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                           detail=f'{error} ({answer.message})')
-        return answer

@@ -92,7 +92,7 @@ def test_a_bad_image_is_named(localizer, values):
 @pytest.mark.parametrize(('changes', 'error', 'message'), [
     ({'map_file': ''}, MapError, 'no map: set map_file'),
     ({'map_file': '/nowhere/room.yaml'}, MapError, '/nowhere/room.yaml'),
-    ({'algorithm': 'b-prosac'}, OptionsError, 'orders candidates by similarity'),
+    ({'algorithm': 'b-prosac'}, OptionsError, 'needs similarities'),
     ({'base_from_camera': [1.0] * 7}, OptionsError, 'base_from_camera')])
 def test_a_bad_start_is_named(make_node, values, changes, error, message):
     with pytest.raises(error, match=message):

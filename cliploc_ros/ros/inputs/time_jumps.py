@@ -16,8 +16,8 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.units import NS_PER_S
 
-# Messages from before a jump may still wait in the middleware when the jump is seen (a guess).
-_STRAGGLERS_S = 1.0
+# Stamps may be so much ahead of /clock, which comes at 10 Hz or more (a guess).
+_MAX_AHEAD_NS = NS_PER_S // 5
 # After a jump, transforms may take this long to cover the stamp of an image (a guess).
 _SETTLING_S = 2.0
 # DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
@@ -29,13 +29,9 @@ class TimeJumpError(CliplocError):
 
 
 class _Jump(NamedTuple):
-    """The last jump: when it was seen (monotonic clock) [s], a limit of stamps [ns], and its name.
-
-    A message that arrives soon after the jump with a stamp above the limit is from before it.
-    """
+    """The last jump: when it was seen (monotonic clock) [s], and how it is named."""
 
     seen_at: float
-    limit_ns: float
     name: str
 
 
@@ -54,15 +50,18 @@ class TimeJumps:
 
     def __init__(self, node: Node, forget: Callable[[], None]) -> None:
         self._node = node
+        self._clock = node.get_clock()
         self._forget = forget
-        self._last = _Jump(-math.inf, math.inf, '')
+        self._last = _Jump(-math.inf, '')
         # rcl keeps a bare pointer to the handle
-        self._handle = node.get_clock().create_jump_callback(
+        self._handle = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=True), post_callback=self._on_jump)
 
     def check(self, stamp: Time, received_at: float) -> None:
         """Raise TimeJumpError if a message is from before the last jump.
+
+        It may arrive after the clock's: then its stamp is in the future.
 
         Parameters
         ----------
@@ -72,9 +71,11 @@ class TimeJumps:
             When it arrived (monotonic clock) [s].
         """
         jump = self._last
-        is_straggler = (received_at < jump.seen_at + _STRAGGLERS_S
-                        and stamp_ns(stamp) > jump.limit_ns)
-        if received_at <= jump.seen_at or is_straggler:
+        if not jump.name:
+            return
+        ahead_ns = stamp_ns(stamp) - self._clock.now().nanoseconds
+        if received_at <= jump.seen_at or (self._clock.ros_time_is_active
+                                           and ahead_ns > _MAX_AHEAD_NS):
             raise TimeJumpError(f'{jump.name}: the frame is from before')
 
     @property
@@ -88,13 +89,10 @@ class TimeJumps:
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.clock_change in (ClockChange.ROS_TIME_ACTIVATED, ClockChange.ROS_TIME_DEACTIVATED):
-            limit_ns, name = math.inf, 'use_sim_time changed'
+            name = 'use_sim_time changed'
         else:
-            back_ns = -jump.delta.nanoseconds
-            # Half way between the clock before and after: stamps from before lie near the former.
-            limit_ns = self._node.get_clock().now().nanoseconds + 0.5 * back_ns
-            name = f'time jumped back by {back_ns / NS_PER_S:.3f} s'
-        self._last = _Jump(time.monotonic(), limit_ns, name)
+            name = f'time jumped back by {-jump.delta.nanoseconds / NS_PER_S:.3f} s'
+        self._last = _Jump(time.monotonic(), name)
         self._forget()
         self._node.get_logger().warning(f'{name}: all input from before is forgotten',
                                         throttle_duration_sec=1.0)

@@ -32,11 +32,15 @@ _ODOM_PATIENCE_S = 2.0
 _SUBSCRIBER_PATIENCE_S = 2.0
 # AMCL updates with its next scan; two calls before that count as one. Scans come at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
-_UPDATE_PATIENCE_S = 1.0
+_UPDATE_PATIENCE_S = 2.0
 
 
 class HandOffError(CliplocError):
     """The localizer did not get the pose; the message says why."""
+
+
+class NoLocalizerError(HandOffError):
+    """Nobody subscribes `initialpose`: another pose would not help."""
 
 
 class HandOff:
@@ -91,7 +95,9 @@ class HandOff:
         Raises
         ------
         HandOffError
-            The robot moves or may do so, or there is no localizer; nothing was published.
+            The robot moves or may do so; nothing was published.
+        NoLocalizerError
+            Nobody subscribes `initialpose`; nothing was published.
         TimeJumpError
             Time jumped back meanwhile; nothing was published.
         """
@@ -122,8 +128,8 @@ class HandOff:
             self._changed.wait_for(lambda: subscribed() or self._stopped.is_set(),
                                    min(_SUBSCRIBER_PATIENCE_S, _left_s(deadline)))
         if not subscribed():
-            raise HandOffError(f'nobody subscribes {self._publisher.topic_name}: start the '
-                               'localizer (AMCL), or set require_localizer: false')
+            raise NoLocalizerError(f'nobody subscribes {self._publisher.topic_name}: start the '
+                                   'localizer (AMCL), or set require_localizer: false')
 
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""

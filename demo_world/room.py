@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.demo.world.appearance import CLASSES, Appearance, draw_appearance, draw_lookalike
-from cliploc_ros.demo.world.meshes import Mesh, box, join, make_object
+from demo_world.appearance import CLASSES, Appearance, draw_appearance, draw_lookalike
+from demo_world.meshes import Mesh, box, join, make_object
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.7
 _SLOT_M = 0.31

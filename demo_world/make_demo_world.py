@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the world of the demo: ``python -m cliploc_ros.demo.make_demo_world DIR``.
+"""Makes the world of the demo: ``python -m demo_world.make_demo_world DIR``.
 
 A room no model was trained on. The map is made on a walk round its middle; then objects are moved
 and the lamp is changed, and on another walk the images are taken in which the robot wakes up.
@@ -11,11 +11,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.demo.world.appearance import CLASSES
-from cliploc_ros.demo.world.recording import record, write_fitted_map
-from cliploc_ros.demo.world.renderer import Light, Renderer
-from cliploc_ros.demo.world.room import make_room, move_objects
-from cliploc_ros.demo.world.trajectories import CAMERA, mapping_walk, query_walk
+from demo_world.appearance import CLASSES
+from demo_world.recording import record, write_fitted_map
+from demo_world.renderer import Light, Renderer
+from demo_world.room import make_room, move_objects
+from demo_world.trajectories import CAMERA, mapping_walk, query_walk
 
 #: Far from the seeds of the worlds to train on, which start at 1000.
 SEED = 7

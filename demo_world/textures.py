@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cliploc_ros.demo.world.appearance import COLORS, Appearance
+from demo_world.appearance import COLORS, Appearance
 
 SIZE_PX = 256
 

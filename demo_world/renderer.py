@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.demo.world.appearance import COLORS
-from cliploc_ros.demo.world.meshes import Mesh, make_object
-from cliploc_ros.demo.world.room import HEIGHT_M, LENGTH_M, WIDTH_M, Room
-from cliploc_ros.demo.world.textures import paint, paint_wall, paint_wood
 from cliploc_ros.errors import ModelError
+from demo_world.appearance import COLORS
+from demo_world.meshes import Mesh, make_object
+from demo_world.room import HEIGHT_M, LENGTH_M, WIDTH_M, Room
+from demo_world.textures import paint, paint_wall, paint_wood
 
 _SUPERSAMPLING = 2
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's claim, with real networks: ``python -m cliploc_ros.demo.class_growth --out DIR``.
+"""The paper's claim, with real networks: ``python -m demo_world.class_growth --out DIR``.
 
 Rooms of 48 objects each: of eight classes, then of four, of two, of one. What is seen stays as
 much, but more and more of it is of the same class. Matching by class must then try ever more
@@ -21,13 +21,13 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.demo.compare import record
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.paper_table import as_text, table_rows
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import make_queries
+from demo_world.compare import record
 
 #: Objects of each class; the fewer the classes, the more.
 COUNTS = (6, 12, 24, 48)
@@ -42,11 +42,11 @@ _OPTIONS = RelocalizerOptions(iterations=500, time_budget_s=2.0)
 
 def render(folder: Path, count: int, images: int, seed: int) -> None:
     """Render a room with so many objects of each class, all of them in the map."""
-    from cliploc_ros.demo.world.recording import record as record_walk
-    from cliploc_ros.demo.world.recording import write_true_map
-    from cliploc_ros.demo.world.renderer import Light, Renderer
-    from cliploc_ros.demo.world.room import make_room
-    from cliploc_ros.demo.world.trajectories import CAMERA, query_walk
+    from demo_world.recording import record as record_walk
+    from demo_world.recording import write_true_map
+    from demo_world.renderer import Light, Renderer
+    from demo_world.room import make_room
+    from demo_world.trajectories import CAMERA, query_walk
 
     counts = dict.fromkeys(_CLASSES[:_TOTAL // count], count)
     room = make_room(seed, counts, unknown=0)

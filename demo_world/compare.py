@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's table in the demo's world: ``python -m cliploc_ros.demo.compare --out DIR``.
+"""The paper's table in the demo's world: ``python -m demo_world.compare --out DIR``.
 
 Scores the small networks on the walk they were never trained on, records what they say of it
 once, and runs the paper's ten methods on that.
@@ -25,19 +25,18 @@ from cliploc_ros.datasets.frames import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.demo import train_detector
-from cliploc_ros.demo.world.reading import TrueFrame, read_frames
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.demo.truth import TrueFrame, read_frames
+from cliploc_ros.evaluation.evaluation import Evaluation
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.recording import record_queries
-from cliploc_ros.evaluation.session import Session
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions, import_ultralytics
-
-ASSETS = Path(__file__).parent / 'assets'
+from demo_world import train_detector
 
 
 def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Queries:
@@ -112,7 +111,7 @@ def run(arguments: list[str]) -> int:
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
-    Session(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
+    Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
             workers=options.workers).compare(
         parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
         frames=queries.frames)

@@ -21,11 +21,11 @@ from cliploc_ros.core.geometry.ellipsoid import (
     shape_matrices,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.demo.world.meshes import make_object
-from cliploc_ros.demo.world.photograph import expose
-from cliploc_ros.demo.world.renderer import Renderer
-from cliploc_ros.demo.world.room import Room, WorldObject
-from cliploc_ros.demo.world.trajectories import CAMERA
+from demo_world.meshes import make_object
+from demo_world.photograph import expose
+from demo_world.renderer import Renderer
+from demo_world.room import Room, WorldObject
+from demo_world.trajectories import CAMERA
 
 #: Objects of which fewer pixels are seen are not labelled.
 _FEWEST_PX = 40

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes worlds to train on: ``python -m cliploc_ros.demo.make_worlds DIR --count 100``."""
+"""Makes worlds to train on: ``python -m demo_world.make_worlds DIR --count 100``."""
 
 import argparse
 import multiprocessing
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from cliploc_ros.demo.world.recording import record, write_true_map
-from cliploc_ros.demo.world.renderer import Light, Renderer
-from cliploc_ros.demo.world.room import make_room
-from cliploc_ros.demo.world.trajectories import CAMERA, draw_views
+from demo_world.recording import record, write_true_map
+from demo_world.renderer import Light, Renderer
+from demo_world.room import make_room
+from demo_world.trajectories import CAMERA, draw_views
 
 
 def make_world(folder: Path, seed: int, frames: int) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the demo's CLIP: ``python -m cliploc_ros.demo.train_clip WORLDS --out clip.safetensors``.
+"""Trains the demo's CLIP: ``python -m demo_world.train_clip WORLDS --out clip.safetensors``.
 
 A small open_clip model from scratch, on crops of rendered worlds and the labels of what they
 show. Equal labels in a batch are all right answers, not each other's mistakes.
@@ -21,9 +21,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.demo.world.reading import find_worlds, hold_out, read_frames
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.demo.truth import read_frames
+from demo_world.worlds import find_worlds, hold_out
 
-CONFIG = Path(__file__).parent / 'assets' / 'clip.json'
+CONFIG = ASSETS / 'clip.json'
 _SMALLEST_PX = 14
 #: Pixels kept around a box, as part of its size, so that a scattered box still lies inside.
 _MARGIN = 0.15

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.demo.world.room import LENGTH_M, WIDTH_M, Room
+from demo_world.room import LENGTH_M, WIDTH_M, Room
 
 #: Pixel centres have whole coordinates, as everywhere in the package.
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the demo's detector: ``python -m cliploc_ros.demo.train_detector WORLDS --out yolo.pt``.
+"""Trains the demo's detector: ``python -m demo_world.train_detector WORLDS --out yolo.pt``.
 
 A small YOLO of ultralytics from scratch, on images of rendered worlds.
 """
@@ -16,12 +16,13 @@ import yaml
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.demo.world.appearance import CLASSES
-from cliploc_ros.demo.world.reading import TrueFrame, find_worlds, hold_out, read_frames
-from cliploc_ros.demo.world.trajectories import CAMERA
+from cliploc_ros.demo.truth import TrueFrame, read_frames
 from cliploc_ros.models.yolo_detector import import_ultralytics
+from demo_world.appearance import CLASSES
+from demo_world.trajectories import CAMERA
+from demo_world.worlds import find_worlds, hold_out
 
-ARCHITECTURE = Path(__file__).parent / 'assets' / 'yolo.yaml'
+ARCHITECTURE = Path(__file__).parent / 'yolo.yaml'
 
 
 def write_dataset(parts: dict[str, list[Path]], folder: Path) -> Path:

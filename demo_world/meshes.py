@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cliploc_ros.demo.world.appearance import SIZES, Appearance
+from demo_world.appearance import SIZES, Appearance
 
 
 @dataclass(frozen=True)
