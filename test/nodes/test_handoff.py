@@ -47,14 +47,15 @@ def odom(tester):
         return future.result()
     yield feed
     tester.destroy_publisher(publisher)
-    tester.wait(lambda: not tester.count_subscribers('/odom'), 'what was heard to be forgotten')
+    ended_s = time.monotonic()
+    tester.wait(lambda: time.monotonic() > ended_s + 2.0, 'what was heard to be too old')
 
 
 def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates, odom):
     tester.wait(lambda: tester.count_clients('/request_nomotion_update') == 1, 'the client')
     answer = odom(make_frame(), drive=0.0)
     assert answer.success
-    assert len(updates) == 5, relocalizer.output()
+    assert len(updates) == 10, relocalizer.output()
     gaps_s = [later[0] - earlier[0] for earlier, later in pairwise(updates)]
     assert min(gaps_s) > 0.1, 'a scan lies between them'
     assert len(tester.initial_poses) == 1
