@@ -27,10 +27,10 @@ from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import TrueFrame, read_frames
+from cliploc_ros.evaluation.evaluation import Evaluation
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.recording import record_queries
-from cliploc_ros.evaluation.session import Session
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
@@ -111,7 +111,7 @@ def run(arguments: list[str]) -> int:
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
-    Session(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
+    Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
             workers=options.workers).compare(
         parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
         frames=queries.frames)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which landmarks can a pose see at all? A tree of spheres, so that large maps cost little more.
+"""Frustum culling with a tree of bounding spheres: a pose is compared with what it may see.
 
-A landmark overlaps a box by more than the threshold only if it reaches into the pyramid through
-the boxes of its class, and only if it is near enough to appear large enough. Nothing else is left
-out, so no result changes. The map is sorted once, neighbours together; each frame makes a tree of
-those landmarks whose classes it shows, which knows how far away each of them may be.
+A landmark can overlap a box by more than the threshold only if it reaches into the frustum
+through the boxes of its class, and if it is near enough to appear large enough. Culling drops
+only the others, so it changes no result. The map is sorted along a Morton curve once. Each frame
+builds a tree over the landmarks of the classes that it shows; the tree also bounds their depth.
 """
 
 from math import inf
@@ -15,62 +15,63 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.projection import project
 
-#: So few landmarks are looked at faster than sorted.
+#: Up to so many landmarks, comparing with all is faster than culling.
 FEW = 64
-# So many are held by each sphere of the level above.
+# Children of each sphere of the tree.
 _BRANCHES = 8
 _MORTON_BITS = 16
-# Landmarks that appear larger than this half angle are never too far.
+# Landmarks that appear larger than this half angle are never culled by depth.
 _NEAR_ANGLE = np.radians(10.0)
 
 
 class SortedLandmarks(NamedTuple):
-    """A map's landmarks, neighbours together: L of them, 92 bytes each.
+    """All landmarks of a map along a Morton curve, so that neighbours have near rows: L of them.
 
     Parameters
     ----------
-    landmarks : ndarray (L, 10)
-        Centre, shape and squared radius of each.
+    landmarks : ndarray (L, 9)
+        Centre and shape of each.
+    radii : ndarray (L,)
+        Greatest semi-axis of each [m].
     numbers : ndarray (L,)
-        Which of the map's landmarks they are.
+        Row of each in the map.
     classes : ndarray (L,) of int32
-        From 0.
+        Class number of each.
     """
 
     landmarks: NDArray[np.float64]
+    radii: NDArray[np.float64]
     numbers: NDArray[np.int64]
     classes: NDArray[np.int32]
 
 
 class Groups(NamedTuple):
-    """The classes that a frame shows, and the w landmarks of these classes in a tree of m spheres.
+    """The landmarks of the classes that a frame shows: g classes, w landmarks, m spheres.
 
-    Each of g classes has a group of detections that show any of its landmarks.
+    A group is a class: its detections may show any of its landmarks, the members.
 
     Parameters
     ----------
     starts : ndarray (g + 1,)
-        Where each group's detections begin in detections.
+        Where the detections of each group begin in detections.
     detections : ndarray (v,)
-    reaches : ndarray (g,)
-        At a depth of how many of its radii a landmark appears too small to count.
     frusta : ndarray (g + 1, 4, 2)
-        Unit normals of the sides of the pyramid through each group's boxes: x and z of left and
-        right, y and z of upper and lower, inwards. The last one is through all boxes.
+        Unit normals, inwards, of the sides of the frustum through the boxes of each group: x and z
+        of left and right, y and z of top and bottom. The last row is the frustum through all.
     members : ndarray (w, 2) of int32
         Row among the sorted landmarks, in their order, and group.
     levels : ndarray (d + 1,)
-        Where each level of the tree begins in spheres: the members, then what holds eight of
-        them, and so on to the one that holds all.
+        Where each level of the tree begins in spheres. The first level has a sphere for each
+        member, the next one for each eight of them, up to the root.
     spheres : ndarray (m, 5)
-        Centre and radius of what holds a landmark, or all that are below; its centre must lie
-        at no more than this depth, or all of them appear too small [m].
+        Centre and radius of a sphere around all members below, and the depth of the centre beyond
+        which all of them appear too small [m].
     """
 
     starts: NDArray[np.int64]
     detections: NDArray[np.int64]
-    reaches: NDArray[np.float64]
     frusta: NDArray[np.float64]
     members: NDArray[np.int32]
     levels: NDArray[np.int64]
@@ -79,60 +80,59 @@ class Groups(NamedTuple):
 
 def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                    classes: NDArray[np.int64]) -> SortedLandmarks:
-    """Return the landmarks of a map, neighbours together.
+    """Return the landmarks of a map along a Morton curve.
 
     Parameters
     ----------
     centers, shapes : ndarray (L, 3), (L, 6)
         See cliploc_ros.core.geometry.ellipsoid.
     classes : ndarray (L,) of int
-        From 0.
+        Class number of each landmark, from 0.
     """
     numbers = np.argsort(_morton_codes(centers), kind='stable')
     centers, shapes = centers[numbers], shapes[numbers]
     # the greatest eigenvalue of a shape matrix is the square of the greatest semi-axis
     squares = np.linalg.eigvalsh(shapes[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))[:, 2]
     squares *= 1.0 + 1e-9
-    return SortedLandmarks(np.column_stack([centers, shapes, squares]), numbers.astype(np.int64),
-                           classes[numbers].astype(np.int32))
+    return SortedLandmarks(np.column_stack([centers, shapes]), np.sqrt(squares),
+                           numbers.astype(np.int64), classes[numbers].astype(np.int32))
 
 
 def no_landmarks() -> SortedLandmarks:
-    """Return a map without any."""
-    return SortedLandmarks(np.empty((0, 10)), np.empty(0, dtype=np.int64),
+    """Return an empty table."""
+    return SortedLandmarks(np.empty((0, 9)), np.empty(0), np.empty(0, dtype=np.int64),
                            np.empty(0, dtype=np.int32))
 
 
-def make_groups(nearby: SortedLandmarks, classes: NDArray[np.int64], boxes: NDArray[np.float64],
-                iou_threshold: float) -> Groups:
+def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
+                boxes: NDArray[np.float64], iou_threshold: float) -> Groups:
     """Return the groups of a frame.
 
     Parameters
     ----------
-    nearby : SortedLandmarks
+    sorted_landmarks : SortedLandmarks
     classes : ndarray (n,) of int
-        Of each detection, as the sorted landmarks have them; below 0 for none.
+        Class of each detection, as the sorted landmarks have them; below 0 for none.
     boxes : ndarray (n, 4)
         Box ellipses, see Scene.
     iou_threshold : float
-        Less overlap does not count.
+        Landmarks that cannot overlap a box by more than this are culled.
     """
     shown = np.unique(classes[classes >= 0])
     rows = [np.nonzero(classes == one)[0] for one in shown]
     frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
     reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
                                _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
-    members = _members(nearby.classes, shown)
-    radii = np.sqrt(nearby.landmarks[members[:, 0], 9])
+    members = _members(sorted_landmarks.classes, shown)
+    radii = sorted_landmarks.radii[members[:, 0]]
     return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
                   np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
-                  reaches, frusta, members,
-                  *_make_tree(nearby.landmarks[members[:, 0], :3], radii,
-                              radii * reaches[members[:, 1]]))
+                  frusta, members, *_make_tree(sorted_landmarks.landmarks[members[:, 0], :3],
+                                               radii, radii * reaches[members[:, 1]]))
 
 
 def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return rows and groups (w, 2) of the landmarks of some classes, which are sorted."""
+    """Return row and group (w, 2) of each landmark whose class is one of the sorted shown ones."""
     if not len(shown):
         return np.empty((0, 2), dtype=np.int32)
     of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
@@ -144,12 +144,14 @@ def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np
 
 def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
                depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return levels and spheres of some landmarks, neighbours together; see Groups.
+    """Return levels and spheres of the tree over some landmarks, see Groups.
 
     Parameters
     ----------
-    centers, radii, depths : ndarray (w, 3), (w,), (w,)
-        Of each landmark, and the depth from which on it appears too small.
+    centers, radii : ndarray (w, 3), (w,)
+        Of landmarks along a Morton curve.
+    depths : ndarray (w,)
+        The depth beyond which each appears too small.
     """
     spheres = [np.c_[centers, radii, depths]]
     low = high = centers
@@ -163,7 +165,7 @@ def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
 
 
 def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return numbers (u,) of points (u, 3) by whose order neighbours stand together."""
+    """Return the place (u,) of points (u, 3) on a Morton curve through their bounding cube."""
     low, extent = centers.min(axis=0), np.ptp(centers, axis=0).max()
     cells = ((centers - low) / max(extent, 1e-9) * (2**_MORTON_BITS - 1)).astype(np.uint64)
     code = np.zeros(len(centers), dtype=np.uint64)
@@ -178,7 +180,7 @@ def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 
 def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sides (4, 2) of the pyramid through some boxes; see Groups."""
+    """Return the sides (4, 2) of the frustum through some boxes, see Groups."""
     if not len(boxes):
         return np.zeros((4, 2))
     low = (boxes[:, :2] - boxes[:, 2:]).min(axis=0)
@@ -188,12 +190,12 @@ def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _widest_angle(boxes: NDArray[np.float64]) -> float:
-    """Return how far off the axis the corners of boxes are seen [rad]."""
+    """Return the greatest angle between the optical axis and a corner of some boxes [rad]."""
     return float(np.arctan(np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1).max()))
 
 
 def _reach(least_axes: float, angle: float) -> float:
-    """Return at a depth of how many of its radii a landmark appears smaller than what counts.
+    """Return the depth, in radii of a landmark, beyond which its outline is too small.
 
     A sphere of radius r at a depth z and a distance d has an outline on the plane z = 1 whose
     semi-axes have the product ``r^2 sqrt(d^2 - r^2) / (z^2 - r^2)^(3/2)``.
@@ -201,9 +203,9 @@ def _reach(least_axes: float, angle: float) -> float:
     Parameters
     ----------
     least_axes : float
-        The least such product that counts.
+        Outlines with a smaller product of semi-axes are too small.
     angle : float
-        How far off the axis landmarks are seen [rad].
+        Greatest angle between the optical axis and a landmark [rad].
     """
     widest = angle + _NEAR_ANGLE
     nearness = (np.sin(_NEAR_ANGLE) / np.cos(widest))**2 if widest < np.pi / 2 else 1.0
@@ -214,19 +216,21 @@ def _reach(least_axes: float, angle: float) -> float:
 
 
 @compiled
-def visible_members(groups, rotations, translations, which, seen):
-    """Write which members a pose may see into the first row of seen; return how many.
+def visible_members(groups, poses, which, seen):
+    """Write the members that a pose may see into the first row of seen; return their number.
 
-    Without branches but for the loops: what a pose sees of a map is hard to predict.
+    The inner loop has no branches: which members are visible is hard to predict.
 
     Parameters
     ----------
     groups : Groups
-    rotations, translations : ndarray (p, 3, 3), (p, 3)
-        Of camera_from_map; which is one of them.
+    poses : Poses
+    which : int
+        Row of the pose.
     seen : ndarray (2, w) of int
-        The second row is for what holds them.
+        The second row holds their parents in the tree.
     """
+    rotations, translations = poses.rotations, poses.translations
     frusta, members, levels, spheres = groups.frusta, groups.members, groups.levels, groups.spheres
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
     r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
@@ -234,18 +238,18 @@ def visible_members(groups, rotations, translations, which, seen):
     t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
     if members.shape[0] == 0:
         return 0
-    top, pyramid = levels.shape[0] - 2, frusta.shape[0] - 1
+    top, frustum = levels.shape[0] - 2, frusta.shape[0] - 1
     seen[(top + 1) % 2, 0], count = 0, 1
     for level in range(top, -1, -1):
         first, size = levels[level], levels[level + 1] - levels[level]
         above, here = (level + 1) % 2, level % 2
         found = 0
-        for holder in range(count):
-            begin = _BRANCHES * seen[above, holder]
+        for parent in range(count):
+            begin = _BRANCHES * seen[above, parent]
             for number in range(begin, min(begin + _BRANCHES, size)):
                 sphere = first + number
                 if level == 0:
-                    pyramid = members[number, 1]
+                    frustum = members[number, 1]
                 px, py, pz = spheres[sphere, 0], spheres[sphere, 1], spheres[sphere, 2]
                 behind = -spheres[sphere, 3]
                 x = r00 * px + r01 * py + r02 * pz + t0
@@ -253,9 +257,33 @@ def visible_members(groups, rotations, translations, which, seen):
                 z = r20 * px + r21 * py + r22 * pz + t2
                 seen[here, found] = number
                 found += ((z >= behind) & (z <= spheres[sphere, 4])
-                          & (x * frusta[pyramid, 0, 0] + z * frusta[pyramid, 0, 1] >= behind)
-                          & (x * frusta[pyramid, 1, 0] + z * frusta[pyramid, 1, 1] >= behind)
-                          & (y * frusta[pyramid, 2, 0] + z * frusta[pyramid, 2, 1] >= behind)
-                          & (y * frusta[pyramid, 3, 0] + z * frusta[pyramid, 3, 1] >= behind))
+                          & (x * frusta[frustum, 0, 0] + z * frusta[frustum, 0, 1] >= behind)
+                          & (x * frusta[frustum, 1, 0] + z * frusta[frustum, 1, 1] >= behind)
+                          & (y * frusta[frustum, 2, 0] + z * frusta[frustum, 2, 1] >= behind)
+                          & (y * frusta[frustum, 3, 0] + z * frusta[frustum, 3, 1] >= behind))
         count = found
     return count
+
+
+@compiled
+def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out):
+    """Project the members that a pose may see; return where their outlines end.
+
+    Parameters
+    ----------
+    landmarks : ndarray (L, 9)
+        See SortedLandmarks.
+    groups, poses, which, seen
+        See visible_members.
+    outlines, owners : ndarray (o, 6), (o,)
+        Outlines that are visible and the group of each, written from row out on.
+    out : int
+    """
+    members = groups.members
+    for place in range(visible_members(groups, poses, which, seen)):
+        row, group = np.int64(members[seen[0, place], 0]), members[seen[0, place], 1]
+        project(landmarks, row, row + 1, poses, which, outlines, out)
+        if outlines[out, 2] > 0.0:
+            owners[out] = group
+            out += 1
+    return out

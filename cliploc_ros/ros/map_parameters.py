@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map that stands in a node's parameters, as `--params-file map.yaml` puts it there."""
+"""A map in a node's parameters, where `--params-file map.yaml` puts it."""
 
 from typing import Any
 
@@ -13,18 +13,18 @@ _PREFIX = 'map.'
 
 
 def load_map(node: Node, map_file: str) -> LandmarkMap:
-    """Return the map of a file, or of the node's own parameters where no file is named.
+    """Return the map of a file, or of the node's own parameters where no file is given.
 
     Raises
     ------
     MapError
-        Names the source, the landmark and the field to mend.
+        Names the source, the landmark and the field to fix.
     """
     if map_file:
         return LandmarkMap.from_file(map_file)
     parameters = node.get_parameters_by_prefix('map')
     if not parameters:
-        raise MapError("no map: set map_file, or give a map's file with --params-file")
+        raise MapError('no map: set map_file, or load a map with --params-file')
     tree: dict[str, Any] = {}
     for name, parameter in parameters.items():
         _insert(tree, name.split('.'), parameter.value)
@@ -32,11 +32,11 @@ def load_map(node: Node, map_file: str) -> LandmarkMap:
 
 
 def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
-    """Put a value where its dotted name points."""
+    """Insert a value at its dotted name."""
     for key in path[:-1]:
         branch = tree.setdefault(key, {})
         if not isinstance(branch, dict):
-            raise MapError(f"parameters: {_PREFIX}{'.'.join(path)}: '{key}' is a value and holds "
-                           'fields')
+            raise MapError(f"parameters: {_PREFIX}{'.'.join(path)}: '{key}' has both a value "
+                           'and fields')
         tree = branch
     tree[path[-1]] = value

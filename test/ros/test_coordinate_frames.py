@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 
 NO_MOUNT = [0.0] * 7
 
 
 @pytest.fixture
 def ask(make_node):
-    frame = BaseFrame(make_node())
+    frame = CoordinateFrames(make_node())
     return lambda base, mount: frame.camera_from_base(base, mount, 'camera', Time(), 0.0)
 
 
@@ -41,7 +41,8 @@ def test_an_optical_frame_in_numbers(ask):
 def test_it_is_the_inverse_of_the_mount(position, quat_xyzw):
     mount = [*position, *(quat_xyzw / np.linalg.norm(quat_xyzw)).tolist()]
     # a mount needs no tf2, and so no node
-    camera_from_base = BaseFrame(None).camera_from_base('base_link', mount, 'camera', Time(), 0.0)
+    camera_from_base = CoordinateFrames(None).camera_from_base('base_link', mount, 'camera',
+                                                               Time(), 0.0)
     base_from_camera = transform_from_pose(np.array(mount[:3]), np.array(mount[3:]))
     np.testing.assert_allclose(base_from_camera @ camera_from_base, np.eye(4), atol=1e-10)
 
@@ -49,5 +50,5 @@ def test_it_is_the_inverse_of_the_mount(position, quat_xyzw):
 def test_a_base_that_nobody_places_is_named_with_the_remedy(ask):
     # also where tf2_ros is not installed
     for _ in range(2):
-        with pytest.raises(FrameError, match='set base_from_camera'):
+        with pytest.raises(NoTransformError, match='set base_from_camera'):
             ask('base_link', NO_MOUNT)

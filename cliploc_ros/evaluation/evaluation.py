@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One evaluation from its queries to its table, files and figures."""
+"""An evaluation, from its queries to its table, files and figures."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,6 @@ from tqdm import tqdm
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import QueryFrame
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation import tuning
 from cliploc_ros.evaluation.journal import Journal
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.output import write_text
@@ -29,25 +28,25 @@ from cliploc_ros.evaluation.paper_table import (
 )
 from cliploc_ros.evaluation.run import count_searches, run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
-from cliploc_ros.evaluation.trajectories import absolute_trajectory_error, write_trajectories
+from cliploc_ros.evaluation.trajectories import write_trajectories
 from cliploc_ros.evaluation.trials import Query, Result
 
 _JOURNAL = 'unfinished.jsonl'
 _TRAJECTORIES = 'trajectories'
-# Joins a method and a number of iterations.
+# Separates the name of a method from a number of iterations.
 _AT = '@'
 
 
 @dataclass(frozen=True)
-class Session:
-    """Queries against a map, and where the results go.
+class Evaluation:
+    """Queries, their map, and the folder for the results.
 
     Parameters
     ----------
     landmark_map : LandmarkMap
     queries : sequence of Query
     out : Path
-        A folder that exists.
+        An existing folder.
     trials, workers : int
         See run_methods.
     """
@@ -61,19 +60,19 @@ class Session:
     def compare(self, methods: Sequence[Method], *, sweep: Sequence[int] = (),
                 resume: bool = False, figures: bool = True, frames: Sequence[QueryFrame] = ()
                 ) -> list[Summary]:
-        """Run methods, print the table, and write everything.
+        """Run methods, print the table, and write all files.
 
         Parameters
         ----------
         methods : sequence of Method
         sweep : sequence of int
-            Numbers of iterations to run each sampling method with besides, for a figure.
+            Further numbers of iterations for each sampling method, for a figure.
         resume : bool
-            Go on with a run that was stopped.
+            Continue an unfinished run.
         figures : bool
             Whether to draw.
         frames : sequence of QueryFrame
-            Of the query file, for the times of detector and CLIP.
+            Frames of the query file, for the times of detector and CLIP.
 
         Returns
         -------
@@ -83,7 +82,7 @@ class Session:
         Raises
         ------
         CliplocError
-            For a run that cannot be resumed, or files that cannot be written.
+            The run cannot be resumed, or a file cannot be written.
         """
         everything = [*methods, *_swept(methods, sweep if figures else ())]
         results = self._run(everything, resume)
@@ -96,30 +95,11 @@ class Session:
         print(f'results: {self.out.resolve()}', flush=True)
         return summaries
 
-    def tune(self, method: Method, seed: int) -> tuning.Tuned:
-        """Tune a method, print what it brings, and write tuned.yaml, a parameter file."""
-        count = tuning.count_searches(method.options, len(self.landmark_map), len(self.queries),
-                                      self.trials)
-        with tqdm(total=count, desc='tuning', unit='search', disable=None) as bar:
-            tuned = tuning.tune(self.landmark_map, method.options, self.queries,
-                                trials=self.trials, workers=self.workers, seed=seed,
-                                advance=lambda results: bar.update(len(results)))
-        pair = [tuned.before, tuned.after]
-        text = tuning.as_parameter_file(tuned.options)
-        print(f'on the {len(tuned.after.queries)} queries that did not choose:\n'
-              f'{as_text(table_rows(pair))}\n' + '\n'.join(notes(pair)) + f'\n\n{text}')
-        for one in pair:
-            print(f'{one.method}: precision {one.precision():.3f} at recall {one.recall():.3f} '
-                  '(1 m)')
-        write_text(self.out / 'tuned.yaml', text)
-        print(f'wrote {self.out / "tuned.yaml"}', flush=True)
-        return tuned
-
     def _run(self, methods: Sequence[Method], resume: bool) -> list[Result]:
         run = self._describe(methods)
         journal = Journal(self.out / _JOURNAL)
         if journal.exists and not resume:
-            raise OptionsError(f'{self.out} holds an unfinished run: go on with --resume, give '
+            raise OptionsError(f'{self.out} holds an unfinished run; continue with --resume, give '
                                f'another --out, or remove {self.out / _JOURNAL}')
         done = journal.read(run) if journal.exists else []
         with journal.writing(run, done), self._progress(methods, len(done)) as bar:
@@ -137,7 +117,7 @@ class Session:
             yield bar
 
     def _describe(self, methods: Sequence[Method]) -> dict[str, Any]:
-        """Return what makes this run another one than others, as JSON knows it."""
+        """Return what identifies this run, as JSON keeps it."""
         digest = hashlib.sha256()
         for query in self.queries:
             for one in (*query.neighbours, query.observation):
@@ -158,11 +138,6 @@ class Session:
         rows = table_rows(summaries)
         write_trajectories(self.out / _TRAJECTORIES, self.queries, results)
         remarks = notes(summaries)
-        for one in summaries:
-            error = absolute_trajectory_error(self.out / _TRAJECTORIES, one.method)
-            if error is not None:
-                remarks.append(f'{one.method}: absolute trajectory error of believed poses '
-                               f'{error:.3f} m (evo, trial 0)')
         print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
         write_text(self.out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
         write_text(self.out / 'results.json', as_json(results))
@@ -173,7 +148,7 @@ class Session:
         try:
             from cliploc_ros.evaluation.figures import draw_all
         except ImportError as error:
-            print(f'no figures: {error}: pip install matplotlib', flush=True)
+            print(f'no figures: {error}; install matplotlib', flush=True)
             return
         observing = {stage: np.array([getattr(frame, name) for frame in frames])
                      for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
@@ -190,7 +165,7 @@ def _swept(methods: Sequence[Method], counts: Sequence[int]) -> list[Method]:
 
 def _by_count(summaries: Sequence[Summary], methods: Sequence[Method]
               ) -> dict[str, dict[int, Summary]]:
-    """Return the summaries of the sweep and of the methods themselves, by iterations."""
+    """Return the summaries of each sampling method, by their number of iterations."""
     counts: dict[str, dict[int, Summary]] = {}
     iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
     for one in summaries:
