@@ -58,6 +58,8 @@ def pytest_configure(config):
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     # The older name of the same; where both are set, ROS warns.
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
+    # As in the nodes: threads of PyTorch that wait for work leave the cores to others.
+    os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
 
 
 @pytest.hookimpl(trylast=True)
