@@ -3,6 +3,7 @@
 """The compiled kernels' cache on disk may be damaged; the search still works."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -49,6 +50,20 @@ def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
     assert 'compiling them again' in done.stderr
     # and is whole again
     assert 'compiling them again' not in run(code, tmp_path).stderr
+
+
+def test_a_cache_of_another_version_is_replaced(tmp_path):
+    """After an upgrade, the index of a kernel may name a module that is gone."""
+    assert run(FEW, tmp_path).stdout == 'warm\n'
+    for file in tmp_path.rglob('*.nbi'):
+        with file.open('rb') as index:
+            pickle.load(index)  # numba's version
+            end = index.tell()
+        file.write_bytes(file.read_bytes()[:end] + b'ccliploc_ros.core.gone\nThing\n.')
+    done = run(FEW, tmp_path)
+    assert done.stdout == 'warm\n', done.stderr
+    assert 'compiling them again' in done.stderr
+    assert 'compiling them again' not in run(FEW, tmp_path).stderr
 
 
 FULL_DISK = """
