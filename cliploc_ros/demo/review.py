@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.verdict import Match
+from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
-from cliploc_ros.demo.world.reading import TrueBox, read_frames
+from cliploc_ros.demo.truth import TrueBox, read_frames
 
 #: Poses farther from the truth than this are wrong [m].
 WRONG_M = 1.0

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import Support, View, confidences, support
-from cliploc_ros.core.acceptance.verdict import Evidence, Match, refusal
+from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.covariance import pose_covariance
+from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
