@@ -199,3 +199,23 @@ def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
     assert len(built) == 1
     assert built.semi_axes[0] == pytest.approx(np.full(3, 0.3), abs=0.01)
     assert CLASSES[detections.classes[0]] == built.class_ids[0]
+
+
+def test_one_object_under_two_names_becomes_class_weights():
+    table = make_table()
+    detections = see(table, walk_around(frames=90))
+    built = build_map(detections)
+    row = int(np.flatnonzero(np.array(built.landmark_map.class_ids) == 'bottle')[0])
+    classes = detections.classes.copy()
+    boxes = np.flatnonzero(built.shown == row)
+    classes[boxes[::4]] = CLASSES.index('cup')
+    renamed = build_map(replace(detections, classes=classes))
+    assert len(renamed.landmark_map) == len(table)
+    same = np.linalg.norm(renamed.landmark_map.centers - built.landmark_map.centers[row],
+                          axis=1).argmin()
+    assert renamed.landmark_map.class_ids[same] == 'bottle'
+    assert dict(renamed.landmark_map.details[same].class_weights) == pytest.approx(
+        {'bottle': 0.75, 'cup': 0.25}, abs=0.02)
+    others = [one for number, one in enumerate(renamed.landmark_map.details) if number != same]
+    assert all(one.class_weights is None for one in others)
+    assert renamed.report.explained == 1.0
