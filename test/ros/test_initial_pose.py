@@ -97,6 +97,7 @@ def test_a_localizer_that_is_there_gets_the_pose(robot):
     assert robot.localizer.poses[0].header == make_pose().header
 
 
+@pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld(robot):
     start = time.monotonic()
     with pytest.raises(NoLocalizerError, match=r'^nobody subscribes /initialpose: start the '
@@ -122,6 +123,7 @@ def test_a_robot_without_a_localizer_need_not_wait_for_one(robot):
     assert robot.hand_over(require_localizer=False) < 1.0
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('timeout_s', [0.3, 0.0, -1.0])
 def test_no_wait_goes_beyond_the_deadline(robot, timeout_s):
     start = time.monotonic()
@@ -194,6 +196,7 @@ def rest(wheels):
         wheels.publish(odometry)
 
 
+@pytest.mark.clock
 def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
     robot.localizer.subscribe()
     robot.meet()

@@ -98,6 +98,7 @@ def test_an_image_waits_for_the_message_after_it(robot, source):
     late.join()
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('moments', [[], [10.0], [12.0], [1.0]])
 def test_an_image_outside_of_odometry_costs_no_time(robot, source, moments):
     talk(source, *moments)
@@ -153,6 +154,7 @@ def test_poses_give_the_speed_where_the_twist_is_empty(source):
     assert source.speeds_by_poses(1.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('moments', [[], [10.0], [9.9, 10.0], [9.0, 10.0]])
 def test_too_few_poses_give_no_speed(source, moments):
     talk(source, *moments)
