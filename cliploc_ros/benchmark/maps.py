@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the size of a map costs in time and memory; part of cliploc_ros.benchmark.search."""
+"""Time and memory against the size of the map; part of cliploc_ros.benchmark.search."""
 
 import re
 import time
@@ -12,24 +12,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.culling import make_groups
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.association.similarities import (
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.index.culling import SortedLandmarks, make_groups
+from cliploc_ros.core.index.similarities import (
     CropSimilarities,
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.screening import set_up
-from cliploc_ros.core.search.search import Leaders, search_samples
+from cliploc_ros.core.search.strategies import search_samples
 
 _CROPS, _DIMENSIONS, _K, _CLASSES = 12, 512, 3, 40
 _CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -37,7 +38,7 @@ _REPETITIONS = 5
 
 
 def storey(count: int) -> tuple[LandmarkMap, Observation]:
-    """Return a map, a landmark a four square metres, and a frame in it of up to twelve boxes."""
+    """Return a map of one landmark in four square metres, and a frame of up to twelve boxes."""
     rng, side = np.random.default_rng(0), np.sqrt(4.0 * count)
     names = tuple(f'class {number}' for number in rng.integers(0, _CLASSES, count))
     quats = rng.normal(size=(count, 4))
@@ -61,8 +62,8 @@ def storey(count: int) -> tuple[LandmarkMap, Observation]:
 
 
 def measure_maps(counts: Sequence[int]) -> None:
-    """Print what maps of some sizes cost, the smallest first."""
-    print(f'maps, {_CROPS} crops of {_DIMENSIONS} numbers, every label another:\n'
+    """Print time and memory for maps of some sizes."""
+    print(f'maps, {_CROPS} crops of {_DIMENSIONS} numbers, all labels different:\n'
           '  landmarks  k-NN ms  labels MB  sort s  sorted MB  frame ms  us a sample  ratio  '
           'request ms  process MB')
     first_us = None
@@ -83,13 +84,13 @@ def measure_maps(counts: Sequence[int]) -> None:
         request_ms = 1e3 * _least_s(partial(relocalizer.relocalize, [observation]))
         first_us = first_us or sample_us
         print(f'  {count:9,d} {knn_ms:8.1f} {similarities.labels.unique.nbytes / 1e6:10.0f} '
-              f'{sort_s:7.2f} {sum(part.nbytes for part in landmark_map.nearby) / 1e6:10.1f} '
+              f'{sort_s:7.2f} {_size_mb(landmark_map.sorted_landmarks):10.1f} '
               f'{frame_ms:9.2f} {sample_us:12.2f} {sample_us / first_us:6.2f} '
               f'{request_ms:11.1f} {_peak_mb():11.0f}', flush=True)
 
 
 def measure_first_request() -> None:
-    """Print how long the first request after a start takes, against the tenth."""
+    """Print the time of the first request after a start, compared with the tenth."""
     landmark_map, observation = storey(100)
     start = time.perf_counter()
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
@@ -104,15 +105,15 @@ def measure_first_request() -> None:
 
 
 def _mixed_samples(scene: Scene) -> NDArray[np.int64]:
-    """Return samples of CLIP's candidates, so that maps of all sizes have the same mixture."""
+    """Return samples of CLIP's candidates, whose mixture does not depend on the map's size."""
     count = min(len(scene.pairs), _K * _CROPS)
     samples = draw_ransac(scene.pairs[:count], 4_000, np.random.default_rng(0))
     return samples[samples[:, 0] >= 0]
 
 
 def _frame(landmark_map: LandmarkMap, observation: Observation, scene: Scene) -> None:
-    """Make what the landmarks of a frame's classes are found with, and the memory to search in."""
-    make_groups(landmark_map.nearby,
+    """Prepare the search of a frame: the tree of its classes' landmarks, and the bench."""
+    make_groups(landmark_map.sorted_landmarks,
                 landmark_map.classes.classes_of(observation.detections.class_ids),
                 scene.box_ellipses, scene.iou_threshold)
     set_up(scene)
@@ -136,6 +137,10 @@ def _least_s(run: Callable[[], object]) -> float:
         run()
         least = min(least, time.perf_counter() - start)
     return least
+
+
+def _size_mb(arrays: SortedLandmarks) -> float:
+    return sum(array.nbytes for array in arrays) / 1e6
 
 
 def _peak_mb() -> float:

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the search is on this machine: ``python -m cliploc_ros.benchmark.search``.
+"""Measure the speed of the search: ``python -m cliploc_ros.benchmark.search``.
 
-One core, beside a plain loop over OpenCV and NumPy that does the same, and maps of several sizes,
-in one run. With --queries and --map also the time that every sample of each recorded query takes.
+One run compares the kernel on one core with a plain loop over OpenCV and NumPy, and measures maps
+of several sizes. With --queries and --map, it also searches each recorded query to the end.
 """
 
 import os
 
-# As in the nodes: read when NumPy is loaded.
+# As in the nodes. NumPy reads it when it is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
@@ -23,18 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.benchmark.maps import measure_first_request, measure_maps
-from cliploc_ros.core.association import candidates as association
+from cliploc_ros.core.association.candidates import (
+    balanced_order,
+    class_candidates,
+    joined,
+    nearest_candidates,
+)
 from cliploc_ros.core.association.scene import Scene, make_scene
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.geometry.p3p import p3p
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.screening import choose_pose, load_sample, set_up, verify_beyond
-from cliploc_ros.core.search.search import (
-    Leaders,
+from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
+from cliploc_ros.core.search.strategies import (
     Progress,
     search_exhaustively,
     search_progressively,
@@ -99,14 +103,14 @@ def query_scenes(queries: Path, map_file: Path, matching: str) -> list[Scene]:
     camera = Camera(640, 480, *recorded.intrinsics_fx_fy_cx_cy)
     scenes = []
     for frame in recorded.main_frames():
-        potential = association.same_class(frame.class_ids, landmark_map.class_ids)
-        candidates = association.class_candidates(potential)
+        index = landmark_map.classes
+        candidates = potential = class_candidates(index, index.classes_of(frame.class_ids))
         if matching == 'hybrid':
-            candidates = association.balanced_order(
-                association.nearest_candidates(frame.similarities.astype(np.float32), _K))
-            potential |= association.candidate_mask(candidates, potential.shape)
+            candidates = balanced_order(
+                nearest_candidates(frame.similarities.astype(np.float32), _K))
+            potential = joined(candidates, potential, len(landmark_map))
         scenes.append(make_scene(camera.normalize_bboxes(frame.bboxes_xyxy),
-                                 landmark_map.centers, landmark_map.shapes, potential,
+                                 landmark_map.centers, landmark_map.shapes, potential.pairs,
                                  candidates.pairs, _IOU_THRESHOLD))
     return scenes
 
@@ -124,7 +128,7 @@ def _measure_hypotheses(scene: Scene) -> None:
     plain_us, plain_score = _plain(scene, samples[:_PLAIN_HYPOTHESES])
     leaders = Leaders.none_yet()
     _drain(search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
-    print(f'{len(scene.bearings)} boxes, {len(scene.potential_detections)} pairs, one core:\n'
+    print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
           f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
           f'  {five_hundred_ms:7.2f} ms for N = 500\n'
@@ -136,24 +140,14 @@ def _measure_hypotheses(scene: Scene) -> None:
 
 @compiled
 def _verify_all(bench, samples):
-    """Make every hypothesis and verify it to the end; return how many there were."""
+    """Make every hypothesis and verify it to the end; return how many there are."""
+    targets, poses, overlaps = bench.targets, bench.poses, bench.overlaps
     solved = 0
-    for t in range(samples.shape[0]):
-        load_sample(bench.candidates, samples, t, 3, bench.bearings, bench.points,
-                    bench.sampled_boxes, bench.sampled_landmarks)
-        count = p3p(bench.bearings, bench.points, bench.rotations, bench.translations)
-        if count == 0:
-            continue
-        which = choose_pose(bench.prior, bench.rotations, bench.translations, 3, count,
-                            bench.sampled_boxes, bench.sampled_landmarks,
-                            bench.sampled_outlines, bench.uppers, 0.0)
-        if which < 0:
-            continue
-        verify_beyond(bench.nearby, bench.groups, bench.landmarks, bench.boxes,
-                      bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
-                      bench.translations, which, bench.seen, bench.outlines,
-                      bench.owners, bench.entries, bench.bounds, bench.best_bounds, -1.0)
-        solved += 1
+    for number in range(samples.shape[0]):
+        which = make_hypothesis(bench, samples, number, 0.0)
+        if which >= 0:
+            verify_beyond(targets, poses, which, overlaps, -1.0)
+            solved += 1
     return solved
 
 
@@ -186,7 +180,7 @@ def _drain(search: Iterator[Progress]) -> int:
 
 
 def _least_s(run: Callable[[], object], repetitions: int = _REPETITIONS) -> float:
-    """Return the least time [s] of some runs: what else the machine does only adds to it."""
+    """Return the least time [s] of some runs, the one least disturbed by other programs."""
     least = inf
     for _ in range(repetitions):
         start = time.perf_counter()
@@ -196,7 +190,7 @@ def _least_s(run: Callable[[], object], repetitions: int = _REPETITIONS) -> floa
 
 
 def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:
-    """Return how long the plain loop takes a hypothesis with a pose [us], and its best score."""
+    """Return the time of the plain loop [us a hypothesis], and its best score."""
     solved, best = 0, 0.0
     duals = [_dual_quadric(center, shape)
              for center, shape in zip(scene.centers, scene.shapes, strict=True)]
@@ -211,7 +205,7 @@ def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:
 
 def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[np.int64]
                 ) -> NDArray[np.float64] | None:
-    """Return camera_from_map (3, 4) of a sample as sample_pose has it."""
+    """Return camera_from_map (3, 4): of P3P's poses, the one whose sampled IoUs sum highest."""
     import cv2
 
     seen = scene.box_ellipses[pairs[:, 0], :2].reshape(3, 1, 2)
@@ -229,12 +223,12 @@ def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[n
 
 def _plain_score(scene: Scene, duals: list[NDArray[np.float64]], pose: NDArray[np.float64]
                  ) -> float:
-    """Return the score of a pose as verify has it."""
-    ious = np.zeros(len(scene.bearings))
-    for number, landmark in enumerate(scene.potential_landmarks):
+    """Return the score of a pose: the sum of each detection's best IoU above the threshold."""
+    ious, potential = np.zeros(len(scene.bearings)), scene.potential
+    for number, landmark in enumerate(potential.landmarks):
         outline = _plain_outline(pose, duals[landmark])
-        for detection in scene.potential_detections[
-                scene.potential_starts[number]:scene.potential_starts[number + 1]]:
+        for detection in potential.detections[
+                potential.starts[number]:potential.starts[number + 1]]:
             iou = _plain_iou(scene.box_ellipses[detection], outline)
             if iou > max(scene.iou_threshold, ious[detection]):
                 ious[detection] = iou
@@ -254,7 +248,7 @@ def _dual_quadric(center: NDArray[np.float64], shape: NDArray[np.float64]
 
 def _plain_outline(pose: NDArray[np.float64], dual: NDArray[np.float64]
                    ) -> NDArray[np.float64] | None:
-    """Return the dual conic of a landmark; None if it is not wholly in front."""
+    """Return the dual conic of a landmark; None if the landmark is not wholly in front."""
     conic = pose @ dual @ pose.T
     if pose[2] @ dual[3] >= 0.0 or conic[2, 2] >= 0.0:
         return None

@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the numerical kernels are compiled: one decorator, so that all share its settings.
+"""How the numerical kernels are compiled: one decorator, so that all share its settings."""
 
-Where numba is absent the kernels run as they stand, as plain Python: equal results, hundreds of
-times slower.
-"""
-
-import functools
 import logging
 import pickle
 from collections.abc import Callable
@@ -15,76 +10,65 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
+from numba.core import config
+from numba.core.caching import NullCache
 
-try:
-    from numba import njit
-    from numba.core import config
-    from numba.core.caching import NullCache
-except ImportError:
-    njit = None
-else:
-    # As newer numba always has it; 0.59 takes a damaged file of a kernel that another one
-    # calls for a mistake in that one's types.
-    config.CAPTURED_ERRORS = 'new_style'
+# The default of newer versions. In the old style, numba 0.59 reports the damaged cache of a callee
+# as a typing error of its caller.
+config.CAPTURED_ERRORS = 'new_style'
+
+#: A literal 0 as an argument compiles a further specialization of a kernel; this one does not.
+ZERO = np.int64(0)
 
 logger = logging.getLogger(__name__)
 _kernels: list[Any] = []
-# What numba raises for a cache that was cut off by a power cut.
-_DAMAGE = (EOFError, pickle.UnpicklingError)
+# Raised by numba for a file that is truncated, as after a power cut, and for one that names a
+# module or type of another version of this package.
+_DAMAGE = (EOFError, pickle.UnpicklingError, ImportError, AttributeError)
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel to machine code at its first call, and keep the code on disk.
+    """Compile a kernel to machine code at its first call, and cache the code on disk.
 
-    The GIL is released while the kernel runs, so that a node answers during a search, and
-    divisions by zero give inf and NaN as in NumPy.
+    The kernel releases the GIL, so that a node answers during a search. Divisions by zero give
+    inf and NaN, as in NumPy.
     """
-    if njit is None:
-        return _interpreted(function)
     settings = {'nogil': True, 'error_model': 'numpy'}
     try:
         kernel = njit(cache=True, **settings)(function)
     except RuntimeError:
-        # Neither the package's folder nor the user's cache can be written: compile each time.
+        # Neither the package's folder nor the user's cache is writable: compile at each start.
         kernel = njit(**settings)(function)
     _kernels.append(kernel)
     return kernel
 
 
-def _interpreted(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a kernel run as plain Python, as silent about infinities as compiled code."""
-    @functools.wraps(function)
-    def kernel(*args: Any) -> Any:
-        with np.errstate(all='ignore'):
-            return function(*args)
-    return kernel
-
-
 def warm_up(run: Callable[[], object]) -> None:
-    """Run what calls the kernels; mend their cache on disk, or do without it.
+    """Run the kernels once; repair their cache on disk, or continue without it.
 
     Parameters
     ----------
     run : callable
-        Calls every kernel that will be needed.
+        Calls every kernel that requests use.
     """
-    for _ in range(len(_kernels) + 1):  # each kernel has a file of its own to be damaged
+    for _ in range(len(_kernels) + 1):  # each kernel has its own file, which may be damaged
         try:
             run()
             return
         except _DAMAGE as error:
-            logger.warning('cached kernels could not be read: %r; compiling anew', error)
+            logger.warning('cached kernels are damaged or outdated: %r; compiling them again',
+                           error)
             _forget_cache()
-        except OSError as error:  # as on a full disk: every kernel would fail, and each request
-            logger.warning('compiled kernels are not cached, so each start will take a minute '
-                           'until there is room in their folder or NUMBA_CACHE_DIR names '
-                           'another: %s', error)
-            _do_without_cache()
+        except OSError as error:  # as on a full disk: every kernel and every request would fail
+            logger.warning('cannot cache compiled kernels: %s; each start takes a minute until '
+                           'NUMBA_CACHE_DIR names a folder with room', error)
+            _disable_cache()
     run()
 
 
-def _do_without_cache() -> None:
-    """Let this process neither read nor write kernels on disk."""
+def _disable_cache() -> None:
+    """Stop this process from reading and writing kernels on disk."""
     for kernel in _kernels:
         kernel._cache = NullCache()
 

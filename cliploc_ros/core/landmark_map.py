@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.candidates import ClassIndex
-from cliploc_ros.core.association.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
+from cliploc_ros.core.index.classes import ClassIndex
+from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
@@ -33,7 +33,7 @@ class LandmarkMap:
     Parameters
     ----------
     frame_id : str
-        The frame in which centres and orientations are given.
+        The coordinate frame of centres and orientations.
     landmark_ids, labels, class_ids : tuple of str
         Name, description in natural language and detector class of each landmark.
     centers : ndarray (L, 3)
@@ -57,8 +57,8 @@ class LandmarkMap:
         return len(self.landmark_ids)
 
     def prepare(self) -> None:
-        """Make now what the first request would have to wait for."""
-        _ = self.shapes, self.classes, self.nearby
+        """Compute the indices now, so that the first request does not wait for them."""
+        _ = self.shapes, self.classes, self.sorted_landmarks
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -67,12 +67,12 @@ class LandmarkMap:
 
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return which landmarks are of which class."""
+        """Return the landmarks by class."""
         return ClassIndex.of(self.class_ids)
 
     @cached_property
-    def nearby(self) -> SortedLandmarks:
-        """Return the landmarks, neighbours together."""
+    def sorted_landmarks(self) -> SortedLandmarks:
+        """Return the landmarks sorted by place."""
         return sort_landmarks(self.centers, self.shapes, self.classes.of_landmarks)
 
     @staticmethod
@@ -82,7 +82,7 @@ class LandmarkMap:
         Raises
         ------
         MapError
-            Names the file, the landmark and the field to mend.
+            Names the file, the landmark and the field to correct.
         """
         tree = read_parameter_file(path)
         found = [node['ros__parameters']['map'] for node in tree.values()
@@ -102,12 +102,12 @@ class LandmarkMap:
         tree : mapping
             As in the map file, below the key 'map'.
         source : str
-            Where it came from, for messages.
+            Where the tree came from, for messages.
 
         Raises
         ------
         MapError
-            Names the source, the landmark and the field to mend.
+            Names the source, the landmark and the field to correct.
         """
         _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
         frame_id = _text(tree['frame_id'], f'{source}: map: frame_id')
@@ -127,7 +127,7 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     """Return one landmark's validated fields, in the order of _FIELDS."""
     where = f"{source}: landmark '{landmark_id}'"
     if not isinstance(landmark_id, str) or not landmark_id or '.' in landmark_id:
-        # a dot would part the name when the map comes as ROS parameters
+        # a dot would split the name of a ROS parameter
         raise MapError(f'{where}: an id must be text without dots')
     _check_keys(fields, _FIELDS, where)
     semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.similarities import Similarities
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.index.similarities import Similarities
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class RelocalizerOptions:
         repetition, until `iterations` or `time_budget_s` end it. In hybrid matching it goes on
         to candidates of equal class after those of CLIP.
     k : int
-        Number of landmarks retrieved for each crop.
+        Number of landmarks retrieved for each crop, at least 1.
     iterations : int
         Number of minimal samples drawn; for auto the most samples tried; bf ignores it. The
         paper's 500 find the best pose less often, and its rivals less often, too.

@@ -27,14 +27,14 @@ from cliploc_ros.core.fit.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fit.several_frames import Rig, make_rig
+from cliploc_ros.core.fit.rig import Rig, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame, search_frame
-from cliploc_ros.core.search.search import MAX_DISTINCT, same_place
+from cliploc_ros.core.search.leaders import MAX_DISTINCT, same_place
 from cliploc_ros.core.time_budget import TimeBudget
 from cliploc_ros.core.warm_up import call_every_kernel
 from cliploc_ros.errors import OptionsError

@@ -4,21 +4,17 @@
 
 import numpy as np
 
-from cliploc_ros.core.association.scene import Workspace, make_scene
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
-from cliploc_ros.core.fit.several_frames import (
-    choose_distinct,
-    make_rig,
-    refine_all,
-    verify_rig,
-)
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.leaders import Leaders, same_place
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.search import (
-    Leaders,
-    same_place,
+from cliploc_ros.core.search.strategies import (
     search_exhaustively,
     search_progressively,
     search_samples,
@@ -40,8 +36,8 @@ def call_every_kernel() -> None:
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
     rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
-    choose_distinct(rig, np.eye(3)[None], np.zeros((1, 3)), 1, Workspace.allocate(3))
-    refine_all(rig, np.eye(3)[None], np.zeros((1, 3)), Workspace.allocate(3))
-    verify_rig(rig, np.eye(3), np.zeros(3), Workspace.allocate(3))
+    scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
+    choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+    refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
     project_ellipsoids(np.eye(4), centers, shapes)

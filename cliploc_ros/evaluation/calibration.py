@@ -27,7 +27,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.search import MAX_DISTINCT
+from cliploc_ros.core.search.leaders import MAX_DISTINCT
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.summary import wilson_interval

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.similarities import LabelEmbeddings
+from cliploc_ros.core.index.similarities import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights

@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame of messages to a relocalization: what the node keeps loaded between requests."""
+"""From a frame to a relocalization: the map and the network that stay loaded between requests."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -24,11 +22,19 @@ from cliploc_ros.ros.conversions import (
     stamp_ns,
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.odometry import CameraPlace
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.node.map_parameters import load_map
-from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
+
+
+class Localized(NamedTuple):
+    """The result of one frame, what was seen in it, and how long each stage took."""
+
+    found: Relocalization
+    seen: SeenImage
+    times: StageTimes
 
 
 class Localizer:
@@ -61,7 +67,7 @@ class Localizer:
 
     @property
     def map_frame(self) -> str:
-        """Return the frame that poses are given in."""
+        """Return the coordinate frame of the poses."""
         return self._map.frame_id
 
     @property
@@ -76,7 +82,7 @@ class Localizer:
         Raises
         ------
         CliplocError
-            Names what in the map is to be mended; this localizer is as it was.
+            Names what to fix in the map; this localizer stays as it was.
         """
         options = relocalizer_options(values)
         landmark_map = load_map(node, values['map_file'])
@@ -88,28 +94,21 @@ class Localizer:
                                                          landmark_map.labels))
         return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
-    def localize(self, frame: Frame, values: Mapping[str, Any],
-                 up_in_camera: NDArray[np.float64] | None = None,
-                 views: list[View] | None = None, place: CameraPlace | None = None
-                 ) -> tuple[Relocalization, StageTimes]:
-        """Find where the camera was, by a frame and those before that odometry joins to it.
+    def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState) -> Localized:
+        """Find where the camera was, with a frame and those that odometry links to it.
 
         Parameters
         ----------
         frame : Frame
         values : mapping
-            Of the relocalizer's parameters, as they are now.
-        up_in_camera : ndarray (3,) or None
-            The vertical, where it is known.
-        views : list of View or None
-            Takes what was seen, for pictures of it.
-        place : CameraPlace or None
-            Where odometry has the camera; None: the frame is asked about alone.
+            The relocalizer's parameters, as they are now.
+        state : RobotState
+            At the stamp of the frame.
 
         Raises
         ------
         CliplocError
-            Names what in the frame or in the parameters is to be mended.
+            Names what to fix in the frame or in the parameters.
         """
         times = StageTimes(frame.received_at)
         times.mark('waiting')
@@ -124,11 +123,10 @@ class Localizer:
         observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
             else self._observer.observe(image, camera, detections, stamp)
         times.mark('CLIP')
-        if views is not None:
-            views.append(View(image, observation))
-        found = self._relocalize(replace(observation, up_in_camera=up_in_camera), place, values)
+        found = self._relocalize(replace(observation, up_in_camera=state.up_in_camera),
+                                 state.place, values)
         times.mark('search')
-        return found, times
+        return Localized(found, SeenImage(image, observation), times)
 
     def _relocalize(self, observation: Observation, place: CameraPlace | None,
                     values: Mapping[str, Any]) -> Relocalization:

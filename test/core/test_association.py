@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference import candidate_mask, same_class
 
 from cliploc_ros.core.association.candidates import (
-    ClassIndex,
-    adaptive_candidates,
     balanced_order,
-    candidate_mask,
     class_candidates,
     joined,
     nearest_candidates,
     prosac_order,
-    same_class,
+    rarest_class_candidates,
 )
+from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.errors import OptionsError
 
 SIMILARITIES = np.array([[0.9, 0.1, 0.5], [0.2, 0.8, 0.7]], dtype=np.float32)
@@ -61,19 +60,15 @@ def test_k_must_fit_the_map(k):
 
 
 def test_classes_the_map_does_not_know_match_nothing():
-    mask = same_class(('cup', 'zebra', ''), ('chair', 'cup', 'cup'))
-    assert mask.tolist() == [[False, True, True], [False] * 3, [False] * 3]
-    assert class_candidates(mask).pairs.tolist() == [[0, 1], [0, 2]]
-
-
-def test_mask_of_candidates():
-    mask = candidate_mask(nearest_candidates(SIMILARITIES, 1), (2, 3))
-    assert mask.tolist() == [[True, False, False], [False, True, False]]
+    index = ClassIndex.of(('chair', 'cup', 'cup'))
+    classes = index.classes_of(('cup', 'zebra', ''))
+    assert classes.tolist() == [1, -1, -1]
+    assert class_candidates(index, classes).pairs.tolist() == [[0, 1], [0, 2]]
 
 
 def test_rare_classes_come_first_and_nothing_twice():
     index = ClassIndex.of(('a', 'a', 'a', 'b'))
-    rare = index.candidates(index.classes_of(('a', 'b', 'a')), rarest_first=True)
+    rare = rarest_class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
     assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
     both = joined(nearest_candidates(similarities, 1), rare, 4)
@@ -87,21 +82,9 @@ def test_the_index_of_classes_agrees_with_their_mask(landmarks, detections, limi
     mask = same_class(tuple(detections), tuple(landmarks))
     classes = index.classes_of(detections)
     assert (index.sizes_of(classes) == mask.sum(axis=1)).all()
-    wanted = class_candidates(mask).pairs
-    assert (index.candidates(classes).pairs == wanted).all()
-    assert (index.candidates(classes, limit=limit).pairs == wanted[:limit]).all()
-
-
-def test_adaptive_k_is_what_may_as_well_be_the_best():
-    """A crop that knows its landmark, one that three fit equally well, one that all fit."""
-    similarities = np.full((3, 20), 0.2, dtype=np.float32)
-    similarities[0, 4] = 0.3
-    similarities[1, [2, 5, 7]] = 0.3, 0.3, 0.299
-    candidates = adaptive_candidates(similarities)
-    assert np.bincount(candidates.detections).tolist() == [2, 3, 8]
-    first = candidates.select(candidates.ranks == 0)
-    assert first.landmarks.tolist() == [4, 2, 0]
-
-
-def test_adaptive_k_fits_the_smallest_map():
-    assert len(adaptive_candidates(np.full((2, 1), 0.2, dtype=np.float32))) == 2
+    found = class_candidates(index, classes)
+    assert (found.pairs == np.argwhere(mask)).all()
+    assert (candidate_mask(found, mask.shape) == mask).all()
+    rarest = rarest_class_candidates(index, classes, 100).pairs
+    assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
+    assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()

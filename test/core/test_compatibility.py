@@ -16,7 +16,8 @@ from cliploc_ros.core.search.compatibility import (
     _distance_range,
     compatible_pairs,
 )
-from cliploc_ros.core.search.search import Leaders, search_exhaustively, search_progressively
+from cliploc_ros.core.search.leaders import Leaders
+from cliploc_ros.core.search.strategies import search_exhaustively, search_progressively
 
 
 @pytest.fixture(scope='module')

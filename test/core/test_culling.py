@@ -7,18 +7,23 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from reference import sample_pose, verify
 
-from cliploc_ros.core.association.culling import (
+from cliploc_ros.core.association.scene import Scene, make_scene
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
+from cliploc_ros.core.geometry.projection import Poses
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.index.culling import (
     make_groups,
     no_landmarks,
     sort_landmarks,
     visible_members,
 )
-from cliploc_ros.core.association.scene import Scene, Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.search import Leaders, search_samples
+from cliploc_ros.core.search.strategies import search_samples
+
+HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))
 
 
 def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
@@ -49,17 +54,16 @@ def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
 def test_nothing_that_counts_is_left_out(seed):
     scene, plain = make_storey(5_000, seed), make_storey(5_000, seed, by_class=False)
     samples = draw_ransac(scene.pairs, 300, np.random.default_rng(seed))
-    workspace, scores = Workspace.allocate(len(scene.bearings)), []
+    scores = []
     for sample in samples:
-        which, _ = sample_pose(plain, sample, workspace)
-        if which < 0:
+        pose, _ = sample_pose(plain, sample)
+        if pose is None:
             scores.append(-1.0)
             continue
-        pose = workspace.rotations[which].copy(), workspace.translations[which].copy()
-        scores.append(verify(plain, *pose, workspace))
-        landmarks = workspace.landmarks.copy()
-        assert verify(scene, *pose, workspace) == scores[-1]
-        assert (workspace.landmarks == landmarks).all()
+        expected, found = verify(plain, *pose), verify(scene, *pose)
+        scores.append(expected.score)
+        assert found.score == expected.score
+        assert (found.landmarks == expected.landmarks).all()
     leaders = Leaders.none_yet(len(samples))
     list(search_samples(scene, samples, leaders))
     ranked = leaders.ranked()
@@ -75,22 +79,23 @@ def test_a_frame_sees_what_its_boxes_can_show_and_little_more(rng, classes):
     shapes = np.zeros((1_000, 6))
     shapes[:, [0, 3, 5]] = 4.0
     class_ids = rng.permutation(np.arange(1_000) % classes)
-    nearby = sort_landmarks(centers, shapes, class_ids)
-    assert (np.sort(nearby.numbers) == np.arange(1_000)).all()
-    assert (nearby.landmarks[:, :3] == centers[nearby.numbers]).all()
-    steps = np.linalg.norm(np.diff(nearby.landmarks[:, :3], axis=0), axis=1)
-    assert np.median(steps) < 20  # neighbours stand together
-    groups = make_groups(nearby, np.array([-1, 0]),
+    landmarks = sort_landmarks(centers, shapes, class_ids)
+    assert (np.sort(landmarks.numbers) == np.arange(1_000)).all()
+    assert (landmarks.landmarks[:, :3] == centers[landmarks.numbers]).all()
+    assert landmarks.radii == pytest.approx(2.0)
+    steps = np.linalg.norm(np.diff(landmarks.landmarks[:, :3], axis=0), axis=1)
+    assert np.median(steps) < 20  # neighbours have near rows
+    groups = make_groups(landmarks, np.array([-1, 0]),
                          np.array([[5.0, 5, 1, 1], [0, 0, 0.3, 0.2]]), 0.02)
     assert groups.detections.tolist() == [1]
-    members = nearby.numbers[groups.members[:, 0]]
+    members = landmarks.numbers[groups.members[:, 0]]
     assert set(members) == set(np.nonzero(class_ids == 0)[0])
     seen = np.empty((2, len(members)), dtype=np.int64)
-    count = visible_members(groups, np.eye(3)[None], np.zeros((1, 3)), 0, seen)
+    count = visible_members(groups, HERE, 0, seen)
     visible = {int(members[member]) for member in seen[0, :count]}
     outlines = project_ellipsoids(np.eye(4), centers, shapes)
     overlap = ((np.abs(outlines[:, 0]) < 0.3) & (np.abs(outlines[:, 1]) < 0.2)
-               & (class_ids == 0) & (centers[:, 2] < groups.reaches[0] * 2.0))
+               & (class_ids == 0) & (centers[:, 2] < groups.spheres[0, 4]))
     assert overlap.any() or classes > 7
     assert set(np.nonzero(overlap)[0]) <= visible
     assert len(visible) <= 3 * overlap.sum() + 3
@@ -100,12 +105,15 @@ def test_a_frame_sees_what_its_boxes_can_show_and_little_more(rng, classes):
 def test_every_sphere_holds_what_is_below_it(rng, count):
     centers, class_ids = rng.uniform(-5, 5, (count, 3)), np.arange(count) % 2
     shapes = shape_matrices(rng.uniform(0.1, 0.4, (count, 3)), np.tile([0.0, 0, 0, 1], (count, 1)))
-    _, _, reaches, _, members, levels, spheres = make_groups(
+    _, _, _, members, levels, spheres = make_groups(
         sort_landmarks(centers, shapes, class_ids), np.array([0, 1]),
         np.array([[0.1, 0.1, 0.2, 0.1], [0, 0, 0.3, 0.2]]), 0.2)
     assert len(members) == levels[1] == count
     assert len(spheres) == levels[-1] == levels[-2] + 1  # the last one holds all
-    assert (spheres[:count, 4] == spheres[:count, 3] * reaches[members[:, 1]]).all()
+    reaches = spheres[:count, 4] / spheres[:count, 3]
+    for group in range(min(count, 2)):
+        assert np.ptp(reaches[members[:, 1] == group]) < 1e-9
+    assert reaches.min() > 1.0
     for level, (first, last) in enumerate(pairwise(levels)):
         holders = spheres[first:last][np.arange(count) // 8**level]
         apart = np.linalg.norm(spheres[:count, :3] - holders[:, :3], axis=1)
@@ -114,24 +122,23 @@ def test_every_sphere_holds_what_is_below_it(rng, count):
 
 
 def test_frames_that_show_nothing_of_the_map():
-    for nearby in (no_landmarks(), sort_landmarks(np.zeros((1, 3)), np.ones((1, 6)),
-                                                  np.zeros(1, dtype=np.int64))):
+    for landmarks in (no_landmarks(), sort_landmarks(np.zeros((1, 3)), np.ones((1, 6)),
+                                                     np.zeros(1, dtype=np.int64))):
         for classes in (np.empty(0, dtype=np.int64), np.array([-1])):
-            groups = make_groups(nearby, classes, np.ones((len(classes), 4)), 0.2)
-            assert len(groups.reaches) == len(groups.members) == len(groups.spheres) == 0
-            assert visible_members(groups, np.eye(3)[None], np.zeros((1, 3)), 0,
-                                   np.empty((2, 0), dtype=np.int64)) == 0
+            groups = make_groups(landmarks, classes, np.ones((len(classes), 4)), 0.2)
+            assert len(groups.starts) - 1 == len(groups.members) == len(groups.spheres) == 0
+            assert visible_members(groups, HERE, 0, np.empty((2, 0), dtype=np.int64)) == 0
 
 
 def test_far_landmarks_appear_too_small():
-    """The reach against the outlines of spheres."""
+    """The greatest depth of a member against the outlines of spheres."""
     radius, box, iou_threshold = 0.3, np.array([[0.0, 0, 0.4, 0.3]]), 0.2
     shape = np.array([[radius**2, 0, 0, radius**2, 0, radius**2]])
-    reach = float(make_groups(sort_landmarks(np.zeros((1, 3)), shape, np.zeros(1, dtype=np.int64)),
-                              np.zeros(1, dtype=np.int64), box, iou_threshold).reaches[0])
+    farthest = make_groups(sort_landmarks(np.zeros((1, 3)), shape, np.zeros(1, dtype=np.int64)),
+                           np.zeros(1, dtype=np.int64), box, iou_threshold).spheres[0, 4]
     for x in (-0.5, 0.0, 0.5):
         direction = np.array([x, 0.2, 1.0])
-        center = direction * reach * radius * 1.001
+        center = direction * farthest * 1.001
         exx, exy, eyy = project_ellipsoids(np.eye(4), center[None], shape)[0, 2:]
         assert np.sqrt(exx * eyy - exy * exy) < iou_threshold * 0.4 * 0.3
 

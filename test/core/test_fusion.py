@@ -4,21 +4,22 @@
 
 import numpy as np
 import pytest
+from reference import verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.association.matching import match_frame
-from cliploc_ros.core.association.scene import Workspace, make_scene, verify
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN, move, robust_cost
-from cliploc_ros.core.fit.several_frames import (
-    _linearize,
-    _pair,
-    _residuals,
-    choose_distinct,
-    make_rig,
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.box_edges import robust_cost
+from cliploc_ros.core.fit.refinement import (
+    linearize_rig,
+    move,
+    one_to_one,
     refine_rig,
-    verify_rig,
+    residuals_of_rig,
 )
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -28,6 +29,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 FRAMES = 4
 
@@ -81,29 +83,19 @@ def shaken(pose, rng, metres, degrees):
         size=3))
 
 
-def test_one_frame_is_verified_as_ever(room, rng):
-    scene, rig = see(room, MAP_FROM_CAMERA), rig_of(room, [MAP_FROM_CAMERA])
-    alone, joined = Workspace.allocate(len(room)), Workspace.allocate(len(room))
-    for _ in range(20):
-        pose = split(shaken(MAP_FROM_CAMERA, rng, 0.2, 4.0))
-        assert verify_rig(rig, *pose, joined) == verify(scene, *pose, alone)
-        np.testing.assert_array_equal(joined.landmarks, alone.landmarks)
-        np.testing.assert_array_equal(joined.ious, alone.ious)
-
-
 def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
     rig = rig_of(room, walk)
-    workspace, alone = Workspace.allocate(FRAMES * len(room)), Workspace.allocate(len(room))
     shift = invert_transform(walk[-1]) @ shaken(walk[-1], rng, 0.03, 0.5)
-    scores, landmarks = [], []
+    alone = []
     for pose in walk:  # the rig moves as one
         moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
-        scores.append(verify(see(room, pose), *split(moved), alone))
-        landmarks.append(alone.landmarks.copy())
-    assert min(scores) > 1.0
-    found = verify_rig(rig, *split(walk[-1] @ shift), workspace)
-    assert found == pytest.approx(sum(scores), abs=1e-9)
-    np.testing.assert_array_equal(workspace.landmarks, np.concatenate(landmarks))
+        alone.append(verify(see(room, pose), *split(moved)))
+    assert min(one.score for one in alone) > 1.0
+    found = verify_rig(rig, *split(walk[-1] @ shift))
+    assert found.score == pytest.approx(sum(one.score for one in alone), abs=1e-9)
+    np.testing.assert_array_equal(found.landmarks,
+                                  np.concatenate([one.landmarks for one in alone]))
+    np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
 
 
 def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
@@ -120,16 +112,16 @@ def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
         seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
         scenes.append(match_frame(many, Observation(CAMERA, seen),
                                   RelocalizerOptions(matching='class'))[0])
-    assert [len(scene.groups.reaches) for scene in scenes] == [3, 0, 1, 1]
+    assert [len(scene.groups.starts) - 1 for scene in scenes] == [3, 0, 1, 1]
     cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
     rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
-    workspace, place = Workspace.allocate(8), 3
+    place = 3
     reference = walk[-1].copy()
     reference[0, 3] += 30.0 * place
-    verify_rig(rig, *split(reference), workspace)
+    found = verify_rig(rig, *split(reference))
     np.testing.assert_array_equal(
-        workspace.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
-    assert workspace.ious.min() > 0.6
+        found.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
+    assert found.ious.min() > 0.6
 
 
 def test_frames_that_saw_nothing_take_no_part(room, walk):
@@ -137,13 +129,11 @@ def test_frames_that_saw_nothing_take_no_part(room, walk):
     scenes = [see(room, walk[0]), see(room, walk[1], rows=slice(0, 0)),
               see(room, walk[2], rows=slice(2, 3)), see(room, walk[3], rows=slice(0, 0))]
     rig = make_rig(scenes, relative, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
-    workspace = Workspace.allocate(len(room) + 1)
-    rotation, translation = split(walk[-1])
-    perfect = verify_rig(rig, rotation, translation, workspace)
-    np.testing.assert_array_equal(workspace.landmarks, [*range(len(room)), 2])
-    score, information = refine_rig(rig, rotation, translation, workspace)
-    assert score == pytest.approx(perfect, abs=1e-2)
-    assert (np.linalg.eigvalsh(information) > 0).all()
+    perfect = verify_rig(rig, *split(walk[-1]))
+    np.testing.assert_array_equal(perfect.landmarks, [*range(len(room)), 2])
+    refined = refine_rig(rig, *split(walk[-1]))
+    assert refined.score == pytest.approx(perfect.score, abs=1e-2)
+    assert (np.linalg.eigvalsh(refined.information) > 0).all()
 
 
 def test_the_gradient_is_that_of_differences(room, walk, rng):
@@ -152,22 +142,20 @@ def test_the_gradient_is_that_of_differences(room, walk, rng):
     verticals = np.array([[*(invert_transform(pose)[:3, :3] @ up), *up, 0.02] for pose in walk])
     rig = rig_of(room, walk, verticals, noise_px=3.0, rng=rng)
     rotation, translation = split(shaken(walk[-1], rng, 0.1, 2.0))
-    workspace, starts = Workspace.allocate(FRAMES * len(room)), np.zeros(FRAMES + 1, np.int64)
-    verify_rig(rig, rotation, translation, workspace)
-    fixed = _pair(rig, workspace, starts), starts, rig.cameras, rig.verticals
-    assert starts[-1] > 2 * len(room)
-    residuals = np.empty(4 * starts[-1] + 3 * FRAMES)
+    inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
+    assert inliers.starts[-1] == len(inliers.pairs) > 2 * len(room)
+
+    def residuals_at(pose):
+        in_front, residuals = residuals_of_rig(rig, inliers, *pose)
+        assert in_front
+        return residuals
 
     def cost(step):
-        moved, moved_translation = np.empty((3, 3)), np.empty(3)
-        move(rotation, translation, step, moved, moved_translation)
-        assert _residuals(*fixed, moved, moved_translation, residuals)
-        return robust_cost(residuals)
+        return robust_cost(residuals_at(move(rotation, translation, step)))
 
     differences = [(cost(step) - cost(-step)) / 2e-6 for step in np.eye(6) * 1e-6]
-    information, gradient = np.empty((6, 6)), np.empty(6)
-    assert _residuals(*fixed, rotation, translation, residuals)
-    _linearize(*fixed, rotation, translation, residuals, information, gradient)
+    information, gradient = linearize_rig(rig, inliers, rotation, translation,
+                                          residuals_at((rotation, translation)))
     np.testing.assert_allclose(-2.0 * gradient, differences, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
 
@@ -178,10 +166,8 @@ def test_several_views_are_nearer_the_truth_than_one(room, walk, rng):
         start = shaken(walk[-1], rng, 0.05, 1.0)
         noise = {'noise_px': 3.0, 'rng': rng}
         for count, found in errors.items():
-            rotation, translation = split(start)
-            rig = rig_of(room, walk[-count:], **noise)
-            refine_rig(rig, rotation, translation, Workspace.allocate(count * len(room)))
-            pose = invert_transform(make_transform(rotation, translation))
+            refined = refine_rig(rig_of(room, walk[-count:], **noise), *split(start))
+            pose = invert_transform(make_transform(refined.rotation, refined.translation))
             found.append(pose_error(pose, walk[-1])[0])
     medians = {count: np.median(found) for count, found in errors.items()}
     print(f'\nboxes by 3 px: one frame {medians[1]:.3f} m off, {FRAMES} frames '
@@ -190,15 +176,16 @@ def test_several_views_are_nearer_the_truth_than_one(room, walk, rng):
 
 
 def test_the_best_at_each_place_are_chosen(room, walk, rng):
-    rig, workspace = rig_of(room, walk), Workspace.allocate(FRAMES * len(room))
+    rig = rig_of(room, walk)
     near = [shaken(walk[-1], rng, 0.02, 0.3) for _ in range(6)]
     far = walk[-1].copy()
     far[2, 3] -= 1.0
     poses = [*near[:3], far, *near[3:]]
     rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
-    rows, scores = choose_distinct(rig, rotations, translations, 5, workspace)
+    scores = scores_of(rig, rotations, translations)
+    rows = choose_distinct(scores, rotations, translations, 5)
     assert len(rows) == 2
     assert rows[1] == 3
     assert scores[rows[0]] == scores.max() > scores[3]
-    rows, _ = choose_distinct(rig, rotations, translations, 1, workspace)
+    rows = choose_distinct(scores, rotations, translations, 1)
     np.testing.assert_array_equal(rows, [int(np.argmax(scores))])

@@ -4,11 +4,17 @@
 
 import numpy as np
 import pytest
+from reference import candidate_mask, same_class, sample_pose, verify
 
-from cliploc_ros.core.association import candidates as association
-from cliploc_ros.core.association.scene import Workspace, make_scene, sample_pose, verify
+from cliploc_ros.core.association.candidates import (
+    balanced_order,
+    nearest_candidates,
+    prosac_order,
+)
+from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.geometry.p3p import solve_p3p
-from cliploc_ros.core.search.search import Leaders, search_exhaustively
+from cliploc_ros.core.search.leaders import Leaders
+from cliploc_ros.core.search.strategies import search_exhaustively
 
 
 @pytest.fixture(scope='module')
@@ -22,10 +28,10 @@ def golden_scenes(office, office_map, queries, observe):
         if 'H' not in values:  # fewer than three boxes
             continue
         observation = observe(frame)
-        nearest = association.nearest_candidates(frame.similarities, 3)
-        potential = association.same_class(frame.class_ids, office_map.class_ids)
-        potential |= association.candidate_mask(nearest, potential.shape)
-        pairs = association.balanced_order(nearest).pairs
+        nearest = nearest_candidates(frame.similarities, 3)
+        potential = same_class(frame.class_ids, office_map.class_ids)
+        potential |= candidate_mask(nearest, potential.shape)
+        pairs = balanced_order(nearest).pairs
         scene = make_scene(observation.camera.normalize_bboxes(frame.bboxes_xyxy),
                            office_map.centers, office_map.shapes, potential, pairs,
                            float(golden['thr']))
@@ -36,8 +42,8 @@ def golden_scenes(office, office_map, queries, observe):
 
 def test_orders_and_masks_are_identical(golden_scenes):
     for _, nearest, potential, values in golden_scenes:
-        assert (association.prosac_order(nearest).pairs == values['prosac']).all()
-        assert (association.balanced_order(nearest).pairs == values['bprosac']).all()
+        assert (prosac_order(nearest).pairs == values['prosac']).all()
+        assert (balanced_order(nearest).pairs == values['bprosac']).all()
         assert (potential == values['vmask'].astype(bool)).all()
 
 
@@ -45,25 +51,24 @@ def test_scores_inliers_and_poses_agree(golden_scenes):
     compared, worst, only_ours = 0, 0.0, 0
     for scene, _, _, values in golden_scenes:
         row_of = {tuple(pair): row for row, pair in enumerate(scene.pairs.tolist())}
-        workspace = Workspace.allocate(len(scene.bearings))
         for sample, score, inliers, pose in zip(values['H'], values['S'], values['inl'],
                                                 values['RT'], strict=True):
             if sample[0] < 0:
                 continue
             rows = np.array([row_of[sample[i], sample[i + 3]] for i in range(3)])
-            solution, _ = sample_pose(scene, rows, workspace)
-            if score < 0 and solution >= 0:
+            found, _ = sample_pose(scene, rows)
+            if score < 0 and found is not None:
                 only_ours += 1
-                assert_solves(scene, rows, workspace, solution)
+                assert_solves(scene, rows, *found)
                 continue
-            assert (score < 0) == (solution < 0)
+            assert (score < 0) == (found is None)
             compared += 1
-            if solution < 0:
+            if found is None:
                 continue
-            rotation = workspace.rotations[solution]
-            translation = workspace.translations[solution]
-            worst = max(worst, abs(verify(scene, rotation, translation, workspace) - score))
-            assert (workspace.landmarks >= 0).sum() == inliers
+            rotation, translation = found
+            verified = verify(scene, rotation, translation)
+            worst = max(worst, abs(verified.score - score))
+            assert (verified.landmarks >= 0).sum() == inliers
             # theirs is rounded to single precision
             assert np.abs(rotation - pose[:, :3]).max() < 1e-2
             assert np.abs(translation - pose[:, 3]).max() < 1e-2
@@ -74,9 +79,8 @@ def test_scores_inliers_and_poses_agree(golden_scenes):
     assert only_ours <= 2
 
 
-def assert_solves(scene, rows, workspace, solution):
+def assert_solves(scene, rows, rotation, translation):
     """A pose that only we found must look along the three bearings."""
-    rotation, translation = workspace.rotations[solution], workspace.translations[solution]
     seen = scene.centers[scene.pairs[rows, 1]] @ rotation.T + translation
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     assert np.abs(seen - scene.bearings[scene.pairs[rows, 0]]).max() < 1e-8

@@ -4,13 +4,16 @@
 
 import numpy as np
 import pytest
+from reference import verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.association.scene import Workspace, make_scene, verify
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN, linearize, move, residuals_of
-from cliploc_ros.core.fit.several_frames import _LEAST_SHARE, make_rig, refine_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.box_edges import jacobian_of, residuals_of
+from cliploc_ros.core.fit.refinement import LEAST_SHARE, move, refine_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 
 @pytest.fixture(scope='module')
@@ -27,10 +30,9 @@ def see(room, noise_px=0.0, rng=None):
                       np.argwhere(potential), 0.2)
 
 
-def refine(scene, rotation, translation, vertical, workspace):
+def refine(scene, rotation, translation, vertical):
     """One frame alone is a rig of one."""
-    return refine_rig(make_rig([scene], np.eye(4)[None], vertical[None]), rotation, translation,
-                      workspace)
+    return refine_rig(make_rig([scene], np.eye(4)[None], vertical[None]), rotation, translation)
 
 
 def shaken(rng, metres, degrees):
@@ -53,28 +55,25 @@ def error_of(rotation, translation):
 
 
 def test_a_perfect_view_leads_to_the_truth(room, rng):
-    scene, workspace = see(room), Workspace.allocate(len(room))
-    perfect = verify(scene, *shaken(rng, 0.0, 0.0), workspace)
+    scene = see(room)
+    perfect = verify(scene, *shaken(rng, 0.0, 0.0)).score
     for _ in range(50):
-        rotation, translation = shaken(rng, 0.08, 1.5)
-        score, information = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
-        assert error_of(rotation, translation)[0] < 1e-4
-        assert score == pytest.approx(perfect, abs=1e-2)
-        assert (np.linalg.eigvalsh(information) > 0).all()
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
+        assert error_of(found.rotation, found.translation)[0] < 1e-4
+        assert found.score == pytest.approx(perfect, abs=1e-2)
+        assert (np.linalg.eigvalsh(found.information) > 0).all()
+        np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
 
 
 def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rng):
     before, after = [], []
     for _ in range(200):
-        scene, workspace = see(room, 3.0, rng), Workspace.allocate(len(room))
-        rotation, translation = shaken(rng, 0.15, 3.0)
-        before.append(error_of(rotation, translation)[0])
-        start = verify(scene, rotation, translation, workspace)
-        score, _ = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
-        assert score >= _LEAST_SHARE * start
-        assert score == verify(scene, rotation, translation, workspace)
-        after.append(error_of(rotation, translation)[0])
+        scene, start = see(room, 3.0, rng), shaken(rng, 0.15, 3.0)
+        before.append(error_of(*start)[0])
+        found = refine(scene, *start, VERTICAL_UNKNOWN)
+        assert found.score >= LEAST_SHARE * verify(scene, *start).score
+        assert found.score == verify(scene, found.rotation, found.translation).score
+        after.append(error_of(found.rotation, found.translation)[0])
     print(f'\nshaken by {np.median(before):.2f} m, boxes by 3 px: '
           f'{np.median(after):.3f} m off afterwards (median)')
     # three pixels leave so much, wherever one starts
@@ -85,16 +84,12 @@ def test_the_information_is_the_scatter_of_the_results(room, rng):
     """Over many noisy views, errors are as large as the information says, in deviations."""
     normalized = []
     for _ in range(300):
-        scene, workspace = see(room, 3.0, rng), Workspace.allocate(len(room))
-        rotation, translation = shaken(rng, 0.02, 0.3)
-        _, information = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
+        refined = refine(see(room, 3.0, rng), *shaken(rng, 0.02, 0.3), VERTICAL_UNKNOWN)
         true = MAP_FROM_CAMERA
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, translation
-        found = invert_transform(pose)
+        found = invert_transform(make_transform(refined.rotation, refined.translation))
         error = np.r_[true[:3, 3] - found[:3, 3], Rotation.from_matrix(
             true[:3, :3] @ found[:3, :3].T).as_rotvec()]
-        normalized.append(np.linalg.cholesky(information).T @ error)
+        normalized.append(np.linalg.cholesky(refined.information).T @ error)
     # the deviations assumed are not those of this noise, but the ratio must not depend on the axis
     deviations = np.std(normalized, axis=0)
     print(f'\nwhitened errors: {np.round(deviations, 3)}')
@@ -110,22 +105,19 @@ def test_a_known_vertical_is_kept(room, rng):
         tilts[name] = []
         for seed in range(50):
             own = np.random.default_rng(seed)
-            scene, workspace = see(room, 4.0, own), Workspace.allocate(len(room))
-            rotation, translation = shaken(own, 0.1, 1.0)
-            refine(scene, rotation, translation, known, workspace)
+            found = refine(see(room, 4.0, own), *shaken(own, 0.1, 1.0), known)
             tilts[name].append(np.degrees(np.arccos(np.clip(
-                (rotation @ up) @ (true_rotation @ up), -1, 1))))
+                (found.rotation @ up) @ (true_rotation @ up), -1, 1))))
     assert np.median(tilts['known']) < 0.5 * np.median(tilts['unknown'])
 
 
 def test_nothing_to_go_by_changes_nothing(room):
-    scene, workspace = see(room), Workspace.allocate(len(room))
     away = np.diag([-1.0, 1.0, -1.0])
-    rotation, translation = away.copy(), np.zeros(3)
-    score, information = refine(scene, rotation, translation, VERTICAL_UNKNOWN, workspace)
-    assert score == 0.0
-    assert not information.any()
-    np.testing.assert_array_equal(rotation, away)
+    found = refine(see(room), away, np.zeros(3), VERTICAL_UNKNOWN)
+    assert found.score == 0.0
+    assert not found.information.any()
+    np.testing.assert_array_equal(found.rotation, away)
+    np.testing.assert_array_equal(found.translation, np.zeros(3))
 
 
 def test_derivatives_are_those_of_differences(room, rng):
@@ -134,17 +126,11 @@ def test_derivatives_are_those_of_differences(room, rng):
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]
-        fixed = pairs, vertical
-        count = 4 * len(room) + 3
-        residuals, jacobian = np.empty(count), np.empty((count, 6))
-        assert residuals_of(*fixed, rotation, translation, residuals)
-        linearize(*fixed, rotation, translation, residuals, jacobian, np.empty((6, 6)),
-                   np.empty(6))
-        there, back = np.empty(count), np.empty(count)
+        jacobian = jacobian_of(pairs, vertical, rotation, translation)
+        there, back = np.empty(len(jacobian)), np.empty(len(jacobian))
         for axis, step in enumerate(np.eye(6) * 1e-6):
-            moved, moved_translation = np.empty((3, 3)), np.empty(3)
             for sign, values in ((1, there), (-1, back)):
-                move(rotation, translation, sign * step, moved, moved_translation)
-                assert residuals_of(*fixed, moved, moved_translation, values)
+                moved = move(rotation, translation, sign * step)
+                assert residuals_of(pairs, vertical, *moved, values)
             np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
                                        atol=1e-4)

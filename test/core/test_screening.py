@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The fast choice and verification of poses against the plain ones of scoring."""
+"""The search kernel against the plain reference."""
 
 from math import radians
 
@@ -8,24 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference import sample_pose, score, verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.association.scene import Workspace, make_scene, sample_pose, verify
-from cliploc_ros.core.geometry.ellipse import ellipse_iou
-from cliploc_ros.core.geometry.p3p import p3p
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.leaders import Leaders
+from cliploc_ros.core.search.prior import Prior
 from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.screening import (
-    Prior,
-    choose_pose,
-    iou_bound,
-    load_sample,
-    set_up,
-    verify_beyond,
-)
-from cliploc_ros.core.search.search import (
-    Leaders,
+from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
+from cliploc_ros.core.search.strategies import (
     search_exhaustively,
     search_progressively,
     search_samples,
@@ -41,61 +35,55 @@ def upright(**known):
 
 
 @pytest.fixture(scope='module')
-def scene():
+def potential():
+    room = make_room()
+    seen = see_room(room)
+    return np.array(seen.class_ids)[:, None] == np.array(room.class_ids)[None]
+
+
+@pytest.fixture(scope='module')
+def scene(potential):
     room = make_room()
     seen = see_room(room)
     rng = np.random.default_rng(3)
-    potential = np.array(seen.class_ids)[:, None] == np.array(room.class_ids)[None]
     boxes = CAMERA.normalize_bboxes(seen.bboxes_xyxy + rng.normal(0, 4, (len(room), 4)))
     return make_scene(boxes, room.centers, room.shapes, potential, np.argwhere(potential), 0.2)
 
 
-def poses_of(scene, samples, prior=None, least_iou=0.0):
-    """Bench, number of the chosen pose, and how many there were, for each sample."""
-    bench = set_up(scene, prior)
-    for t in range(len(samples)):
-        load_sample(bench.candidates, samples, t, 3, bench.bearings, bench.points,
-                    bench.sampled_boxes, bench.sampled_landmarks)
-        count = p3p(bench.bearings, bench.points, bench.rotations, bench.translations)
-        which = choose_pose(bench.prior, bench.rotations, bench.translations, 3, count,
-                            bench.sampled_boxes, bench.sampled_landmarks,
-                            bench.sampled_outlines, bench.uppers, least_iou)
-        yield samples[t], bench, which
-
-
-def score_beyond(bench, which, floor):
-    return verify_beyond(bench.nearby, bench.groups, bench.landmarks, bench.boxes,
-                         bench.starts, bench.detections, bench.iou_threshold, bench.rotations,
-                         bench.translations, which, bench.seen, bench.outlines,
-                         bench.owners, bench.entries, bench.bounds, bench.best_bounds, floor)
-
-
-def test_it_chooses_and_scores_as_the_plain_way(scene, rng):
-    workspace, compared = Workspace.allocate(len(scene.bearings)), 0
-    for sample, bench, which in poses_of(scene, draw_ransac(scene.pairs, 2_000, rng)):
-        expected, total = sample_pose(scene, sample, workspace)
-        assert which == expected
-        if which < 0:
+def test_it_chooses_and_scores_as_the_reference(scene, potential, rng):
+    bench, compared = set_up(scene), 0
+    samples = draw_ransac(scene.pairs, 2_000, rng)
+    for number, sample in enumerate(samples):
+        which = make_hypothesis(bench, samples, number, 0.0)
+        expected, total = sample_pose(scene, sample)
+        assert (which >= 0) == (expected is not None)
+        if expected is None:
             continue
         compared += 1
-        score = verify(scene, workspace.rotations[which], workspace.translations[which],
-                       workspace)
-        assert score_beyond(bench, which, -1.0) == pytest.approx(score, abs=1e-9)
-        for floor in (0.5 * score, score - 1e-6, score + 1e-6, score + 1.0):
-            found = score_beyond(bench, which, floor)
-            assert found == pytest.approx(max(score, floor), abs=1e-9)
         assert total >= 0.0
+        assert (bench.poses.rotations[which] == expected[0]).all()
+        assert (bench.poses.translations[which] == expected[1]).all()
+        plain, landmarks = score(scene, potential, expected)
+        verified = verify(scene, *expected)
+        assert verified.score == pytest.approx(plain, abs=1e-12)
+        assert (verified.landmarks == landmarks).all()
+        for floor in (-1.0, 0.5 * plain, plain - 1e-6, plain + 1e-6, plain + 1.0):
+            found = verify_beyond(bench.targets, bench.poses, which, bench.overlaps, floor)
+            assert found == pytest.approx(max(plain, floor), abs=1e-9)
     assert compared > 500
 
 
-def test_a_least_overlap_leaves_what_overlaps_less(scene, rng):
-    samples, left = draw_ransac(scene.pairs, 500, rng), 0
-    workspace = Workspace.allocate(len(scene.bearings))
-    for sample, _, which in poses_of(scene, samples, least_iou=1.0):
-        expected, total = sample_pose(scene, sample, workspace)
-        assert which == (expected if total >= 1.0 else -1)
-        left += expected >= 0 and which < 0
-    assert left > 20
+def test_a_least_overlap_drops_what_overlaps_less(scene, rng):
+    bench, dropped = set_up(scene), 0
+    samples = draw_ransac(scene.pairs, 500, rng)
+    for number, sample in enumerate(samples):
+        which = make_hypothesis(bench, samples, number, 1.0)
+        expected, total = sample_pose(scene, sample)
+        assert (which >= 0) == (total >= 1.0)
+        if which >= 0:
+            assert (bench.poses.rotations[which] == expected[0]).all()
+        dropped += expected is not None and which < 0
+    assert dropped > 20
 
 
 sizes = st.floats(0.05, 20.0)
@@ -112,12 +100,8 @@ def test_the_bound_is_never_below_the_iou(a, b, p, q, x, y, angle):
 
 def test_leaders_are_those_of_scoring_every_sample(scene, rng):
     samples = draw_ransac(scene.pairs, 1_000, rng)
-    workspace = Workspace.allocate(len(scene.bearings))
-    scores = []
-    for sample in samples:
-        which, _ = sample_pose(scene, sample, workspace)
-        scores.append(-1.0 if which < 0 else verify(
-            scene, workspace.rotations[which], workspace.translations[which], workspace))
+    poses = [sample_pose(scene, sample)[0] for sample in samples]
+    scores = [-1.0 if pose is None else verify(scene, *pose).score for pose in poses]
     leaders = Leaders.none_yet()
     *_, progress = search_samples(scene, samples, leaders)
     best = leaders.ranked()[0]

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.association.similarities import (
+from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.index.similarities import (
     Similarities,
     pair_similarities,
     sampled_similarities,
 )
-from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 # Boxes that overlap more than this show the same object, detected twice.

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.fit.refinement import RELATIVE_DEVIATION, VERTICAL_UNKNOWN
+from cliploc_ros.core.fit.box_edges import RELATIVE_DEVIATION
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 # Scatter of box centres assumed before any box is seen, as a share of the box, and how many
 # measurements this prior counts as. Without it three boxes alone would seem to fit perfectly.

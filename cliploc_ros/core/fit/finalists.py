@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Workspace
 from cliploc_ros.core.fit.covariance import (
     box_scatter,
     odometry_covariance,
@@ -20,11 +19,13 @@ from cliploc_ros.core.fit.covariance import (
     refined_covariance,
     vertical_information,
 )
-from cliploc_ros.core.fit.several_frames import Rig, choose_distinct, refine_all, verify_rig
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import Rig
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.core.search.search import MAX_DISTINCT, same_place
+from cliploc_ros.core.search.leaders import MAX_DISTINCT, same_place
 
 # Refinement checks the time limit after this many poses.
 _REFINED_AT_ONCE = 4
@@ -112,7 +113,9 @@ def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[F
 
 def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
     """Return the best distinct poses by their scores in all frames, best first."""
-    rows, scores = choose_distinct(rig, *_poses(found), count, _workspace(rig))
+    rotations, translations = _poses(found)
+    scores = scores_of(rig, rotations, translations)
+    rows = choose_distinct(scores, rotations, translations, count)
     return [found[row]._replace(score=float(scores[row])) for row in rows]
 
 
@@ -123,11 +126,8 @@ def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]
         if improved and time.perf_counter() > deadline:
             improved += some
             continue
-        rotations, translations = _poses(some)
-        scores, informations = refine_all(rig, rotations, translations, _workspace(rig))
-        improved += [one._replace(rotation=rotations[row], translation=translations[row],
-                                  score=float(scores[row]), information=informations[row])
-                     for row, one in enumerate(some)]
+        improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
+                     for one in some]
     distinct: list[Finalist] = []
     for one in sorted(improved, key=lambda one: -one.score):
         if not any(same_place(one.rotation, one.translation, better.rotation, better.translation)
@@ -141,18 +141,12 @@ def _poses(found: Sequence[Finalist]) -> tuple[NDArray[np.float64], NDArray[np.f
             np.stack([one.translation for one in found]))
 
 
-def _workspace(rig: Rig) -> Workspace:
-    return Workspace.allocate(int(rig.bounds[-1, 0]))
-
-
 def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
     """Return the inliers of a pose in each frame."""
-    workspace = _workspace(rig)
-    verify_rig(rig, pose.rotation, pose.translation, workspace)
-    return [tuple(Match(int(row - first), int(workspace.landmarks[row]),
-                        float(workspace.ious[row]))
-                  for row in range(first, last) if workspace.landmarks[row] >= 0)
-            for first, last in pairwise(rig.bounds[:, 0])]
+    found = verify_rig(rig, pose.rotation, pose.translation)
+    return [tuple(Match(int(row - first), int(found.landmarks[row]), float(found.ious[row]))
+                  for row in range(first, last) if found.landmarks[row] >= 0)
+            for first, last in pairwise(rig.starts.boxes)]
 
 
 def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,

@@ -15,7 +15,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.compiled import ZERO, compiled
 from cliploc_ros.core.geometry.cubic import largest_cubic_root
 
 MAX_SOLUTIONS = 4
@@ -72,7 +72,7 @@ def p3p(bearings, points, rotations, translations):
     frame, sound = _inverse_triangle_frame(points)
     if not sound:
         return 0
-    count = 0
+    count = ZERO
     for line in (line1, line2):
         roots, depths_a, depths_b = _meet_line_and_conic(line, first)
         for which in range(roots):

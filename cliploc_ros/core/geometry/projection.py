@@ -1,22 +1,55 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Outlines of many landmarks at one pose: of given ones, and of those that the pose may see."""
+"""Outlines of many ellipsoids at one pose, for the search."""
 
 from math import inf, sqrt
+from typing import NamedTuple
 
-from cliploc_ros.core.association.culling import visible_members
+import numpy as np
+from numpy.typing import NDArray
+
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS
+
+
+class Poses(NamedTuple):
+    """Poses camera_from_map, as a minimal solver writes them.
+
+    Parameters
+    ----------
+    rotations, translations : ndarray (p, 3, 3), (p, 3)
+    """
+
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+
+    @staticmethod
+    def allocate() -> 'Poses':
+        """Return memory for the solutions of one minimal sample."""
+        return Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)))
 
 
 @compiled
-def project(rotations, translations, which, landmarks, first, last, reach, outlines, out):
+def project(landmarks, first, last, poses, which, outlines, out):
     """Write the outlines of landmarks first to last at one pose into rows from out on.
 
-    As project_ellipsoid, in one loop without calls, which is several times faster; of ellipsoids
-    that are not wholly in front, or deeper than reach times their radius, the half extents
-    are minus infinity.
+    The numbers are those of project_ellipsoid, in one loop without calls, which is several times
+    faster.
+
+    Parameters
+    ----------
+    landmarks : ndarray (u, 9)
+        Centre and shape of each.
+    first, last : int
+    poses : Poses
+    which : int
+        Row of the pose.
+    outlines : ndarray (o, 6)
+        Centre x and y, half extents x and y, exy, and the product of the semi-axes. The half
+        extents are minus infinity where an ellipsoid is not wholly in front of the camera.
+    out : int
     """
-    square = reach * reach
+    rotations, translations = poses.rotations, poses.translations
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
     r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
     r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
@@ -29,7 +62,7 @@ def project(rotations, translations, which, landmarks, first, last, reach, outli
         y = r10 * px + r11 * py + r12 * pz + t1
         z = r20 * px + r21 * py + r22 * pz + t2
         outlines[out, 2] = outlines[out, 3] = -inf
-        if not (z > 0.0 and z * z <= landmarks[row, 9] * square):
+        if not z > 0.0:
             out += 1
             continue
         x0 = sxx * r00 + sxy * r01 + sxz * r02
@@ -57,17 +90,3 @@ def project(rotations, translations, which, landmarks, first, last, reach, outli
             outlines[out, 4] = exy
             outlines[out, 5] = sqrt(max(0.0, exx * eyy - exy * exy))
         out += 1
-
-
-@compiled
-def project_groups(landmarks, groups, rotations, translations, which, seen, outlines, owners, out):
-    """Project what a pose may see of the groups into rows from out on; return where they end."""
-    members, reaches = groups.members, groups.reaches
-    for place in range(visible_members(groups, rotations, translations, which, seen)):
-        row, group = members[seen[0, place], 0], members[seen[0, place], 1]
-        project(rotations, translations, which, landmarks, row, row + 1, reaches[group],
-                outlines, out)
-        if outlines[out, 2] > 0.0:
-            owners[out] = group
-            out += 1
-    return out

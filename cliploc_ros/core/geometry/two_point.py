@@ -18,7 +18,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.compiled import ZERO, compiled
 
 MAX_TWO_POINT_SOLUTIONS = 2
 # Below this, relative, two points are one, a bearing is level, or a baseline is vertical.
@@ -92,7 +92,7 @@ def two_point(bearings, points, verticals, rotations, translations):
         return 0
     discriminant = max(0.0, discriminant)
     q = -half - sqrt(discriminant) if half > 0.0 else -half + sqrt(discriminant)
-    count = 0
+    count = ZERO
     for which in range(2):
         if which == 1 and (q == 0.0 or discriminant == 0.0):
             break

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame searched as if it were alone, by the algorithm that the options name."""
+"""The search of one frame by the algorithm that the options name."""
 
 import time
 from collections.abc import Iterator
@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.leaders import MAX_DISTINCT, Leaders
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN, Prior
 from cliploc_ros.core.search.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
-from cliploc_ros.core.search.screening import Prior
-from cliploc_ros.core.search.search import (
-    MAX_DISTINCT,
-    Leaders,
+from cliploc_ros.core.search.strategies import (
     Progress,
     search_exhaustively,
     search_progressively,
@@ -30,7 +28,7 @@ from cliploc_ros.core.search.search import (
 )
 from cliploc_ros.errors import OptionsError
 
-#: So many of the best are refined: what is worse has never led afterwards on real frames.
+#: So many of the best are refined. On the recorded frames, worse ones never led afterwards.
 REFINED = 32
 # The map's third axis is up (REP 103), and the optical frame's second is down.
 _UP_IN_MAP = (0.0, 0.0, 1.0)
@@ -47,14 +45,14 @@ class SearchedFrame(NamedTuple):
     scene : Scene
         Of the observation.
     vertical : ndarray (7,)
-        See make_rig.
+        See VERTICAL_UNKNOWN.
     leaders : Leaders
-        The best, as poses of this frame's camera.
+        The best hypotheses, as poses of this frame's camera.
     tilted : Leaders
-        Where the vertical is known, the best that did not ask for it; else none.
+        The best hypotheses that ignore the vertical, where it is known; else none.
     progress : Progress
     samples : ndarray (t, 3) or None
-        What was tried; None: all samples of the first candidates, as far as progress reaches.
+        The samples tried; None for all samples of the first candidates, see progress.reach.
     """
 
     observation: Observation
@@ -67,17 +65,17 @@ class SearchedFrame(NamedTuple):
 
     @property
     def sample_size(self) -> int:
-        """Return how many candidates make a pose."""
+        """Return how many candidates a minimal sample has."""
         return _sample_size(self.vertical)
 
     @property
     def has_samples(self) -> bool:
-        """Return whether detections and landmarks can differ in so many candidates."""
+        """Return whether there are enough different detections and landmarks for a sample."""
         return _has_samples(self.scene, self.vertical)
 
     @property
     def known_tried(self) -> int:
-        """Return how many samples were looked at, with those that boxes contradict."""
+        """Return how many samples were tried or ruled out as incompatible."""
         return max(self.progress.tried, comb(self.progress.reach, self.sample_size))
 
 
@@ -99,7 +97,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         Similarities that the matching type needs are missing or of the wrong shape, or the
         vertical is no unit vector.
     """
-    scene, share = match_frame(landmark_map, observation, options)
+    scene, left_out = match_frame(landmark_map, observation, options)
     vertical = _vertical(observation, options)
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
@@ -110,26 +108,34 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                               limit=options.iterations)
             progress = _run(try_all(leaders, size=_sample_size(vertical)), deadline)
             if _is_known(vertical):
-                # Where what is said to be the vertical is wrong, as by a wrong mount, what the
-                # boxes say by themselves must be among the rivals of what it leads to.
+                # The vertical may be wrong, as with a wrong camera mount. Then the pose that the
+                # boxes alone suggest must be among the rivals.
                 free = _run(try_all(tilted), deadline)
                 progress = progress._replace(tried=progress.tried + free.tried)
         elif samples is None:
             progress = _run(search_exhaustively(scene, leaders, prior), deadline)
         else:
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
-        progress = progress._replace(coverage=progress.coverage * share)
+        progress = progress._replace(
+            coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
     return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples)
 
 
 def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
-    """Return the vertical as make_rig takes it; the paper's algorithms know of none."""
+    """Return the vertical (7,) of a frame; the paper's algorithms do not use it."""
     up = observation.up_in_camera
     if up is None or options.algorithm != 'auto':
         return VERTICAL_UNKNOWN
     if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
         raise OptionsError(f'up_in_camera: {up} is no unit vector')
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
+
+
+def _kept_share(kept: int, left_out: int) -> float:
+    """Return the share of all samples that consist of the candidates kept."""
+    if not left_out:
+        return 1.0
+    return comb(kept, SAMPLE_SIZE) / max(comb(kept + left_out, SAMPLE_SIZE), 1)
 
 
 def _is_known(vertical: NDArray[np.float64]) -> bool:
@@ -146,14 +152,14 @@ def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
 
 
 def _prior(vertical: NDArray[np.float64], options: RelocalizerOptions) -> Prior:
-    """Return what the search may take for granted."""
+    """Return what the vertical and the options say about the camera."""
     up_in_camera = tuple(vertical[:3]) if _is_known(vertical) else _UPRIGHT
     low, high = options.height_range_m
     return Prior(up_in_camera, _UP_IN_MAP, low, high, np.radians(options.max_tilt_deg))
 
 
 def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None:
-    """Return the samples (t, 3) of an algorithm that draws them, else None."""
+    """Return the samples (t, 3) of an algorithm that draws them; None for the others."""
     if options.algorithm in ('auto', 'bf'):
         return None
     draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
@@ -162,7 +168,7 @@ def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None
 
 
 def _run(search: Iterator[Progress], deadline: float) -> Progress:
-    """Run a search until its end or until a deadline; return how far it came."""
+    """Run a search to its end or to a deadline; return its progress."""
     progress = Progress(0, 1.0)
     for step in search:
         progress = step

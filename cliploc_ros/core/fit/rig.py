@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of one moving camera, joined by odometry: their cameras form a rigid rig.
+
+A pose of the rig is the pose of the reference frame's camera. It fixes the poses of all others.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.association.scene import Potential, Scene
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.index.culling import Groups
+
+
+class FrameStarts(NamedTuple):
+    """Where each frame's rows begin in the arrays of a rig: arrays (F + 1,).
+
+    Parameters
+    ----------
+    boxes, landmarks, pairs : ndarray (F + 1,)
+        In the box ellipses, and in the landmarks and detections of potential.
+    groups, shown, members, levels, spheres : ndarray (F + 1,)
+        In the groups, and in their detections, members, levels and spheres.
+    """
+
+    boxes: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    groups: NDArray[np.int64]
+    shown: NDArray[np.int64]
+    members: NDArray[np.int64]
+    levels: NDArray[np.int64]
+    spheres: NDArray[np.int64]
+
+
+class Rig(NamedTuple):
+    """The scenes of F frames, one behind the other, and where their cameras are.
+
+    Parameters
+    ----------
+    scene : Scene
+        All arrays but the map's are concatenated. Numbers in them count within their frame, and
+        starts have an end of their own for each frame. It has no pairs.
+    starts : FrameStarts
+    cameras : ndarray (F, 3, 4)
+        Rotation and translation of each camera_from_reference.
+    verticals : ndarray (F, 7)
+        See VERTICAL_UNKNOWN.
+    """
+
+    scene: Scene
+    starts: FrameStarts
+    cameras: NDArray[np.float64]
+    verticals: NDArray[np.float64]
+
+
+def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
+             verticals: NDArray[np.float64]) -> Rig:
+    """Return the rig of some frames.
+
+    Parameters
+    ----------
+    scenes : sequence of Scene
+        F of them, of one map.
+    camera_from_reference : ndarray (F, 4, 4)
+    verticals : ndarray (F, 7)
+        See VERTICAL_UNKNOWN.
+    """
+    first = scenes[0]
+    joined = first._replace(
+        box_ellipses=np.concatenate([one.box_ellipses for one in scenes]),
+        bearings=np.concatenate([one.bearings for one in scenes]),
+        potential=Potential(*map(np.concatenate, zip(*(one.potential for one in scenes),
+                                                     strict=True))),
+        pairs=first.pairs[:0],
+        groups=Groups(*map(np.concatenate, zip(*(one.groups for one in scenes), strict=True))))
+    sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
+    starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
+    return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
+               np.ascontiguousarray(verticals))
+
+
+def _sizes(scene: Scene) -> list[int]:
+    """Return how many rows a frame has in each array, in the order of FrameStarts."""
+    potential, groups = scene.potential, scene.groups
+    return [len(scene.box_ellipses), len(potential.landmarks), len(potential.detections),
+            len(groups.starts) - 1, len(groups.detections), len(groups.members),
+            len(groups.levels), len(groups.spheres)]
+
+
+@compiled
+def scene_of(rig, frame):
+    """Return the scene of one frame."""
+    scene, starts, potential, groups = rig.scene, rig.starts, rig.scene.potential, rig.scene.groups
+    after = frame + 1
+    # starts and frusta have one row more than their frame has landmarks or groups
+    landmarks, landmarks_end = starts.landmarks[frame], starts.landmarks[after]
+    groups_begin, groups_end = starts.groups[frame] + frame, starts.groups[after] + after
+    boxes = scene.box_ellipses[starts.boxes[frame]:starts.boxes[after]]
+    bearings = scene.bearings[starts.boxes[frame]:starts.boxes[after]]
+    own_potential = Potential(
+        potential.landmarks[landmarks:landmarks_end],
+        potential.starts[landmarks + frame:landmarks_end + after],
+        potential.detections[starts.pairs[frame]:starts.pairs[after]])
+    own_groups = Groups(
+        groups.starts[groups_begin:groups_end],
+        groups.detections[starts.shown[frame]:starts.shown[after]],
+        groups.frusta[groups_begin:groups_end],
+        groups.members[starts.members[frame]:starts.members[after]],
+        groups.levels[starts.levels[frame]:starts.levels[after]],
+        groups.spheres[starts.spheres[frame]:starts.spheres[after]])
+    return Scene(boxes, bearings, scene.centers, scene.shapes, own_potential, scene.pairs,
+                 scene.iou_threshold, scene.sorted_landmarks, own_groups)
+
+
+@compiled
+def camera_pose(rig, frame, rotation, translation):
+    """Return camera_from_map of one frame (3, 3), (3,) at a pose of the reference."""
+    camera = rig.cameras[frame]
+    own_rotation, own_translation = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            own_rotation[i, j] = (camera[i, 0] * rotation[0, j] + camera[i, 1] * rotation[1, j]
+                                  + camera[i, 2] * rotation[2, j])
+        own_translation[i] = (camera[i, 0] * translation[0] + camera[i, 1] * translation[1]
+                              + camera[i, 2] * translation[2] + camera[i, 3])
+    return own_rotation, own_translation

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frustum culling with a tree of bounding spheres: a pose is compared with what it may see.
+
+A landmark can overlap a box by more than the threshold only if it reaches into the frustum
+through the boxes of its class, and if it is near enough to appear large enough. Culling drops
+only the others, so it changes no result. The map is sorted along a Morton curve once. Each frame
+builds a tree over the landmarks of the classes that it shows; the tree also bounds their depth.
+"""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.projection import project
+
+#: Up to so many landmarks, comparing with all is faster than culling.
+FEW = 64
+# Children of each sphere of the tree.
+_BRANCHES = 8
+_MORTON_BITS = 16
+# Landmarks that appear larger than this half angle are never culled by depth.
+_NEAR_ANGLE = np.radians(10.0)
+
+
+class SortedLandmarks(NamedTuple):
+    """All landmarks of a map along a Morton curve, so that neighbours have near rows: L of them.
+
+    Parameters
+    ----------
+    landmarks : ndarray (L, 9)
+        Centre and shape of each.
+    radii : ndarray (L,)
+        Greatest semi-axis of each [m].
+    numbers : ndarray (L,)
+        Row of each in the map.
+    classes : ndarray (L,) of int32
+        Class number of each.
+    """
+
+    landmarks: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    numbers: NDArray[np.int64]
+    classes: NDArray[np.int32]
+
+
+class Groups(NamedTuple):
+    """The landmarks of the classes that a frame shows: g classes, w landmarks, m spheres.
+
+    A group is a class: its detections may show any of its landmarks, the members.
+
+    Parameters
+    ----------
+    starts : ndarray (g + 1,)
+        Where the detections of each group begin in detections.
+    detections : ndarray (v,)
+    frusta : ndarray (g + 1, 4, 2)
+        Unit normals, inwards, of the sides of the frustum through the boxes of each group: x and z
+        of left and right, y and z of top and bottom. The last row is the frustum through all.
+    members : ndarray (w, 2) of int32
+        Row among the sorted landmarks, in their order, and group.
+    levels : ndarray (d + 1,)
+        Where each level of the tree begins in spheres. The first level has a sphere for each
+        member, the next one for each eight of them, up to the root.
+    spheres : ndarray (m, 5)
+        Centre and radius of a sphere around all members below, and the depth of the centre beyond
+        which all of them appear too small [m].
+    """
+
+    starts: NDArray[np.int64]
+    detections: NDArray[np.int64]
+    frusta: NDArray[np.float64]
+    members: NDArray[np.int32]
+    levels: NDArray[np.int64]
+    spheres: NDArray[np.float64]
+
+
+def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
+                   classes: NDArray[np.int64]) -> SortedLandmarks:
+    """Return the landmarks of a map along a Morton curve.
+
+    Parameters
+    ----------
+    centers, shapes : ndarray (L, 3), (L, 6)
+        See cliploc_ros.core.geometry.ellipsoid.
+    classes : ndarray (L,) of int
+        Class number of each landmark, from 0.
+    """
+    numbers = np.argsort(_morton_codes(centers), kind='stable')
+    centers, shapes = centers[numbers], shapes[numbers]
+    # the greatest eigenvalue of a shape matrix is the square of the greatest semi-axis
+    squares = np.linalg.eigvalsh(shapes[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))[:, 2]
+    squares *= 1.0 + 1e-9
+    return SortedLandmarks(np.column_stack([centers, shapes]), np.sqrt(squares),
+                           numbers.astype(np.int64), classes[numbers].astype(np.int32))
+
+
+def no_landmarks() -> SortedLandmarks:
+    """Return an empty table."""
+    return SortedLandmarks(np.empty((0, 9)), np.empty(0), np.empty(0, dtype=np.int64),
+                           np.empty(0, dtype=np.int32))
+
+
+def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
+                boxes: NDArray[np.float64], iou_threshold: float) -> Groups:
+    """Return the groups of a frame.
+
+    Parameters
+    ----------
+    sorted_landmarks : SortedLandmarks
+    classes : ndarray (n,) of int
+        Class of each detection, as the sorted landmarks have them; below 0 for none.
+    boxes : ndarray (n, 4)
+        Box ellipses, see Scene.
+    iou_threshold : float
+        Landmarks that cannot overlap a box by more than this are culled.
+    """
+    shown = np.unique(classes[classes >= 0])
+    rows = [np.nonzero(classes == one)[0] for one in shown]
+    frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
+    reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
+                               _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
+    members = _members(sorted_landmarks.classes, shown)
+    radii = sorted_landmarks.radii[members[:, 0]]
+    return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
+                  np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
+                  frusta, members, *_make_tree(sorted_landmarks.landmarks[members[:, 0], :3],
+                                               radii, radii * reaches[members[:, 1]]))
+
+
+def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return row and group (w, 2) of each landmark whose class is one of the sorted shown ones."""
+    if not len(shown):
+        return np.empty((0, 2), dtype=np.int32)
+    of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
+    of_classes[shown] = np.arange(len(shown))
+    groups = of_classes[classes]
+    rows = np.nonzero(groups >= 0)[0]
+    return np.column_stack([rows, groups[rows]]).astype(np.int32)
+
+
+def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
+               depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return levels and spheres of the tree over some landmarks, see Groups.
+
+    Parameters
+    ----------
+    centers, radii : ndarray (w, 3), (w,)
+        Of landmarks along a Morton curve.
+    depths : ndarray (w,)
+        The depth beyond which each appears too small.
+    """
+    spheres = [np.c_[centers, radii, depths]]
+    low = high = centers
+    while len(low) > 1:
+        cuts = np.arange(0, len(low), _BRANCHES)
+        low, high = np.minimum.reduceat(low, cuts), np.maximum.reduceat(high, cuts)
+        radii, depths = np.maximum.reduceat(radii, cuts), np.maximum.reduceat(depths, cuts)
+        around = np.linalg.norm(high - low, axis=1) / 2
+        spheres.append(np.c_[(low + high) / 2, around + radii, around + depths])
+    return np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres)
+
+
+def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the place (u,) of points (u, 3) on a Morton curve through their bounding cube."""
+    low, extent = centers.min(axis=0), np.ptp(centers, axis=0).max()
+    cells = ((centers - low) / max(extent, 1e-9) * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    code = np.zeros(len(centers), dtype=np.uint64)
+    for axis in range(3):
+        bits = cells[:, axis]
+        for shift, mask in ((32, 0x1f00000000ffff), (16, 0x1f0000ff0000ff),
+                            (8, 0x100f00f00f00f00f), (4, 0x10c30c30c30c30c3),
+                            (2, 0x1249249249249249)):
+            bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+        code |= bits << np.uint64(axis)
+    return code
+
+
+def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sides (4, 2) of the frustum through some boxes, see Groups."""
+    if not len(boxes):
+        return np.zeros((4, 2))
+    low = (boxes[:, :2] - boxes[:, 2:]).min(axis=0)
+    high = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
+    sides = np.array([[1.0, -low[0]], [-1.0, high[0]], [1.0, -low[1]], [-1.0, high[1]]])
+    return sides / np.linalg.norm(sides, axis=1, keepdims=True)
+
+
+def _widest_angle(boxes: NDArray[np.float64]) -> float:
+    """Return the greatest angle between the optical axis and a corner of some boxes [rad]."""
+    return float(np.arctan(np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1).max()))
+
+
+def _reach(least_axes: float, angle: float) -> float:
+    """Return the depth, in radii of a landmark, beyond which its outline is too small.
+
+    A sphere of radius r at a depth z and a distance d has an outline on the plane z = 1 whose
+    semi-axes have the product ``r^2 sqrt(d^2 - r^2) / (z^2 - r^2)^(3/2)``.
+
+    Parameters
+    ----------
+    least_axes : float
+        Outlines with a smaller product of semi-axes are too small.
+    angle : float
+        Greatest angle between the optical axis and a landmark [rad].
+    """
+    widest = angle + _NEAR_ANGLE
+    nearness = (np.sin(_NEAR_ANGLE) / np.cos(widest))**2 if widest < np.pi / 2 else 1.0
+    if nearness >= 1.0:
+        return inf
+    square = max(least_axes, 1e-24) * np.cos(widest) * (1.0 - nearness)**1.5
+    return float(max(1.0 / np.sin(_NEAR_ANGLE), 1.0 / np.sqrt(square)))
+
+
+@compiled
+def visible_members(groups, poses, which, seen):
+    """Write the members that a pose may see into the first row of seen; return their number.
+
+    The inner loop has no branches: which members are visible is hard to predict.
+
+    Parameters
+    ----------
+    groups : Groups
+    poses : Poses
+    which : int
+        Row of the pose.
+    seen : ndarray (2, w) of int
+        The second row holds their parents in the tree.
+    """
+    rotations, translations = poses.rotations, poses.translations
+    frusta, members, levels, spheres = groups.frusta, groups.members, groups.levels, groups.spheres
+    r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]
+    r10, r11, r12 = rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2]
+    r20, r21, r22 = rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2]
+    t0, t1, t2 = translations[which, 0], translations[which, 1], translations[which, 2]
+    if members.shape[0] == 0:
+        return 0
+    top, frustum = levels.shape[0] - 2, frusta.shape[0] - 1
+    seen[(top + 1) % 2, 0], count = 0, 1
+    for level in range(top, -1, -1):
+        first, size = levels[level], levels[level + 1] - levels[level]
+        above, here = (level + 1) % 2, level % 2
+        found = 0
+        for parent in range(count):
+            begin = _BRANCHES * seen[above, parent]
+            for number in range(begin, min(begin + _BRANCHES, size)):
+                sphere = first + number
+                if level == 0:
+                    frustum = members[number, 1]
+                px, py, pz = spheres[sphere, 0], spheres[sphere, 1], spheres[sphere, 2]
+                behind = -spheres[sphere, 3]
+                x = r00 * px + r01 * py + r02 * pz + t0
+                y = r10 * px + r11 * py + r12 * pz + t1
+                z = r20 * px + r21 * py + r22 * pz + t2
+                seen[here, found] = number
+                found += ((z >= behind) & (z <= spheres[sphere, 4])
+                          & (x * frusta[frustum, 0, 0] + z * frusta[frustum, 0, 1] >= behind)
+                          & (x * frusta[frustum, 1, 0] + z * frusta[frustum, 1, 1] >= behind)
+                          & (y * frusta[frustum, 2, 0] + z * frusta[frustum, 2, 1] >= behind)
+                          & (y * frusta[frustum, 3, 0] + z * frusta[frustum, 3, 1] >= behind))
+        count = found
+    return count
+
+
+@compiled
+def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out):
+    """Project the members that a pose may see; return where their outlines end.
+
+    Parameters
+    ----------
+    landmarks : ndarray (L, 9)
+        See SortedLandmarks.
+    groups, poses, which, seen
+        See visible_members.
+    outlines, owners : ndarray (o, 6), (o,)
+        Outlines that are visible and the group of each, written from row out on.
+    out : int
+    """
+    members = groups.members
+    for place in range(visible_members(groups, poses, which, seen)):
+        row, group = np.int64(members[seen[0, place], 0]), members[seen[0, place], 1]
+        project(landmarks, row, row + 1, poses, which, outlines, out)
+        if outlines[out, 2] > 0.0:
+            owners[out] = group
+            out += 1
+    return out

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The best hypotheses of a search, each at a place of its own."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+
+MAX_DISTINCT = 8
+# Hypotheses nearer than this to a better one are at the same place.
+DISTINCT_DISTANCE_M = 0.5
+DISTINCT_ANGLE_DEG = 20.0
+# The trace of a rotation is 1 + 2 cos(angle).
+_DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
+# Scores nearer than this differ by rounding only: the hypothesis found first stays.
+_TIE = 1e-9
+
+
+class Leaders(NamedTuple):
+    """The best hypotheses so far, at distinct places; unused rows have the score -1.
+
+    Parameters
+    ----------
+    scores : ndarray (m,)
+    iterations : ndarray (m,) of int
+        In which iteration each was found, from 1.
+    samples : ndarray (m, 3) of int
+        Its minimal sample, as candidate numbers.
+    rotations, translations : ndarray (m, 3, 3), (m, 3)
+        Of camera_from_map.
+    """
+
+    scores: NDArray[np.float64]
+    iterations: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+
+    @staticmethod
+    def none_yet(count: int = MAX_DISTINCT) -> 'Leaders':
+        """Return room for so many leaders, all unused."""
+        return Leaders(np.full(count, -1.0), np.zeros(count, dtype=np.int64),
+                       np.full((count, 3), -1, dtype=np.int64),
+                       np.zeros((count, 3, 3)), np.zeros((count, 3)))
+
+    def ranked(self) -> NDArray[np.int64]:
+        """Return the used rows, best first."""
+        order = np.argsort(-self.scores, kind='stable')
+        return order[self.scores[order] >= 0.0]
+
+
+@compiled
+def worst_score(leaders):
+    """Return the score that a hypothesis must exceed to lead."""
+    worst = leaders.scores[0]
+    for row in range(1, leaders.scores.shape[0]):
+        worst = min(worst, leaders.scores[row])
+    return worst
+
+
+@compiled
+def remember(leaders, score, iteration, sample, rotation, translation):
+    """Add a hypothesis, unless a better one leads at its place; drop worse ones there."""
+    scores = leaders.scores
+    free = -1
+    for row in range(scores.shape[0]):
+        if scores[row] < 0.0:
+            continue
+        if not same_place(rotation, translation, leaders.rotations[row],
+                          leaders.translations[row]):
+            continue
+        if scores[row] >= score - _TIE:
+            return
+        scores[row] = -1.0
+        free = row
+    if free < 0:
+        free = 0
+        for row in range(1, scores.shape[0]):
+            if scores[row] < scores[free]:
+                free = row
+    scores[free] = score
+    leaders.iterations[free] = iteration
+    for i in range(3):
+        leaders.samples[free, i] = sample[i]
+        leaders.translations[free, i] = translation[i]
+        for j in range(3):
+            leaders.rotations[free, i, j] = rotation[i, j]
+
+
+@compiled
+def same_place(rotation_a, translation_a, rotation_b, translation_b):
+    """Return whether two camera_from_map poses are within the distinct distance and angle."""
+    trace, square = 0.0, 0.0
+    for i in range(3):
+        center_a, center_b = 0.0, 0.0
+        for j in range(3):
+            trace += rotation_a[i, j] * rotation_b[i, j]
+            center_a -= rotation_a[j, i] * translation_a[j]
+            center_b -= rotation_b[j, i] * translation_b[j]
+        square += (center_a - center_b) ** 2
+    return trace >= _DISTINCT_TRACE and square <= DISTINCT_DISTANCE_M * DISTINCT_DISTANCE_M

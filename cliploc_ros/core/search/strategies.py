@@ -1,0 +1,212 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which minimal samples a search tries: given ones, all of them, or the likeliest first."""
+
+import time
+from collections.abc import Iterator
+from math import comb, inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.association.scene import Scene
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.search.leaders import Leaders, remember, worst_score
+from cliploc_ros.core.search.prior import Prior
+from cliploc_ros.core.search.sampling import (
+    SAMPLE_SIZE,
+    enumerate_compatible_pairs,
+    enumerate_compatible_triples,
+    enumerate_triples,
+)
+from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
+
+# search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries every
+# sample, so a better one of the same place follows.
+_MIN_SAMPLED_IOU = 0.9
+# The same of two pairs, whose poses inherit the noise of the vertical.
+_MIN_SAMPLED_PAIR_IOU = 0.2
+# How search_progressively enumerates samples of each size.
+_ORDERED = {3: (enumerate_compatible_triples, _MIN_SAMPLED_IOU),
+            2: (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU)}
+# A block of a search takes about this long, so that it keeps time limits.
+_BLOCK_S = 1e-3
+# Samples in a block.
+_FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
+
+
+class Progress(NamedTuple):
+    """How far a search is.
+
+    Parameters
+    ----------
+    tried : int
+        Hypotheses tried so far.
+    coverage : float
+        The share of its samples that were tried, 0 to 1.
+    reach : int
+        A progressive search has tried all samples among so many first candidates.
+    """
+
+    tried: int
+    coverage: float
+    reach: int = 0
+
+
+def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
+                   prior: Prior | None = None) -> Iterator[Progress]:
+    """Try given minimal samples, a block at a time.
+
+    Parameters
+    ----------
+    scene : Scene
+    samples : ndarray (t, 3) of int
+        Candidate numbers; rows of -1 are skipped.
+    leaders : Leaders
+        Takes the best hypotheses.
+    prior : Prior, optional
+        Poses that contradict it are not verified.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    bench = set_up(scene, prior)
+    tried = 0
+    pace, start = _Pace(len(samples)), 0
+    while not pace.at_end:
+        block = pace.begin()
+        block[:] = samples[start:start + len(block)]
+        _try_samples(bench, block, len(block), start, 0.0, leaders)
+        start += len(block)
+        tried += int((block[:, 0] >= 0).sum())
+        pace.end(len(block))
+        yield Progress(tried, start / len(samples))
+
+
+def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
+                        ) -> Iterator[Progress]:
+    """Try every valid sample, a block at a time, without storing them.
+
+    Parameters
+    ----------
+    scene : Scene
+    leaders : Leaders
+        Takes the best hypotheses.
+    prior : Prior, optional
+        Poses that contradict it are not verified.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    bench = set_up(scene, prior)
+    count = len(scene.pairs)
+    cursor = np.array([0, 1, 2], dtype=np.int64)
+    pace, tried = _Pace(), 0
+    while cursor[0] < count - 2:
+        block = pace.begin()
+        found = enumerate_triples(scene.pairs, cursor, block)
+        _try_samples(bench, block, found, tried, 0.0, leaders)
+        tried += found
+        pace.end(found)
+        first, second, third = (int(row) for row in cursor)
+        left = (comb(max(0, count - first - 1), 3) + comb(max(0, count - second - 1), 2)
+                + max(0, count - third)) if first < count - 2 else 0
+        yield Progress(tried, 1.0 - left / comb(count, 3))
+
+
+def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
+                         prior: Prior | None = None, limit: float = inf,
+                         size: int = SAMPLE_SIZE) -> Iterator[Progress]:
+    """Try every sample of compatible candidates, those of the first candidates first.
+
+    All samples among the first n candidates precede those with the next one. PROSAC draws in this
+    order at random; this search does not repeat samples, and ends when all are tried.
+
+    Parameters
+    ----------
+    scene : Scene
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.search.compatibility.
+    leaders : Leaders
+        Takes the best hypotheses.
+    prior : Prior, optional
+        Poses that contradict it are not verified.
+    limit : float, optional
+        The most samples to try.
+    size : int, optional
+        Candidates in a sample: three, or two where the prior's vertical is known (see
+        cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
+        is -1.
+
+    Yields
+    ------
+    Progress
+        After each block; the caller may stop there.
+    """
+    bench = set_up(scene, prior)
+    count = len(scene.pairs)
+    fill_block, least_iou = _ORDERED[size]
+    cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
+    pace, tried = _Pace(limit), 0
+    while cursor[0] < count and not pace.at_end:
+        block = pace.begin()
+        found = fill_block(compatible, cursor, block)
+        _try_samples(bench, block, found, tried, least_iou, leaders)
+        tried += found
+        pace.end(found)
+        reach = min(int(cursor[0]), count)
+        yield Progress(tried, comb(reach, size) / max(comb(count, size), 1), reach)
+
+
+class _Pace:
+    """Blocks of samples of about equal time. Results do not depend on their sizes.
+
+    Parameters
+    ----------
+    limit : float
+        How many samples to try in all.
+    """
+
+    def __init__(self, limit: float = inf) -> None:
+        self._memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
+        self._left, self._size, self._start = limit, _FIRST_BLOCK, 0.0
+
+    @property
+    def at_end(self) -> bool:
+        """Return whether all samples were tried."""
+        return self._left <= 0
+
+    def begin(self) -> NDArray[np.int64]:
+        """Return memory (b, 3) for the samples of the next block."""
+        self._start = time.perf_counter()
+        return self._memory[:int(min(self._size, self._left))]
+
+    def end(self, tried: int) -> None:
+        """Finish a block with so many samples, and choose the size of the next."""
+        self._left -= tried
+        elapsed = max(time.perf_counter() - self._start, 1e-9)
+        wanted = int(self._size * min(_BLOCK_S / elapsed, 4.0))
+        self._size = min(max(wanted, 1), _LARGEST_BLOCK)
+
+
+@compiled
+def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
+    """Make the hypotheses of the first samples, and remember those that lead."""
+    targets, poses, overlaps = bench.targets, bench.poses, bench.overlaps
+    floor = worst_score(leaders)
+    for number in range(count):
+        if samples[number, 0] < 0:
+            continue
+        which = make_hypothesis(bench, samples, number, least_iou)
+        if which < 0:
+            continue
+        score = verify_beyond(targets, poses, which, overlaps, floor)
+        if score > floor:
+            remember(leaders, score, tried_before + number + 1, samples[number],
+                     poses.rotations[which], poses.translations[which])
+            floor = worst_score(leaders)

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The method in plain Python: what the compiled kernels are compared with.
+
+Candidates are masks (n, L) of detections and landmarks. Poses are compared pair by pair, without
+bounds and without culling.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.association.candidates import Candidates
+from cliploc_ros.core.association.scene import Scene
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import Verified, verify_rig
+from cliploc_ros.core.geometry.ellipse import ellipse_iou
+from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.p3p import solve_p3p
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
+
+# A pose: rotation (3, 3) and translation (3,) of camera_from_map.
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def same_class(detection_classes: tuple[str, ...], landmark_classes: tuple[str, ...]
+               ) -> NDArray[np.bool_]:
+    """Return a mask (n, L): detection and landmark have the same class name."""
+    return np.array([[detection == landmark for landmark in landmark_classes]
+                     for detection in detection_classes], dtype=bool).reshape(
+                         len(detection_classes), len(landmark_classes))
+
+
+def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask (n, L): the pair is a candidate."""
+    mask = np.zeros(shape, dtype=bool)
+    mask[candidates.detections, candidates.landmarks] = True
+    return mask
+
+
+def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:
+    """Return the hypothesis of a minimal sample, and the sum of the IoUs of its three pairs.
+
+    The hypothesis is the P3P solution with the greatest sum, of those for which all three
+    ellipsoids lie wholly in front of the camera; None if there is none.
+    """
+    detections, landmarks = scene.pairs[sample].T
+    best, best_total = None, -1.0
+    for pose in zip(*solve_p3p(scene.bearings[detections], scene.centers[landmarks]), strict=True):
+        total = sum(pair_iou(scene, detection, outline) for detection, outline in zip(
+            detections, outlines_of(scene, landmarks, pose), strict=True))
+        if total > best_total:  # never true of NaN
+            best, best_total = pose, total
+    return best, best_total
+
+
+def score(scene: Scene, potential: NDArray[np.bool_], pose: Pose
+          ) -> tuple[float, NDArray[np.int64]]:
+    """Return the score of a pose, and the landmark (n,) of each detection or -1.
+
+    Parameters
+    ----------
+    scene : Scene
+    potential : ndarray (n, L) of bool
+        Which landmarks each detection may show.
+    pose : Pose
+    """
+    outlines = outlines_of(scene, np.arange(len(scene.centers)), pose)
+    total, landmarks = 0.0, np.full(len(potential), -1)
+    for detection, mask in enumerate(potential):
+        best = scene.iou_threshold
+        for landmark in np.nonzero(mask)[0]:
+            iou = pair_iou(scene, detection, outlines[landmark])
+            if iou > best:  # never true of NaN
+                best, landmarks[detection] = iou, landmark
+        total += best if landmarks[detection] >= 0 else 0.0
+    return total, landmarks
+
+
+def outlines_of(scene: Scene, landmarks: NDArray[np.int64], pose: Pose) -> NDArray[np.float64]:
+    """Return the outlines (m, 5) of landmarks (m,); NaN for those not wholly in front."""
+    return project_ellipsoids(make_transform(*pose), scene.centers[landmarks],
+                              scene.shapes[landmarks])
+
+
+def pair_iou(scene: Scene, detection: int, outline: NDArray[np.float64]) -> float:
+    """Return the IoU of a detection's box ellipse and an outline (5,); NaN for a NaN outline."""
+    if np.isnan(outline[0]):
+        return np.nan
+    return ellipse_iou(*scene.box_ellipses[detection], *outline)
+
+
+def verify(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
+           ) -> Verified:
+    """Return what a pose explains in one frame, by the kernel: a rig of one."""
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+    return verify_rig(rig, rotation, translation)
