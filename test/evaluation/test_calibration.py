@@ -56,7 +56,7 @@ def test_a_fit_finds_what_the_data_were_made_from():
 
 def test_a_fit_needs_right_and_wrong_poses():
     cases = [case for case in make_cases(np.random.default_rng(1), 50) if case.right[0]]
-    with pytest.raises(OptionsError, match='a fit needs both'):
+    with pytest.raises(OptionsError, match='a fit needs right and wrong'):
         calibration.fit(cases)
 
 
