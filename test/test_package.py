@@ -102,11 +102,6 @@ def test_file_names_its_licence(path):
     assert 'SPDX-License-Identifier: Apache-2.0\n' in head
 
 
-@pytest.mark.parametrize('path', SOURCES, ids=relative)
-def test_module_is_not_too_long(path):
-    assert len(path.read_text().splitlines()) <= 400
-
-
 @pytest.mark.parametrize('name', EXECUTABLES)
 def test_executable_is_installed(name, executables):
     assert os.access(executables / name, os.X_OK), f'{name} is missing: run script/setup'

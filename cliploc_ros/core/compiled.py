@@ -57,7 +57,8 @@ def warm_up(run: Callable[[], object]) -> None:
             run()
             return
         except _DAMAGE as error:
-            logger.warning('cached kernels are damaged or outdated: %r; compiling them again', error)
+            logger.warning('cached kernels are damaged or outdated: %r; compiling them again',
+                           error)
             _forget_cache()
         except OSError as error:  # as on a full disk: every kernel and every request would fail
             logger.warning('cannot cache compiled kernels: %s; each start takes a minute until '
