@@ -19,8 +19,8 @@ SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('errors', 'units'),
-    ('core.compiled', 'core.parameter_file', 'core.time_budget'),
+    ('errors', 'replace_file', 'units'),
+    ('core.compiled', 'core.landmark_details', 'core.parameter_file', 'core.time_budget'),
     ('core.geometry',),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
