@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Advice in words: what to do about a map, the most urgent first."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
+from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, GridCheck
+
+_MOST_OF_A_KIND = 5
+# A shorter run of refused frames is no side of a room.
+_MIN_SPAN = 2
+_FEW_LANDMARKS = 3
+_NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten')
+
+
+def give_advice(report: CheckReport) -> list[str]:
+    """Return what to do, one sentence or two each."""
+    advice = [*_on_misled(report), *_on_duplicates(report), *_on_landmarks(report),
+              *_on_corrections(report), *_on_look_alikes(report), *_on_spans(report),
+              *_on_grid(report.grid)]
+    return advice or ['nothing to do: the map reaches all thresholds that were checked']
+
+
+def _on_misled(report: CheckReport) -> Iterator[str]:
+    trials = [*(report.recording.trials if report.recording else ()), *report.queries,
+              *report.grid.trials]
+    wrong = [one for one in trials if one.verdict == 'misled']
+    for one in wrong[:_MOST_OF_A_KIND]:
+        assert one.error_m is not None
+        yield (f'a robot at {_place(one.position)} looking {_heading(one)} would be misled by '
+               f'{one.error_m:.1f} m: raise min_confidence, or map more distinct objects there')
+    yield from _more(len(wrong), 'views that mislead')
+
+
+def _on_duplicates(report: CheckReport) -> Iterator[str]:
+    pairs = [one for one in report.overlaps if one.is_duplicate]
+    for one in pairs[:_MOST_OF_A_KIND]:
+        yield (f'{report.map_ids[one.first]} and {report.map_ids[one.second]} are the same object '
+               f'(normalized distance {one.distance:.2f}): delete one of them')
+    yield from _more(len(pairs), 'pairs of duplicates')
+
+
+def _on_landmarks(report: CheckReport) -> Iterator[str]:
+    faulty = [one for one in report.landmarks if one.severity >= SERIOUS and one.faults
+              and 'same object as' not in one.faults[0]]
+    for one in faulty[:_MOST_OF_A_KIND]:
+        yield f'{one.landmark_id} {one.faults[0]}'
+    yield from _more(len(faulty), 'landmarks with a serious fault')
+
+
+def _on_corrections(report: CheckReport) -> Iterator[str]:
+    found = [one for one in (report.recording.corrections if report.recording else ())
+             if one.is_significant]
+    what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
+            'stamps': 'check the clock and the delay of the images'}
+    for one in sorted(found, key=lambda one: -one.effect_px)[:_MOST_OF_A_KIND]:
+        yield (f'{what[one.cause]}: {one.name} seems off by {one.value:+.2f} {one.unit} '
+               f'(standard deviation {one.deviation:.2f}); another systematic error may look '
+               'like it')
+
+
+def _on_look_alikes(report: CheckReport) -> Iterator[str]:
+    for one in report.look_alikes[:_MOST_OF_A_KIND]:
+        matched = len(one.matched)
+        told_apart = ('their labels are equal, so nothing tells them apart: map an object that '
+                      'only one of them has, or describe what differs') \
+            if one.same_labels == matched else (
+            f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
+        yield (f'the places around {_place(one.first)} and {_place(one.second)} look alike '
+               f'({matched} of {one.landmarks} landmarks): {told_apart}')
+    yield from _more(len(report.look_alikes), 'pairs of places that look alike')
+
+
+def _on_spans(report: CheckReport) -> Iterator[str]:
+    if report.recording is None:
+        return
+    for run in list(refused_spans(report.recording.trials))[:_MOST_OF_A_KIND]:
+        seen = int(np.median([one.landmarks for one in run]))
+        if len(run) < _MIN_SPAN or run[0].stamp_s is None or run[-1].stamp_s is None:
+            continue
+        first = report.recording.trials[0].stamp_s or 0.0
+        middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
+        center = np.mean([one.position for one in run], axis=0)
+        what = 'record this side' if seen <= _FEW_LANDMARKS else (
+            'give these objects better labels, or record this side again')
+        yield (f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} looking '
+               f'{_heading(run[len(run) // 2])}, see {_landmarks(seen)} and none is '
+               'accepted')
+
+
+def _on_grid(grid: GridCheck) -> Iterator[str]:
+    for rows in _dead_areas(grid)[:_MOST_OF_A_KIND]:
+        low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
+        yield (f'no heading is accepted at {len(rows)} positions near the recording with x '
+               f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: at most '
+               f'{_landmarks(int(grid.visible[rows].max()))} in one view; map more objects that '
+               'can be seen from there')
+
+
+def _dead_areas(grid: GridCheck) -> list[NDArray[np.int64]]:
+    """Return the rows of neighbouring positions that accept no heading, the most first."""
+    dead = np.nonzero(grid.is_near & (grid.accepted == 0))[0]
+    if len(dead) == 0:
+        return []
+    cells = np.round((grid.positions[:, :2] - grid.positions[:, :2].min(axis=0))
+                     / grid.spacing_m).astype(np.int64)
+    picture = np.zeros(cells.max(axis=0) + 1, dtype=np.bool_)
+    picture[cells[dead, 0], cells[dead, 1]] = True
+    areas, count = label(picture)
+    found = [dead[areas[cells[dead, 0], cells[dead, 1]] == number + 1] for number in range(count)]
+    return sorted((rows for rows in found if len(rows) >= _MIN_SPAN), key=len, reverse=True)
+
+
+def _more(count: int, what: str) -> Iterator[str]:
+    if count > _MOST_OF_A_KIND:
+        yield f'and {count - _MOST_OF_A_KIND} more {what}'
+
+
+def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
+    return f'x {point[0]:.1f}, y {point[1]:.1f}'
+
+
+def _heading(trial: Trial) -> str:
+    """Return where a camera looks, as an angle from the map's x axis."""
+    angle = np.degrees(np.arctan2(trial.forward[1], trial.forward[0]))
+    return f'to {angle:.0f} degrees'
+
+
+def _count(number: int) -> str:
+    return _NUMBERS[number] if 0 <= number < len(_NUMBERS) else str(number)
+
+
+def _landmarks(number: int) -> str:
+    return f'{_count(number)} landmark{"" if number == 1 else "s"}'

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The entry point of checking: a map and, if there is one, a recording in, a report out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+from cliploc_ros.mapping.checking.advice import give_advice
+from cliploc_ros.mapping.checking.cross_validation import (
+    box_quality,
+    judge_boxes,
+    make_folds,
+)
+from cliploc_ros.mapping.checking.detector_model import (
+    DetectorModel,
+    guess_detector,
+    measure_detector,
+)
+from cliploc_ros.mapping.checking.grid import make_grid
+from cliploc_ros.mapping.checking.landmark_faults import (
+    Witness,
+    check_landmarks,
+    find_map_overlaps,
+    hear_witness,
+)
+from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
+from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+from cliploc_ros.mapping.checking.relocalization import (
+    PosedObservation,
+    try_grid,
+    try_observations,
+    try_recording,
+)
+from cliploc_ros.mapping.checking.report import (
+    BlockQuality,
+    CheckReport,
+    GridCheck,
+    RecordingCheck,
+    find_failures,
+)
+from cliploc_ros.mapping.checking.systematic import find_corrections
+from cliploc_ros.mapping.evidence import group_boxes
+from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.input_checks import check_input
+from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.views import Views, make_views
+
+#: Told the name of a stage and the share of it that is done.
+Progress = Callable[[str, float], None]
+
+
+def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
+              queries: Sequence[PosedObservation] = (), options: CheckOptions | None = None,
+              thresholds: Thresholds | None = None, progress: Progress | None = None
+              ) -> CheckReport:
+    """Check a map.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    detections : PosedDetections, optional
+        A recording of the place. Without one, the report is shorter.
+    queries : sequence of PosedObservation
+        Observations with recorded similarities to the map's labels.
+    options : CheckOptions, optional
+    thresholds : Thresholds, optional
+        What the map has to reach.
+    progress : callable, optional
+        Called with the name of a stage and the share of it that is done, 0 to 1.
+
+    Raises
+    ------
+    MappingError
+        The recording says nothing of this map; the message says what to correct.
+    """
+    options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
+    rng = np.random.default_rng(options.random_seed)
+    views = witness = recording = recorded_poses = None
+    notes = ['similarities of crops and labels are simulated, except for queries: labels of '
+             'equal text look equal, and labels that share words look alike',
+             'the grid assumes that the map is right and that walls hide nothing that the '
+             'recording did not show to be hidden']
+    if detections is not None:
+        tell('judging landmarks', 0.0)
+        views = make_views(detections, options.mapping)
+        notes += check_input(detections, views, options.mapping)
+        witness = hear_witness(views, landmark_map, detections.class_names, options.mapping)
+        if not (witness.shown >= 0).any():
+            raise MappingError(_unrelated(landmark_map, detections))
+        recorded_poses = detections.map_from_camera
+        model = measure_detector(landmark_map, detections, views, witness, options.mapping)
+        recording = _check_recording(landmark_map, detections, views, witness, model, options,
+                                     tell)
+    else:
+        model = guess_detector(landmark_map, options.mapping)
+        notes.append('no recording: the detector is a guess that finds 60 % of the objects in '
+                     'view within 5 m, in images of 640 x 480 px with a focal length of 525 px')
+    overlaps = find_map_overlaps(landmark_map, witness, views)
+    grid = make_grid(landmark_map, recorded_poses, options)
+    trials = try_grid(model, landmark_map, grid, options,
+                      lambda share: tell('relocalizing on the grid', share))
+    verdicts = np.array([one.verdict for one in trials]).reshape(-1, options.headings)
+    visible = np.array([len(model.in_view(pose)[0]) for pose in grid.poses])
+    report = CheckReport(
+        landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
+        overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map, rng)),
+        grid=GridCheck(grid.positions, grid.is_near, (verdicts == 'accepted').sum(axis=1),
+                       (verdicts == 'misled').sum(axis=1),
+                       visible.reshape(-1, options.headings).max(axis=1), options.headings,
+                       grid.spacing_m, tuple(trials)),
+        recording=recording,
+        queries=tuple(try_observations(landmark_map, queries, options,
+                                       lambda share: tell('relocalizing queries', share))),
+        notes=tuple(notes), map_ids=landmark_map.landmark_ids)
+    tell('done', 1.0)
+    return replace(report, advice=tuple(give_advice(report)),
+                   failures=tuple(find_failures(report, thresholds or Thresholds())))
+
+
+def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, model: DetectorModel, options: CheckOptions,
+                     tell: Progress) -> RecordingCheck:
+    tell('cross-validating', 0.0)
+    folds, blocks, held_out = [], [], []
+    for fold in make_folds(views, witness, options):
+        ious = judge_boxes(views, fold.landmarks, fold.frames)
+        folds.append(fold)
+        held_out.append(ious)
+        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), box_quality(ious)))
+        tell('cross-validating', len(folds) / options.folds)
+    trials = try_recording(landmark_map, detections, witness.shown, folds, options,
+                           lambda share: tell('relocalizing recorded frames', share))
+    tell('looking for systematic errors', 0.0)
+    return RecordingCheck(
+        frames=len(detections), boxes=len(detections.classes),
+        duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
+        path_xyz=detections.map_from_camera[:, :3, 3],
+        as_given=box_quality(judge_boxes(views, witness.landmarks)),
+        held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
+        trials=tuple(trials),
+        corrections=tuple(find_corrections(detections, views, _fitted(views, witness),
+                                           witness.shown)),
+        edge_scale=model.edge_scale)
+
+
+def _fitted(views: Views, witness: Witness) -> Landmarks:
+    """Return the landmarks fitted to the boxes that show them."""
+    centers, bases = witness.landmarks.centers.copy(), witness.landmarks.bases.copy()
+    for number, rows in enumerate(group_boxes(witness.shown, len(centers))):
+        if len(rows):
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            centers[number], bases[number] = fit.center, fit.basis
+    return Landmarks(centers, bases, witness.landmarks.classes)
+
+
+def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
+    shared = set(landmark_map.class_ids) & set(detections.class_names)
+    if not shared:
+        return ("the recording's classes are none of the map's "
+                f'({", ".join(sorted(set(landmark_map.class_ids))[:3])}): use the detector that '
+                'the map was made with')
+    return ('no box of the recording overlaps a landmark of its class: check that poses and map '
+            'have the same coordinate frame, and that the poses are of the camera (z forward)')

@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a detector would see of a map from a pose, with the errors measured in a recording."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.mapping.checking.landmark_faults import Witness
+from cliploc_ros.mapping.evidence import best_ious, group_boxes
+from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.projection import project_box
+from cliploc_ros.mapping.views import Views, camera_centers
+
+# A landmark is detected only if this share of its box is in the image, from no farther away than
+# this times the greatest distance at which it was detected.
+_SHOWN_SHARE = 0.6
+_REACH = 1.2
+# Frames count for a pose if they saw the landmark from within this angle of its direction.
+_NEAR_COSINE = np.cos(np.radians(30.0))
+# Frames that the landmark's overall ratio stands for, where few frames are near.
+_PRIOR_FRAMES = 3.0
+_MAX_SAMPLED_FRAMES = 600
+_CLUTTER_IOU = 0.1
+_SCORE = 0.8
+# Without a recording; guesses.
+_GUESSED_RATIO = 0.6
+_GUESSED_REACH_M = 5.0
+_GUESSED_MIN_SIDE_PX = 12.0
+_GUESSED_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+
+
+class _Sightings(NamedTuple):
+    """Frames that should show a landmark: its direction (k, 3) from them, and if it was seen."""
+
+    directions: NDArray[np.float64]
+    was_seen: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class DetectorModel:
+    """A detector's misses and errors: L landmarks.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        What there is to see.
+    camera : Camera
+    sightings : tuple of _Sightings
+        Of each landmark; empty without a recording.
+    ratios, reach_m : ndarray (L,)
+        Share of the expected frames in which each landmark was detected, and from how far away
+        it can be [m].
+    edge_scale : float
+        Deviation of edges, in units of MappingOptions' one.
+    min_side_px : float
+        Smaller boxes are not detected.
+    clutter : tuple of (ndarray (k, 4), tuple of str)
+        Boxes [px] of no landmark in single frames, and their classes.
+    mapping : MappingOptions
+    """
+
+    landmark_map: LandmarkMap
+    camera: Camera
+    sightings: tuple[_Sightings, ...]
+    ratios: NDArray[np.float64]
+    reach_m: NDArray[np.float64]
+    edge_scale: float
+    min_side_px: float
+    clutter: tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]
+    mapping: MappingOptions
+
+    def in_view(self, map_from_camera: NDArray[np.float64]
+                ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the landmarks (k,) that a camera could detect, and their boxes (k, 4) [px]."""
+        one = self.landmark_map
+        outlines = project_ellipsoids(invert_transform(map_from_camera), one.centers, one.shapes)
+        boxes = ellipse_bboxes(ellipses_in_pixels(outlines, self.camera))
+        size = [self.camera.width, self.camera.height] * 2
+        with np.errstate(invalid='ignore'):
+            clipped = np.clip(boxes, 0.0, size)
+            extent, shown = boxes[:, 2:] - boxes[:, :2], clipped[:, 2:] - clipped[:, :2]
+            distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
+            visible = (shown.prod(axis=1) > _SHOWN_SHARE * extent.prod(axis=1)) \
+                & (shown.min(axis=1) >= self.min_side_px) & (distances <= self.reach_m)
+        rows = np.nonzero(visible)[0]
+        return rows, clipped[rows]
+
+    def detect(self, map_from_camera: NDArray[np.float64], rng: np.random.Generator
+               ) -> tuple[Detections, NDArray[np.int64]]:
+        """Return what the detector might find, and the landmark that each box shows."""
+        rows, boxes = self.in_view(map_from_camera)
+        chances = np.array([self._chance(row, map_from_camera) for row in rows])
+        seen = rng.random(len(rows)) < chances
+        rows, boxes = rows[seen], boxes[seen]
+        extents = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+        deviations = np.hypot(self.mapping.edge_sigma_px, self.mapping.edge_sigma_share * extents)
+        noisy = boxes + self.edge_scale * deviations * rng.normal(size=boxes.shape)
+        noisy = np.clip(noisy, 0.0, [self.camera.width, self.camera.height] * 2)
+        sound = (noisy[:, 2:] - noisy[:, :2]).min(axis=1, initial=np.inf) >= 1.0
+        rows, noisy = rows[sound], noisy[sound]
+        class_ids = tuple(self.landmark_map.class_ids[row] for row in rows)
+        if self.clutter:
+            false_boxes, false_classes = self.clutter[rng.integers(len(self.clutter))]
+            noisy = np.concatenate([noisy, false_boxes])
+            class_ids += false_classes
+            rows = np.concatenate([rows, np.full(len(false_boxes), -1, dtype=np.int64)])
+        return Detections(noisy, class_ids, np.full(len(rows), _SCORE)), rows
+
+    def _chance(self, row: int, map_from_camera: NDArray[np.float64]) -> float:
+        """Return the probability that a landmark in view is detected."""
+        ratio = float(self.ratios[row])
+        if not self.sightings:
+            return ratio
+        offset = self.landmark_map.centers[row] - map_from_camera[:3, 3]
+        sightings = self.sightings[row]
+        near = sightings.directions @ (offset / np.linalg.norm(offset)) > _NEAR_COSINE
+        return float((sightings.was_seen[near].sum() + _PRIOR_FRAMES * ratio)
+                     / (near.sum() + _PRIOR_FRAMES))
+
+
+def guess_detector(landmark_map: LandmarkMap, options: MappingOptions) -> DetectorModel:
+    """Return a detector of which nothing was measured."""
+    count = len(landmark_map)
+    ratios = np.full(count, _GUESSED_RATIO)
+    for row, one in enumerate(landmark_map.details):
+        if one.seen_ratio is not None:
+            ratios[row] = one.seen_ratio
+    return DetectorModel(landmark_map, _GUESSED_CAMERA, (), ratios,
+                         np.full(count, _GUESSED_REACH_M), 1.0, _GUESSED_MIN_SIDE_PX, (), options)
+
+
+def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, options: MappingOptions) -> DetectorModel:
+    """Return the detector of a recording.
+
+    A landmark that was never detected does not exist: the model never detects it.
+    """
+    landmarks, shown = witness.landmarks, witness.shown
+    boxes_of = group_boxes(shown, len(landmarks.centers))
+    reach = np.zeros(len(boxes_of))
+    for row, rows in enumerate(boxes_of):
+        if len(rows):
+            offsets = landmarks.centers[row] - camera_centers(views, views.frames[rows])
+            reach[row] = _REACH * np.linalg.norm(offsets, axis=1).max()
+    step = -(-len(detections) // _MAX_SAMPLED_FRAMES)
+    frames = np.arange(0, len(detections), step)
+    sightings = tuple(_sightings(views, frames, landmarks, row, reach[row], rows)
+                      for row, rows in enumerate(boxes_of))
+    sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
+    min_side = float(np.quantile(sides, 0.01)) if len(sides) else _GUESSED_MIN_SIDE_PX
+    return DetectorModel(
+        landmark_map, detections.camera, sightings, witness.evidence.seen_ratio, reach,
+        _edge_scale(views, landmarks, shown), min_side,
+        _clutter(detections, best_ious(views, landmarks), frames), options)
+
+
+def _sightings(views: Views, frames: NDArray[np.int64], landmarks: Landmarks, row: int,
+               reach: float, boxes: NDArray[np.int64]) -> _Sightings:
+    offsets = landmarks.centers[row] - camera_centers(views, frames)
+    distances = np.linalg.norm(offsets, axis=1)
+    shares = _shown_shares(views, frames, landmarks.centers[row], landmarks.bases[row])
+    is_expected = (shares > _SHOWN_SHARE) & (distances <= reach) & (distances > 0.0)
+    return _Sightings(offsets[is_expected] / distances[is_expected, None],
+                      np.isin(frames[is_expected], views.frames[boxes]))
+
+
+@compiled
+def _shown_shares(views, frames, center, basis):
+    """Return the share (k,) of an ellipsoid's box that lies in the image of each frame."""
+    shares, box = np.zeros(len(frames)), np.empty(4)
+    left, top, right, bottom = views.bounds
+    for place in range(len(frames)):
+        frame = frames[place]
+        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            width = min(box[2], right) - max(box[0], left)
+            height = min(box[3], bottom) - max(box[1], top)
+            if width > 0.0 and height > 0.0:
+                shares[place] = width * height / ((box[2] - box[0]) * (box[3] - box[1]))
+    return shares
+
+
+def _edge_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
+    """Return the robust deviation of closed edges, in standard deviations."""
+    rows = np.nonzero(shown >= 0)[0]
+    if len(rows) == 0:
+        return 1.0
+    residuals = _edge_residuals(views, rows, shown[rows], landmarks.centers, landmarks.bases)
+    return float(np.clip(1.4826 * np.nanmedian(np.abs(residuals)), 0.3, 5.0))
+
+
+@compiled
+def _edge_residuals(views, rows, landmarks, centers, bases):
+    """Return how far the projected edges (m, 4) are off; NaN for open edges."""
+    residuals, box = np.full((len(rows), 4), np.nan), np.empty(4)
+    for place in range(len(rows)):
+        row, landmark = rows[place], landmarks[place]
+        frame = views.frames[row]
+        if project_box(views.rotations[frame], views.translations[frame], centers[landmark],
+                       bases[landmark], box):
+            for edge in range(4):
+                if not views.is_open[row, edge]:
+                    residuals[place, edge] = (box[edge] - views.edges[row, edge]) \
+                        * views.stiffness[row, edge]
+    return residuals
+
+
+def _clutter(detections: PosedDetections, ious: NDArray[np.float64], frames: NDArray[np.int64]
+             ) -> tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]:
+    """Return the boxes that no landmark explains, by frame."""
+    is_clutter = ious < _CLUTTER_IOU
+    found = []
+    for frame in frames:
+        rows = np.arange(detections.frame_offsets[frame], detections.frame_offsets[frame + 1])
+        rows = rows[is_clutter[rows]]
+        found.append((detections.bboxes_xyxy[rows],
+                      tuple(detections.class_names[detections.classes[row]] for row in rows)))
+    return tuple(found)

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A grid of camera positions over a map, z up, with headings at each."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.mapping.checking.options import CheckOptions
+
+_MARGIN_M = 0.5
+# Without a recording; guesses.
+_GUESSED_MARGIN_M = 1.5
+_GUESSED_HEIGHT_M = 0.3   # above the middle landmark
+_GUESSED_PITCH_DEG = -10.0
+# Landmarks farther out than all but this share do not widen the grid.
+_OUTLYING = 0.03
+# Positions within this of the recording's path are near it [m].
+_NEAR_M = 1.0
+
+
+class Grid(NamedTuple):
+    """P positions with H headings each.
+
+    Parameters
+    ----------
+    positions : ndarray (P, 3)
+        [m].
+    is_near : ndarray (P,) of bool
+        The recording, if there is one, passed near.
+    poses : ndarray (P * H, 4, 4)
+        map_from_camera, heading by heading of each position.
+    spacing_m : float
+    """
+
+    positions: NDArray[np.float64]
+    is_near: NDArray[np.bool_]
+    poses: NDArray[np.float64]
+    spacing_m: float
+
+
+def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
+              options: CheckOptions) -> Grid:
+    """Return the grid of a map.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    recorded : ndarray (F, 4, 4), optional
+        Poses map_from_camera of a recording: they give height, pitch and extent.
+    options : CheckOptions
+    """
+    low, high = np.quantile(landmark_map.centers, [_OUTLYING, 1.0 - _OUTLYING], axis=0)
+    if recorded is None:
+        margin, pitch_deg = _GUESSED_MARGIN_M, _GUESSED_PITCH_DEG
+        height = float(np.median(landmark_map.centers[:, 2])) + _GUESSED_HEIGHT_M
+        path = None
+    else:
+        path = recorded[:, :3, 3]
+        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+        margin, height = _MARGIN_M, float(np.median(path[:, 2]))
+        pitch_deg = float(np.degrees(np.arcsin(np.clip(np.median(recorded[:, 2, 2]), -1, 1))))
+    if options.camera_height_m is not None:
+        height = options.camera_height_m
+    positions, spacing = _positions(low[:2] - margin, high[:2] + margin, height, options)
+    positions = positions[~_inside(landmark_map, positions)]
+    near = np.ones(len(positions), dtype=np.bool_)
+    if path is not None:
+        near = cKDTree(path[:, :2]).query(positions[:, :2])[0] <= max(_NEAR_M, spacing)
+    headings = 2.0 * np.pi * np.arange(options.headings) / options.headings
+    rotations = np.array([_look(one, np.radians(pitch_deg)) for one in headings])
+    poses = np.tile(np.eye(4), (len(positions), len(headings), 1, 1))
+    poses[:, :, :3, :3] = rotations
+    poses[:, :, :3, 3] = positions[:, None]
+    return Grid(positions, near, poses.reshape(-1, 4, 4), spacing)
+
+
+def _positions(low: NDArray[np.float64], high: NDArray[np.float64], height: float,
+               options: CheckOptions) -> tuple[NDArray[np.float64], float]:
+    spacing = options.spacing_m
+    while True:
+        counts = np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
+        if counts.prod() <= options.max_positions:
+            break
+        spacing *= 1.1
+    first = (low + high) / 2 - spacing * (counts - 1) / 2
+    x, y = (first[axis] + spacing * np.arange(counts[axis]) for axis in (0, 1))
+    columns = np.meshgrid(x, y, indexing='ij')
+    flat = np.stack([column.ravel() for column in columns], axis=1)
+    return np.concatenate([flat, np.full((len(flat), 1), height)], axis=1), spacing
+
+
+def _inside(landmark_map: LandmarkMap, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which positions lie in a landmark."""
+    inside = np.zeros(len(positions), dtype=np.bool_)
+    for center, upper in zip(landmark_map.centers, landmark_map.shapes, strict=True):
+        xx, xy, xz, yy, yz, zz = upper
+        shape = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        offsets = positions - center
+        inside |= np.einsum('pi,pi->p', offsets, np.linalg.solve(shape, offsets.T).T) < 1.0
+    return inside
+
+
+def _look(heading: float, pitch: float) -> NDArray[np.float64]:
+    """Return the rotation of map_from_camera for a level camera with a heading and a pitch."""
+    forward = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch),
+                        np.sin(pitch)])
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    return np.stack([right, np.cross(forward, right), forward], axis=1)

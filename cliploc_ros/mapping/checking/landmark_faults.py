@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each landmark of a map: how well a recording supports it, and what is wrong with it."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence, group_boxes
+from cliploc_ros.mapping.landmarks import Landmarks, landmarks_of_map
+from cliploc_ros.mapping.merging import normalized_distance
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.views import Views, camera_centers
+
+# Landmarks nearer than this are reported, see normalized_distance. Those of one class are one
+# object, unless frames show both at once. A guess: build_map merges below 0.8 if the boxes agree.
+_OVERLAP_DISTANCE = 0.5
+_MAX_SHARED_VIEWS = 0.15
+# A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
+_MIN_THINNESS = 0.05
+# A landmark that so many frames should show and none does is missing.
+_MIN_EXPECTED = 10
+_REACH = 1.2
+
+
+class Overlap(NamedTuple):
+    """Two landmarks that lie in one another.
+
+    Parameters
+    ----------
+    first, second : int
+        Rows in the map.
+    distance : float
+        Normalized, about 1 if they touch.
+    is_duplicate : bool
+        They are of one class and no frames show both.
+    """
+
+    first: int
+    second: int
+    distance: float
+    is_duplicate: bool
+
+
+@dataclass(frozen=True)
+class LandmarkCheck:
+    """What is known of one landmark. Values that nothing tells are None.
+
+    Parameters
+    ----------
+    landmark_id, label, class_id : str
+    center : tuple of float
+        [m].
+    support, expected : int
+        Frames that show it, and frames that should.
+    seen_ratio : float
+        Share of the latter in which it was detected.
+    baseline_deg : float
+        Greatest angle between two directions from which it was seen [deg].
+    position_sigma_m : float
+        Standard deviation of its centre on the worst axis [m].
+    median_iou : float
+        Of its boxes.
+    thinness : float
+        Least semi-axis divided by the greatest one.
+    overlaps : tuple of (str, float)
+        Landmarks that lie in it, and their normalized distances.
+    faults : tuple of str
+        What is wrong with it and what to do, the worst first.
+    severity : float
+        0: nothing; 1 and more: a serious fault.
+    """
+
+    landmark_id: str
+    label: str
+    class_id: str
+    center: tuple[float, float, float]
+    support: int | None
+    expected: int | None
+    seen_ratio: float | None
+    baseline_deg: float | None
+    position_sigma_m: float | None
+    median_iou: float | None
+    thinness: float
+    overlaps: tuple[tuple[str, float], ...]
+    faults: tuple[str, ...]
+    severity: float
+
+
+class Witness(NamedTuple):
+    """What a recording says of a map.
+
+    Parameters
+    ----------
+    landmarks : Landmarks
+        Of the map, with the recording's classes.
+    shown : ndarray (n,) of int
+        The landmark that each box shows, -1 for none.
+    evidence : Evidence
+    expected : ndarray (L,) of int
+        Frames that should show each landmark, those without a box included.
+    """
+
+    landmarks: Landmarks
+    shown: NDArray[np.int64]
+    evidence: Evidence
+    expected: NDArray[np.int64]
+
+
+def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
+                 options: MappingOptions) -> Witness:
+    """Return what a recording says of a map."""
+    landmarks = landmarks_of_map(landmark_map, class_names)
+    shown = associate(views, landmarks, options.association_iou)
+    evidence = gather_evidence(views, landmarks, shown)
+    expected = evidence.expected.copy()
+    reach = _median_reach(views, landmarks, shown)
+    for row in np.nonzero(evidence.support == 0)[0]:
+        expected[row] = count_expected(views, landmarks.centers[row], landmarks.bases[row], reach)
+    return Witness(landmarks, shown, evidence, expected)
+
+
+def _median_reach(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
+    """Return from how far away landmarks are usually detected [m]."""
+    farthest = [np.linalg.norm(landmarks.centers[row] - camera_centers(views, views.frames[rows]),
+                               axis=1).max()
+                for row, rows in enumerate(group_boxes(shown, len(landmarks.centers)))
+                if len(rows)]
+    return _REACH * float(np.median(farthest)) if farthest else 0.0
+
+
+def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
+                      ) -> list[Overlap]:
+    """Return the landmarks of a map that lie in one another, the nearest first."""
+    landmarks = landmarks_of_map(landmark_map, sorted(set(landmark_map.class_ids)))
+    reach = landmark_map.semi_axes.max(axis=1)
+    tree = cKDTree(landmark_map.centers)
+    largest = float(reach.max())
+    found = []
+    for first in range(len(landmark_map)):
+        near = tree.query_ball_point(landmark_map.centers[first],
+                                     _OVERLAP_DISTANCE * 1.5 * (reach[first] + largest))
+        for second in near:
+            if second <= first:
+                continue
+            distance = normalized_distance(landmarks, first, second)
+            if distance < _OVERLAP_DISTANCE:
+                same = landmarks.classes[first] == landmarks.classes[second]
+                found.append(Overlap(first, second, distance, bool(
+                    same and not _seen_together(witness, views, first, second))))
+    return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
+
+
+def _seen_together(witness: Witness | None, views: Views | None, first: int, second: int) -> bool:
+    if witness is None or views is None:
+        return False
+    frames = [views.frames[witness.shown == row] for row in (first, second)]
+    shared = len(np.intersect1d(*frames))
+    return shared > _MAX_SHARED_VIEWS * max(1, min(map(len, frames)))
+
+
+def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
+                    overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
+    """Return each landmark's check, the worst first.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    witness : Witness, optional
+        Without a recording, the map's own fields tell of support.
+    overlaps : list of Overlap
+    options : MappingOptions
+        Its limits for landmarks.
+    """
+    partners: dict[int, list[tuple[int, Overlap]]] = {}
+    for one in overlaps:
+        partners.setdefault(one.first, []).append((one.second, one))
+        partners.setdefault(one.second, []).append((one.first, one))
+    checks = [_check(landmark_map, row, witness, partners.get(row, []), options)
+              for row in range(len(landmark_map))]
+    return sorted(checks, key=lambda one: -one.severity)
+
+
+def _check(landmark_map: LandmarkMap, row: int, witness: Witness | None,
+           partners: list[tuple[int, Overlap]], options: MappingOptions) -> LandmarkCheck:
+    ids, semi_axes = landmark_map.landmark_ids, landmark_map.semi_axes[row]
+    numbers = _Numbers.of(landmark_map, row, witness)
+    thinness = float(semi_axes.min() / semi_axes.max())
+    faults = [(1.5, f'is the same object as {ids[other]} (normalized distance '
+                    f'{overlap.distance:.2f}): delete one of them')
+              for other, overlap in partners if overlap.is_duplicate]
+    if not faults:
+        faults += _support_faults(numbers, float(np.linalg.norm(semi_axes)), options)
+    faults += [(0.4, f'lies in {ids[other]} of class {landmark_map.class_ids[other]}: one object '
+                     'under two classes, or one on the other; keep one if it is one object')
+               for other, overlap in partners
+               if landmark_map.class_ids[other] != landmark_map.class_ids[row]]
+    if thinness < _MIN_THINNESS:
+        faults.append((0.3, f'is a sheet: its axes have the ratio {thinness:.3f}; record it from '
+                            'another side, or give it thickness'))
+    faults.sort(key=lambda one: -one[0])
+    center = landmark_map.centers[row]
+    return LandmarkCheck(
+        ids[row], landmark_map.labels[row], landmark_map.class_ids[row],
+        (float(center[0]), float(center[1]), float(center[2])), *numbers, thinness,
+        tuple((ids[other], overlap.distance) for other, overlap in partners),
+        tuple(text for _, text in faults), sum(weight for weight, _ in faults))
+
+
+class _Numbers(NamedTuple):
+    """What a recording, or the map itself, tells of a landmark; None where nothing does."""
+
+    support: int | None
+    expected: int | None
+    seen_ratio: float | None
+    baseline_deg: float | None
+    position_sigma_m: float | None
+    median_iou: float | None
+
+    @staticmethod
+    def of(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> '_Numbers':
+        if witness is None:
+            given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
+            return _Numbers(given.support, None, given.seen_ratio, given.baseline_deg,
+                            given.position_sigma, None)
+        evidence, support = witness.evidence, int(witness.evidence.support[row])
+        expected = int(witness.expected[row])
+        if support == 0:
+            return _Numbers(0, expected, 0.0 if expected else None, None, None, None)
+        return _Numbers(support, expected, float(evidence.seen_ratio[row]),
+                        float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
+                        float(evidence.median_iou[row]))
+
+
+def _support_faults(numbers: _Numbers, size_m: float, options: MappingOptions
+                    ) -> list[tuple[float, str]]:
+    """Return what is wrong with a landmark's support, with a weight each."""
+    support, expected, ratio = numbers.support, numbers.expected, numbers.seen_ratio
+    if support == 0:
+        if expected is not None and expected < _MIN_EXPECTED:
+            return [(0.5, f'was in view in {expected} frames: record this place')]
+        return [(1.4, f'is never detected, although {expected} frames should show it: moved, '
+                      'removed, or of a class that the detector does not find; delete it or '
+                      'update the map')]
+    faults = []
+    if support is not None and support < options.min_viewpoints:
+        faults.append((1.1, f'was seen in {support} frames: record it from more sides'))
+    if ratio is not None and ratio < options.min_seen_ratio:
+        faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
+                            'moved, or hard to detect'))
+    iou, baseline = numbers.median_iou, numbers.baseline_deg
+    if iou is not None and iou < options.min_median_iou:
+        faults.append((1.2, f'does not fit its boxes: median IoU {iou:.2f}; moved, or two objects '
+                            'in one; map it again'))
+    if baseline is not None and baseline < options.min_baseline_deg:
+        faults.append((0.7, f'was seen from one side: {baseline:.0f} degrees; record it from '
+                            'another side'))
+    limit = max(options.max_position_sigma_m, options.max_position_sigma_share * size_m)
+    sigma = numbers.position_sigma_m
+    if sigma is not None and sigma > limit:
+        faults.append((0.8, f'has an uncertain position: {sigma * 100:.0f} cm; record it from '
+                            'more sides'))
+    return faults

@@ -1,0 +1,247 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a check: figures, verdict and advice."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.mapping.checking.cross_validation import BoxQuality
+from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck, Overlap
+from cliploc_ros.mapping.checking.look_alikes import LookAlike
+from cliploc_ros.mapping.checking.options import Thresholds
+from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts
+from cliploc_ros.mapping.checking.systematic import Correction
+
+#: A landmark of this severity has a serious fault.
+SERIOUS = 1.0
+
+
+@dataclass(frozen=True)
+class BlockQuality:
+    """The boxes of one fold, judged with landmarks fitted to the others.
+
+    Parameters
+    ----------
+    frames : int
+    landmarks : int
+        Landmarks that the other folds suffice for.
+    boxes : BoxQuality
+    """
+
+    frames: int
+    landmarks: int
+    boxes: BoxQuality
+
+
+@dataclass(frozen=True)
+class RecordingCheck:
+    """What a recording tells of a map.
+
+    Parameters
+    ----------
+    frames, boxes : int
+    duration_s : float
+    path_xyz : ndarray (F, 3)
+        Where the camera went [m].
+    as_given : BoxQuality
+        Of the map as it is. If it was built from this recording, it was fitted to these boxes.
+    held_out : BoxQuality
+        Cross-validated over time.
+    folds : tuple of BlockQuality
+    trials : tuple of Trial
+        Recorded frames in cross-validated maps, in the order of time.
+    corrections : tuple of Correction
+    edge_scale : float
+        Deviation of box edges, in units of build_map's assumption.
+    """
+
+    frames: int
+    boxes: int
+    duration_s: float
+    path_xyz: NDArray[np.float64]
+    as_given: BoxQuality
+    held_out: BoxQuality
+    folds: tuple[BlockQuality, ...]
+    trials: tuple[Trial, ...]
+    corrections: tuple[Correction, ...]
+    edge_scale: float
+
+
+@dataclass(frozen=True)
+class GridCheck:
+    """Relocalization over a grid of camera positions.
+
+    Parameters
+    ----------
+    positions : ndarray (P, 3)
+        [m].
+    is_near : ndarray (P,) of bool
+        The recording passed near; without a recording, all.
+    accepted, misled : ndarray (P,) of int
+        Headings of each position in which a right, and a wrong pose is accepted.
+    visible : ndarray (P,) of int
+        The most landmarks in one view.
+    headings : int
+    spacing_m : float
+    trials : tuple of Trial
+        Heading by heading of each position.
+    """
+
+    positions: NDArray[np.float64]
+    is_near: NDArray[np.bool_]
+    accepted: NDArray[np.int64]
+    misled: NDArray[np.int64]
+    visible: NDArray[np.int64]
+    headings: int
+    spacing_m: float
+    trials: tuple[Trial, ...]
+
+    @property
+    def accepted_positions(self) -> float:
+        """Return the share of the positions near the recording with an accepted heading."""
+        near = self.accepted[self.is_near]
+        return float((near > 0).mean()) if len(near) else 0.0
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The result of a check.
+
+    Parameters
+    ----------
+    landmarks : tuple of LandmarkCheck
+        The worst first.
+    overlaps : tuple of Overlap
+    look_alikes : tuple of LookAlike
+    grid : GridCheck
+    recording : RecordingCheck, optional
+    queries : tuple of Trial
+        Recorded queries with recorded similarities; empty without any.
+    failures : tuple of str
+        Thresholds that the map misses; empty if it is good enough.
+    advice : tuple of str
+        What to do, the most urgent first.
+    notes : tuple of str
+        What the figures rest on.
+    """
+
+    landmarks: tuple[LandmarkCheck, ...]
+    overlaps: tuple[Overlap, ...]
+    look_alikes: tuple[LookAlike, ...]
+    grid: GridCheck
+    recording: RecordingCheck | None = None
+    queries: tuple[Trial, ...] = ()
+    failures: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Return whether the map reaches all thresholds."""
+        return not self.failures
+
+    @property
+    def duplicates(self) -> int:
+        """Return the number of pairs of landmarks that are one object."""
+        return sum(one.is_duplicate for one in self.overlaps)
+
+    @property
+    def faulty(self) -> float:
+        """Return the share of the landmarks with a serious fault."""
+        return sum(one.severity >= SERIOUS for one in self.landmarks) / len(self.landmarks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON."""
+        return {
+            'passed': self.passed, 'failures': list(self.failures), 'advice': list(self.advice),
+            'notes': list(self.notes), 'faulty_landmarks': self.faulty,
+            'duplicates': self.duplicates,
+            'landmarks': [asdict(one) for one in self.landmarks],
+            'overlaps': [{'first': self._id(one.first), 'second': self._id(one.second),
+                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
+                         for one in self.overlaps],
+            'look_alikes': [asdict(one) for one in self.look_alikes],
+            'grid': _grid_dict(self.grid),
+            'recording': None if self.recording is None else _recording_dict(self.recording),
+            'queries': [_trial_dict(one) for one in self.queries]}
+
+    def _id(self, row: int) -> str:
+        return self.map_ids[row]
+
+    #: Ids in the map's order, which overlaps refer to.
+    map_ids: tuple[str, ...] = ()
+
+
+def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
+    """Return the thresholds that a report misses."""
+    failures = []
+
+    def demand(is_met: bool, text: str) -> None:
+        if not is_met:
+            failures.append(text)
+
+    views = [*report.grid.trials, *report.queries]
+    demand(report.faulty <= limits.max_faulty,
+           f'landmarks with a serious fault: {report.faulty:.0%} > {limits.max_faulty:.0%}')
+    demand(report.duplicates <= limits.max_duplicates,
+           f'pairs of duplicates: {report.duplicates} > {limits.max_duplicates}')
+    demand(len(report.look_alikes) <= limits.max_look_alikes,
+           f'pairs of places that look alike: {len(report.look_alikes)} > '
+           f'{limits.max_look_alikes}')
+    if (recording := report.recording) is not None:
+        views += recording.trials
+        quality = recording.held_out
+        demand(quality.explained >= limits.min_explained,
+               f'held-out boxes explained: {quality.explained:.0%} < {limits.min_explained:.0%}')
+        demand(quality.median_iou >= limits.min_iou,
+               f'held-out median IoU: {quality.median_iou:.2f} < {limits.min_iou:.2f}')
+        accepted = share(recording.trials, 'accepted')
+        demand(accepted >= limits.min_accepted,
+               f'recorded frames accepted: {accepted:.0%} < {limits.min_accepted:.0%}')
+    positions = report.grid.accepted_positions
+    demand(positions >= limits.min_positions,
+           f'positions with an accepted heading: {positions:.0%} < {limits.min_positions:.0%}')
+    misled = share(views, 'misled')
+    demand(misled <= limits.max_misled,
+           f'views that mislead a robot: {misled:.1%} > {limits.max_misled:.1%}')
+    return failures
+
+
+def share(trials: list[Trial] | tuple[Trial, ...], verdict: str) -> float:
+    """Return the share of the trials with a verdict; 0 of none."""
+    return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
+
+
+def _grid_dict(grid: GridCheck) -> dict[str, Any]:
+    return {
+        'headings': grid.headings, 'spacing_m': grid.spacing_m,
+        'accepted_positions_near_recording': grid.accepted_positions,
+        'verdicts': count_verdicts(grid.trials),
+        'positions': [{'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
+                       'misled': int(misled), 'visible_landmarks': int(visible)}
+                      for row, near, accepted, misled, visible in zip(
+                          grid.positions.round(3).tolist(), grid.is_near, grid.accepted,
+                          grid.misled, grid.visible, strict=True)],
+        'misled': [_trial_dict(one) for one in grid.trials if one.verdict == 'misled']}
+
+
+def _recording_dict(recording: RecordingCheck) -> dict[str, Any]:
+    return {
+        'frames': recording.frames, 'boxes': recording.boxes,
+        'duration_s': recording.duration_s, 'as_given': asdict(recording.as_given),
+        'held_out': asdict(recording.held_out), 'folds': [asdict(one) for one in recording.folds],
+        'edge_scale': recording.edge_scale, 'verdicts': count_verdicts(recording.trials),
+        'corrections': [asdict(one) for one in recording.corrections],
+        'trials': [_trial_dict(one) for one in recording.trials]}
+
+
+def _trial_dict(trial: Trial) -> dict[str, Any]:
+    return {
+        'verdict': trial.verdict, 'stamp_s': trial.stamp_s,
+        'position': trial.position.round(4).tolist(), 'forward': trial.forward.round(4).tolist(),
+        'detections': trial.detections, 'landmarks': trial.landmarks,
+        'estimate': None if trial.estimate is None else trial.estimate.round(4).tolist(),
+        'error_m': trial.error_m, 'reason': trial.reason}
