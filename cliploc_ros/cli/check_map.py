@@ -1,27 +1,32 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``check_map``: how good a map is, and what improves it."""
+"""The executable ``check_map``: how good a map is, and what to do about it."""
 
 import argparse
-import json
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.progress import StageBar
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from cliploc_ros.mapping.checking import CheckedMap
+    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+    from cliploc_ros.mapping.checking.relocalization import PosedObservation
 
+_ADVICE_SHOWN = 8
 EPILOG = """\
-exit code: 0: good; 1: below a threshold, or the input cannot be read
-
 examples:
-  check_map office.yaml
-  check_map office.yaml --observations office.npz --html office.html
-  check_map office.yaml --observations office.npz --cross-validate 4 --min-explained 0.8
+  check_map office.yaml --observations office.npz --out office_check
+  check_map office.yaml --observations office.npz --gravity --out office_check
+  check_map hand_written.yaml --out check --max-look-alikes 2
+
+exit code: 0 the map reaches all thresholds, 1 it misses one or the input is invalid
 """
 
 
@@ -37,83 +42,151 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='check_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Tell how good a map is and what to do about it: of the map alone, or '
-        'against a recording with poses. Needs no sourced ROS.')
-    parser.add_argument('map', type=Path, metavar='YAML')
+        description='Check a map: its landmarks, where a robot would be accepted, refused or '
+        'misled in it, places that look alike, and systematic errors. Writes check.html and '
+        'check.json. Without observations the report is shorter. Needs no sourced ROS.')
+    parser.add_argument('map', type=Path, metavar='MAP', help='a map file')
     parser.add_argument('--observations', type=Path, metavar='NPZ',
-                        help='boxes and poses of a recording in the coordinate frame of the map')
-    parser.add_argument('--cross-validate', type=int, default=0, metavar='PARTS',
-                        help='also build maps without each part of the recording, and test them '
-                        'on it (0: no)')
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the result')
-    parser.add_argument('--html', type=Path, metavar='FILE', help='write a page with a top view')
-    limits = parser.add_argument_group('below these the exit code is 1')
-    limits.add_argument('--max-problems', type=float, default=0.25, metavar='SHARE',
-                        help='share of landmarks with problems (%(default)s)')
-    limits.add_argument('--min-explained', type=float, default=0.6, metavar='SHARE',
-                        help='share of explained boxes (%(default)s)')
-    limits.add_argument('--min-localizable', type=float, default=0.6, metavar='SHARE',
-                        help='share of frames with at least three landmarks (%(default)s)')
+                        help='boxes and poses of a recording of the place')
+    parser.add_argument('--queries', type=Path, metavar='NPZ',
+                        help='a query file of this map: frames with similarities')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR',
+                        help='folder of check.html and check.json')
+    parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
+                        help='use each N-th frame of the observations only (%(default)s)')
+    parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    _add_relocalizer_options(parser)
+    _add_thresholds(parser)
     return parser
+
+
+def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('expected relocalization')
+    group.add_argument('--frames', type=_positive_int, default=100, metavar='N',
+                       help='the most recorded frames to relocalize (%(default)s)')
+    group.add_argument('--folds', type=int, default=5, metavar='N',
+                       help='of the cross-validation, 2 or more (%(default)s)')
+    group.add_argument('--grid', type=_positive, default=0.5, metavar='METRES',
+                       help='spacing of the camera positions, larger in large maps (%(default)s)')
+    group.add_argument('--positions', type=_positive_int, default=150, metavar='N',
+                       help='the most camera positions (%(default)s)')
+    group.add_argument('--headings', type=_positive_int, default=8, metavar='N',
+                       help='directions at each position (%(default)s)')
+    group.add_argument('--camera-height', type=float, metavar='METRES',
+                       help='of the grid (as recorded; else .3 m above the middle landmark)')
+    group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
+    group.add_argument('--min-confidence', type=float, default=0.99,
+                       help="the relocalizer's (%(default)s)")
+
+
+def _add_thresholds(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
+    for name, kind, default, text in (
+            ('min-explained', _share, 0.6, 'share of held-out boxes that a landmark explains'),
+            ('min-iou', _share, 0.6, 'their median IoU'),
+            ('min-accepted', _share, 0.4, 'share of recorded frames that are accepted'),
+            ('max-misled', _share, 0.01, 'share of views in which a wrong pose is accepted'),
+            ('min-positions', _share, 0.4, 'share of grid positions with an accepted heading'),
+            ('max-faulty', _share, 0.15, 'share of landmarks with a serious fault'),
+            ('max-duplicates', _count, 0, 'pairs of landmarks that are one object'),
+            ('max-look-alikes', _count, 0, 'pairs of places that look alike')):
+        group.add_argument(f'--{name}', type=kind, default=default, metavar='N',
+                           help=f'{text} (%(default)s)')
 
 
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from dataclasses import replace
-
     from cliploc_ros.core.landmark_map import LandmarkMap
     from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.mapping.check_page import check_page
-    from cliploc_ros.mapping.checking import check_map, cross_validate
-    from cliploc_ros.mapping.options import MappingOptions
+    from cliploc_ros.evaluation.map_check.output import PAGE, write_report
+    from cliploc_ros.evaluation.map_check.page import summary_lines
+    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.mapping.checking.checking import check_map
 
-    if options.observations is None and options.cross_validate:
-        raise OptionsError('--cross-validate needs --observations')
+    begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
+    check_options, thresholds = _check_options(options), _thresholds(options)
     detections = None
     if options.observations is not None:
         detections = load_observations(options.observations)
-    checked = check_map(landmark_map, detections)
-    if detections is not None and options.cross_validate:
-        explained, iou = cross_validate(detections, MappingOptions(), options.cross_validate)
-        checked = replace(checked, held_out_explained=explained, held_out_iou=iou)
-    if options.json is not None:
-        _write(options.json, json.dumps(checked.as_dict(), indent=1))
-    if options.html is not None:
-        way = None if detections is None else detections.map_from_camera[:, :3, 3]
-        _write(options.html, check_page(landmark_map, checked, way))
-    print('\n'.join(checked.lines()))
-    shortfalls = _shortfalls(checked, options)
-    for shortfall in shortfalls:
-        print(f'below threshold: {shortfall}')
-    return 1 if shortfalls else 0
+        if options.every > 1:
+            detections = detections.select_frames(range(0, len(detections), options.every))
+    queries = _read_queries(options.queries, landmark_map) if options.queries else []
+    make_folder(options.out)
+    with StageBar() as bar:
+        report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show)
+        write_report(options.out, options.map.name, landmark_map, report)
+    print('\n'.join(summary_lines(report)))
+    print('what to do:')
+    print('\n'.join(f'  {_printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
+    for failure in report.failures:
+        print(f'fails: {failure}')
+    print(f'wrote {options.out / PAGE} in {time.monotonic() - begin:.1f} s: '
+          f'{"passed" if report.passed else "failed"}')
+    return 0 if report.passed else 1
 
 
-def _shortfalls(checked: 'CheckedMap', options: argparse.Namespace) -> list[str]:
-    """Return the thresholds that a map misses."""
-    found = []
-    problems = sum(bool(one.problems) for one in checked.landmarks) / len(checked.landmarks)
-    if problems > options.max_problems:
-        found.append(f'{problems:.0%} of the landmarks have problems, at most '
-                     f'{options.max_problems:.0%} may')
-    for name, value, least in (
-            ('explained boxes', checked.explained, options.min_explained),
-            ('frames with at least three landmarks', checked.localizable,
-             options.min_localizable)):
-        if value is not None and value < least:
-            found.append(f'{name}: {value:.0%}, expected {least:.0%} or more')
-    return found
+def _check_options(options: argparse.Namespace) -> 'CheckOptions':
+    from cliploc_ros.core.options import RelocalizerOptions
+    from cliploc_ros.mapping.checking.options import CheckOptions
+
+    return CheckOptions(
+        relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
+        folds=options.folds, frames=options.frames, spacing_m=options.grid,
+        max_positions=options.positions, headings=options.headings,
+        camera_height_m=options.camera_height, use_vertical=options.gravity,
+        random_seed=options.seed)
 
 
-def _write(path: Path, text: str) -> None:
-    from cliploc_ros.replace_file import replace_file
+def _thresholds(options: argparse.Namespace) -> 'Thresholds':
+    from cliploc_ros.mapping.checking.options import Thresholds
 
-    try:
-        with replace_file(path) as partial:
-            partial.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
+    return Thresholds(**{field.name: getattr(options, field.name) for field in
+                         fields(Thresholds)})
+
+
+def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:
+    from cliploc_ros.datasets.queries import load_queries
+    from cliploc_ros.evaluation.trials import make_queries
+    from cliploc_ros.mapping.checking.relocalization import PosedObservation
+
+    found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
+    return [PosedObservation(one.observation, one.map_from_camera,
+                             one.observation.stamp_ns / NS_PER_S) for one in found]
+
+
+def _printable(text: str) -> str:
+    """Return text for a terminal: ids in a map may hold any characters."""
+    return ''.join(char if char.isprintable() else ' ' for char in text)
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
+    return value
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    return value
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 1')
+    return value
 
 
 if __name__ == '__main__':

@@ -98,8 +98,8 @@ def _on_grid(grid: GridCheck) -> Iterator[str]:
         low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
         yield (f'no heading is accepted at {len(rows)} positions near the recording with x '
                f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: at most '
-               f'{_landmarks(int(grid.visible[rows].max()))} in one view; map more objects that '
-               'can be seen from there')
+               f'{_landmarks(round(grid.visible[rows].max()))} can be detected in one view; map '
+               'more objects that can be seen from there')
 
 
 def _dead_areas(grid: GridCheck) -> list[NDArray[np.int64]]:

@@ -31,8 +31,9 @@ from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.checking.relocalization import (
     PosedObservation,
-    try_grid,
+    sample_frames,
     try_observations,
+    try_poses,
     try_recording,
 )
 from cliploc_ros.mapping.checking.report import (
@@ -102,10 +103,10 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
                      'view within 5 m, in images of 640 x 480 px with a focal length of 525 px')
     overlaps = find_map_overlaps(landmark_map, witness, views)
     grid = make_grid(landmark_map, recorded_poses, options)
-    trials = try_grid(model, landmark_map, grid, options,
-                      lambda share: tell('relocalizing on the grid', share))
+    trials = try_poses(model, landmark_map, grid.poses, options,
+                       lambda share: tell('relocalizing on the grid', share))
     verdicts = np.array([one.verdict for one in trials]).reshape(-1, options.headings)
-    visible = np.array([len(model.in_view(pose)[0]) for pose in grid.poses])
+    visible = np.array([model.expected_detections(pose) for pose in grid.poses])
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map, rng)),
@@ -135,6 +136,9 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            lambda share: tell('relocalizing recorded frames', share))
+    sampled = sample_frames(len(detections), options.frames)
+    simulated = try_poses(model, landmark_map, detections.map_from_camera[sampled], options,
+                          lambda share: tell('relocalizing simulated frames', share))
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
@@ -142,7 +146,7 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         path_xyz=detections.map_from_camera[:, :3, 3],
         as_given=box_quality(judge_boxes(views, witness.landmarks)),
         held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
-        trials=tuple(trials),
+        trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, _fitted(views, witness),
                                            witness.shown)),
         edge_scale=model.edge_scale)

@@ -100,6 +100,11 @@ class DetectorModel:
         rows = np.nonzero(visible)[0]
         return rows, clipped[rows]
 
+    def expected_detections(self, map_from_camera: NDArray[np.float64]) -> float:
+        """Return how many landmarks the detector finds on average."""
+        rows, _ = self.in_view(map_from_camera)
+        return sum(self._chance(row, map_from_camera) for row in rows)
+
     def detect(self, map_from_camera: NDArray[np.float64], rng: np.random.Generator
                ) -> tuple[Detections, NDArray[np.int64]]:
         """Return what the detector might find, and the landmark that each box shows."""

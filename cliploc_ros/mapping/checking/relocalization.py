@@ -16,7 +16,6 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.checking.cross_validation import Fold, fold_map
 from cliploc_ros.mapping.checking.detector_model import DetectorModel
-from cliploc_ros.mapping.checking.grid import Grid
 from cliploc_ros.mapping.checking.label_model import LabelModel
 from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
@@ -84,8 +83,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         Told the share that is done.
     """
     labels = LabelModel.of(landmark_map)
-    step = max(1, -(-len(detections) // options.frames))
-    chosen = set(range(step // 2, len(detections), step))
+    chosen = set(sample_frames(len(detections), options.frames).tolist())
     trials, done = [], 0
     for fold in folds:
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
@@ -108,9 +106,15 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
 
-def try_grid(model: DetectorModel, landmark_map: LandmarkMap, grid: Grid, options: CheckOptions,
-             tell: Tell) -> list[Trial]:
-    """Relocalize simulated frames at each position and heading of a grid.
+def sample_frames(count: int, limit: int) -> NDArray[np.int64]:
+    """Return at most a limit of frames, evenly spread."""
+    step = max(1, -(-count // limit))
+    return np.arange(min(step // 2, count - 1), count, step)
+
+
+def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
+              options: CheckOptions, tell: Tell) -> list[Trial]:
+    """Relocalize simulated frames.
 
     Parameters
     ----------
@@ -118,21 +122,22 @@ def try_grid(model: DetectorModel, landmark_map: LandmarkMap, grid: Grid, option
         What there is to see.
     landmark_map : LandmarkMap
         What the relocalizer knows.
-    grid : Grid
+    poses : ndarray (k, 4, 4)
+        True poses map_from_camera.
     options : CheckOptions
     tell : callable
         Told the share that is done.
     """
     labels, relocalizer = LabelModel.of(landmark_map), _relocalizer(landmark_map, options)
     trials = []
-    for number, pose in enumerate(grid.poses):
+    for number, pose in enumerate(poses):
         rng = np.random.default_rng([options.random_seed, number])
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
         trials.append(_try(relocalizer, model.camera, detections, similarities, pose,
                            int((shown >= 0).sum()), options))
-        tell((number + 1) / len(grid.poses))
+        tell((number + 1) / len(poses))
     return trials
 
 

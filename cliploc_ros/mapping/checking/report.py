@@ -53,6 +53,9 @@ class RecordingCheck:
     folds : tuple of BlockQuality
     trials : tuple of Trial
         Recorded frames in cross-validated maps, in the order of time.
+    simulated : tuple of Trial
+        The same poses in the map as it is, with simulated boxes: as many should be accepted as
+        with recorded ones, else the grid is too optimistic or too pessimistic.
     corrections : tuple of Correction
     edge_scale : float
         Deviation of box edges, in units of build_map's assumption.
@@ -66,6 +69,7 @@ class RecordingCheck:
     held_out: BoxQuality
     folds: tuple[BlockQuality, ...]
     trials: tuple[Trial, ...]
+    simulated: tuple[Trial, ...]
     corrections: tuple[Correction, ...]
     edge_scale: float
 
@@ -82,8 +86,8 @@ class GridCheck:
         The recording passed near; without a recording, all.
     accepted, misled : ndarray (P,) of int
         Headings of each position in which a right, and a wrong pose is accepted.
-    visible : ndarray (P,) of int
-        The most landmarks in one view.
+    visible : ndarray (P,)
+        The most landmarks that are detected in one view, on average.
     headings : int
     spacing_m : float
     trials : tuple of Trial
@@ -94,7 +98,7 @@ class GridCheck:
     is_near: NDArray[np.bool_]
     accepted: NDArray[np.int64]
     misled: NDArray[np.int64]
-    visible: NDArray[np.int64]
+    visible: NDArray[np.float64]
     headings: int
     spacing_m: float
     trials: tuple[Trial, ...]
@@ -221,7 +225,7 @@ def _grid_dict(grid: GridCheck) -> dict[str, Any]:
         'accepted_positions_near_recording': grid.accepted_positions,
         'verdicts': count_verdicts(grid.trials),
         'positions': [{'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
-                       'misled': int(misled), 'visible_landmarks': int(visible)}
+                       'misled': int(misled), 'expected_detections': round(float(visible), 2)}
                       for row, near, accepted, misled, visible in zip(
                           grid.positions.round(3).tolist(), grid.is_near, grid.accepted,
                           grid.misled, grid.visible, strict=True)],
@@ -234,6 +238,7 @@ def _recording_dict(recording: RecordingCheck) -> dict[str, Any]:
         'duration_s': recording.duration_s, 'as_given': asdict(recording.as_given),
         'held_out': asdict(recording.held_out), 'folds': [asdict(one) for one in recording.folds],
         'edge_scale': recording.edge_scale, 'verdicts': count_verdicts(recording.trials),
+        'verdicts_with_simulated_boxes': count_verdicts(recording.simulated),
         'corrections': [asdict(one) for one in recording.corrections],
         'trials': [_trial_dict(one) for one in recording.trials]}
 

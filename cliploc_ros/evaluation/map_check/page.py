@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a check: one HTML file with its pictures, without scripts and external requests."""
+
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from cliploc_ros.evaluation.map_check.style import ACCEPTED, FAULTY, GRADE_NAMES, MINOR, grade
+from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts
+from cliploc_ros.mapping.checking.report import CheckReport, RecordingCheck, share
+
+_MOST_LANDMARKS = 300
+_MOST_MATCHED = 12
+_STYLE = f"""\
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1100px;
+  padding: 0 1rem }}
+img {{ max-width: 100%; border: 1px solid #ddd }}
+table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
+  margin: 1rem 0 }}
+th, td {{ text-align: left; vertical-align: top; padding: .25rem .7rem;
+  border-bottom: 1px solid #ddd; overflow-wrap: anywhere }}
+td.number, th.number {{ text-align: right; overflow-wrap: normal; white-space: nowrap }}
+.scroll {{ overflow-x: auto }}
+.verdict {{ border-left: 6px solid; padding: .6rem 1rem; background: #f6f6f6 }}
+.passed {{ border-color: {ACCEPTED} }} .failed {{ border-color: {FAULTY} }}
+.faulty {{ border-left: 4px solid {FAULTY} }} .minor {{ border-left: 4px solid {MINOR} }}
+.note, figcaption {{ font-size: 14px; color: #555 }}
+figure {{ margin: 2rem 0 }} li {{ margin: .3rem 0 }}
+"""
+
+
+def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]]) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    name : str
+        Of the map.
+    report : CheckReport
+    pictures : iterable of (str, str, bytes)
+        Name, caption and PNG of each picture.
+    """
+    title = f'Check of {name}'
+    parts = ['<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
+             '<meta name="viewport" content="width=device-width">',
+             f'<title>{escape(title)}</title>', f'<style>{_STYLE}</style>',
+             f'<h1>{escape(title)}</h1>', _verdict(report), '<h2>What to do</h2>',
+             _list(report.advice), '<h2>Figures</h2>', _table(('', ''), _figures(report))]
+    parts += [_picture(*picture) for picture in pictures]
+    parts += ['<h2>Landmarks, worst first</h2>', _landmarks(report.landmarks)]
+    if report.look_alikes:
+        parts += ['<h2>Places that look alike</h2>', _look_alikes(report)]
+    if report.recording is not None:
+        parts += ['<h2>Held-out boxes</h2>', _folds(report.recording),
+                  '<h2>Systematic residuals</h2>', _corrections(report.recording)]
+    parts += ['<h2>What these figures rest on</h2>', _list(report.notes), '</html>', '']
+    return '\n'.join(parts)
+
+
+def summary_lines(report: CheckReport) -> list[str]:
+    """Return the figures as lines of text, for a terminal."""
+    return [f'{name}: {value}' for name, value in _figures(report)]
+
+
+def _verdict(report: CheckReport) -> str:
+    if report.passed:
+        return '<p class="verdict passed"><b>The map reaches all thresholds.</b></p>'
+    return ('<div class="verdict failed"><b>The map misses these thresholds:</b>'
+            + _list(report.failures) + '</div>')
+
+
+def _figures(report: CheckReport) -> list[tuple[str, str]]:
+    faulty = sum(grade(one) == 'faulty' for one in report.landmarks)
+    rows = [('landmarks', str(len(report.landmarks))),
+            ('with a serious fault', f'{faulty} ({report.faulty:.0%})'),
+            ('pairs of duplicates', str(report.duplicates)),
+            ('pairs of places that look alike', str(len(report.look_alikes)))]
+    if (one := report.recording) is not None:
+        rows += [
+            ('recording', f'{one.frames} frames, {one.boxes} boxes, {one.duration_s:.0f} s'),
+            ('explained boxes, median IoU; map as given',
+             f'{one.as_given.explained:.1%}, {one.as_given.median_iou:.3f} (too good if the map '
+             'was built from this recording)'),
+            ('explained boxes, median IoU; held out',
+             f'{one.held_out.explained:.1%}, {one.held_out.median_iou:.3f}'),
+            ('recorded frames, cross-validated', _verdicts(one.trials)),
+            ('the same poses with simulated boxes', _verdicts(one.simulated)),
+            ('noise of box edges', f'{one.edge_scale:.2f} times that assumed by build_map')]
+    if report.queries:
+        rows.append(('queries with recorded similarities', _verdicts(report.queries)))
+    rows += [('grid views', _verdicts(report.grid.trials)),
+             ('grid positions near the recording with an accepted heading'
+              if report.recording else 'grid positions with an accepted heading',
+              f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
+    return rows
+
+
+def _verdicts(trials: Sequence[Trial]) -> str:
+    counts = count_verdicts(trials)
+    return (f'{counts["accepted"]} of {len(trials)} accepted ({share(tuple(trials), "accepted"):.0%}'
+            f'), {counts["refused"]} refused, {counts["misled"]} misled')
+
+
+def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
+    head = ('landmark', 'class', '#frames', '#seen [%]', '#baseline [deg]', '#deviation [cm]',
+            '#median IoU', '#thinness', 'overlaps (normalized distance)', 'faults')
+    rows = ''.join(_landmark_row(one) for one in landmarks[:_MOST_LANDMARKS])
+    rest = len(landmarks) - _MOST_LANDMARKS
+    more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
+    return f'<div class="scroll"><table>{_head(head)}{rows}</table></div>{more}'
+
+
+def _landmark_row(one: LandmarkCheck) -> str:
+    overlaps = ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)
+    texts = [_cell(f'{one.landmark_id}: {one.label}' if one.label != one.class_id
+                   else one.landmark_id, grade(one)), _cell(one.class_id)]
+    support = '' if one.support is None else (
+        str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
+    numbers = [support, _number(one.seen_ratio, 100.0, 0), _number(one.baseline_deg, 1.0, 0),
+               _number(one.position_sigma_m, 100.0, 1), _number(one.median_iou, 1.0, 2),
+               _number(one.thinness, 1.0, 2)]
+    faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
+    return '<tr>' + ''.join([*texts, *(_cell(text, 'number') for text in numbers),
+                             _cell(overlaps), _cell(faults)]) + '</tr>'
+
+
+def _look_alikes(report: CheckReport) -> str:
+    rows = []
+    for number, one in enumerate(report.look_alikes, start=1):
+        pairs = ', '.join(f'{first} = {second}' for first, second in one.matched[:_MOST_MATCHED])
+        if len(one.matched) > _MOST_MATCHED:
+            pairs += f' and {len(one.matched) - _MOST_MATCHED} more'
+        rows.append((str(number), f'{one.first[0]:.1f}, {one.first[1]:.1f}',
+                     f'{one.second[0]:.1f}, {one.second[1]:.1f}', f'{one.turn_deg:.0f}',
+                     f'{len(one.matched)} of {one.landmarks}', str(one.same_labels), pairs))
+    return _table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
+                   '#with equal labels', 'which'), rows)
+
+
+def _folds(recording: RecordingCheck) -> str:
+    rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
+             f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
+            for number, one in enumerate(recording.folds, start=1)]
+    return ('<p>Blocks of time take turns in being judged; landmarks are fitted to the other '
+            'blocks.</p>' + _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
+                                    '#median IoU'), rows))
+
+
+def _corrections(recording: RecordingCheck) -> str:
+    if not recording.corrections:
+        return '<p>Too few boxes to tell.</p>'
+    rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
+             f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
+             'significant' if one.is_significant else '') for one in recording.corrections]
+    return ('<p>The correction that fits the edges of the boxes best, each cause on its own. A '
+            'turned mount and a shifted principal point look much the same.</p>'
+            + _table(('cause', 'what', '#correction', '#deviation', '#effect [px]', ''), rows))
+
+
+def _picture(name: str, caption: str, png: bytes) -> str:
+    data = b64encode(png).decode('ascii')
+    return (f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">'
+            f'<figcaption>{escape(caption)}</figcaption></figure>')
+
+
+def _list(texts: Iterable[str]) -> str:
+    return '<ul>' + ''.join(f'<li>{escape(text)}</li>' for text in texts) + '</ul>'
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table; a heading that begins with # aligns its column to the right."""
+    body = ''.join('<tr>' + ''.join(
+        _cell(text, 'number' if title.startswith('#') else '')
+        for title, text in zip(head, row, strict=True)) + '</tr>' for row in rows)
+    return f'<div class="scroll"><table>{_head(head) if any(head) else ""}{body}</table></div>'
+
+
+def _head(titles: Sequence[str]) -> str:
+    return '<tr>' + ''.join(
+        f'<th{" class=number" if title.startswith("#") else ""}>{escape(title.lstrip("#"))}</th>'
+        for title in titles) + '</tr>'
+
+
+def _cell(text: str, kind: str = '') -> str:
+    return f'<td{f" class={kind}" if kind else ""}>{escape(text)}</td>'
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return '' if value is None else f'{value * factor:.{digits}f}'
