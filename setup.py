@@ -17,7 +17,7 @@ def files(folder: str, pattern: str) -> list[str]:
 setup(
     name=PACKAGE,
     version='0.1.0',
-    packages=find_packages(exclude=['test', 'test.*']),
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
         f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
@@ -38,7 +38,6 @@ setup(
         ],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
-        'worlds': ['vtk'],  # renders them
         'test': ['hypothesis', 'pytest'],
     },
     zip_safe=False,

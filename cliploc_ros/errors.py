@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the package raises for input that its user can mend."""
+"""Errors that the user can fix."""
 
 
-# Of a longer message the middle is left out: what is wrong is named first, and what to do last.
+# A longer message loses its middle: it begins with what is wrong and ends with what to do.
 _HEAD, _TAIL = 700, 250
 
 
 class CliplocError(Exception):
-    """Bad input. The message names the thing to mend; no traceback is needed to act on it.
+    """Bad input. The message names the thing to fix, so no traceback is needed.
 
-    It may quote what a stranger wrote, and goes to logs, answers and diagnostics: as text it is
-    one line, and short.
+    The message may quote untrusted text and goes to logs, answers and diagnostics, so it is cut
+    to one line of bounded length.
     """
 
     def __str__(self) -> str:
@@ -23,7 +23,7 @@ class CliplocError(Exception):
 
 
 class MapError(CliplocError):
-    """A landmark map that cannot be used: file, landmark and field are named."""
+    """An invalid landmark map; the message names file, landmark and field."""
 
 
 class OptionsError(CliplocError):
@@ -31,7 +31,7 @@ class OptionsError(CliplocError):
 
 
 class CameraError(CliplocError):
-    """Camera intrinsics or distortion that no camera can have."""
+    """Invalid camera intrinsics or distortion."""
 
 
 class ImageError(CliplocError):
@@ -51,4 +51,8 @@ class InternalError(CliplocError):
 
 
 class StoppedError(CliplocError):
-    """The process is ending; what was asked for will not come."""
+    """The node or its process is ending."""
+
+
+class TimeUpError(CliplocError):
+    """A request's time is up before the work is done; the message names the work."""

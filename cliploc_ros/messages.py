@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images and cameras out of messages, whether rclpy or rosbags has read these.
+"""Images and cameras from messages, read by rclpy or by rosbags.
 
-Nothing here trusts a message.
+No field of a message is taken for valid.
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import CameraError, ImageError
 
-# Where red, green and blue stand in each pixel, and how many bytes it has.
+# The places of red, green and blue in each pixel, and its bytes.
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
              'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
-# A small file may claim any size: what is decoded is bounded to 200 MB.
+# A small file may declare any size: an image takes 200 MB at most.
 _MAX_PIXELS = 2**26
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
-# the markers of JPEG that begin a frame, with its size in it
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# The markers of JPEG that are followed by the size of the image.
+_JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
 
 class ImageMessage(Protocol):
     """sensor_msgs/Image."""
@@ -64,7 +65,7 @@ def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uin
     Raises
     ------
     ImageError
-        Names what in the message cannot be.
+        A field is invalid; the message names it.
     """
     return _decoded(msg) if isinstance(msg, CompressedImageMessage) else _unpacked(msg)
 
@@ -90,7 +91,7 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
     _check_size(*_declared_size(bytes(msg.data), msg.format))
     data = np.frombuffer(msg.data, dtype=np.uint8)
     try:
-        # EXIF may ask to turn the picture, but the intrinsics are those of the sensor.
+        # EXIF may ask to turn the image, but the intrinsics are those of the sensor.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
@@ -101,16 +102,16 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
 
 
 def _declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
-    """Return width and height that a JPEG or PNG says it has, before it is decoded."""
+    """Return width and height as a JPEG or PNG declares them, before it is decoded."""
     if data.startswith(_PNG) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
     at = 2 if data.startswith(_JPEG) else len(data)
     while at + 9 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] in _JPEG_FRAMES:
+        if data[at + 1] in _JPEG_SIZES:
             return int.from_bytes(data[at + 7:at + 9]), int.from_bytes(data[at + 5:at + 7])
         at += 2 + int.from_bytes(data[at + 2:at + 4])
     raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
-                     'it is no JPEG or PNG, or is cut off')
+                     'it is no JPEG or PNG, or it is cut off')
 
 
 def _check_size(width: int, height: int) -> None:
@@ -128,12 +129,12 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
     image_size : tuple of int
         Width and height of the image [px].
     rectified : bool
-        The image is rectified: P holds, and there is no distortion.
+        The image is rectified: take P and no distortion.
 
     Raises
     ------
     CameraError
-        For values that no camera can have, and for the intrinsics of another image size.
+        The values are invalid, or they are for another image size.
     """
     width, height = image_size
     if (msg.width or width, msg.height or height) != image_size:

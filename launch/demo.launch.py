@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a walk through a synthetic room, ten wake-ups, a page of pictures."""
+"""Run the demo: a walk through a synthetic room, ten requests, a page of pictures."""
 
 # ros2 launch cliploc_ros demo.launch.py rviz:=true
 
@@ -12,12 +12,12 @@ from launch_ros.substitutions import FindPackagePrefix
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the demo, which starts its nodes by itself."""
+    """Return the demo, which starts its own nodes."""
     rviz = LaunchConfiguration('rviz')
     demo = PathJoinSubstitution([FindPackagePrefix('cliploc_ros'), 'lib', 'cliploc_ros', 'demo'])
     command = [demo, '--out', LaunchConfiguration('out')]
     return LaunchDescription([
-        DeclareLaunchArgument('rviz', default_value='false', description='show it in RViz'),
+        DeclareLaunchArgument('rviz', default_value='false', description='true: open RViz'),
         DeclareLaunchArgument('out', default_value='demo_out', description='folder of pictures'),
         ExecuteProcess(cmd=command, output='screen', on_exit=Shutdown(),
                        condition=UnlessCondition(rviz)),

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detector and relocalizer beside a camera driver."""
+"""Start detector and relocalizer next to a camera driver."""
 
-# ros2 launch cliploc_ros relocalization.launch.py map:=office.yaml \
+# ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
+
+from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -12,48 +14,52 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
+# Launch files that include each other share their arguments: apart from namespace, use_sim_time,
+# autostart and log_level, which mean the same there, no name is one of Nav2's bringup.
+
 # Topics and services, each remapped by the argument of its name.
 NAMES = {
-    'image': "the camera driver's topic; image/compressed hangs below it",
-    'camera_info': "the camera driver's topic",
+    'image': 'the raw topic of the camera driver; image/compressed follows it',
+    'camera_info': 'the topic of the camera driver',
     'detections': 'from the detector to the relocalizer',
-    'odom': 'tells whether the robot moves; without it, it is taken to stand',
-    'imu': 'with gravity:=imu',
-    'initialpose': 'what AMCL listens to',
+    'odom': 'tells whether the robot moves; without it the robot is assumed to stand',
+    'imu': 'the vertical, with gravity:=imu',
+    'initialpose': 'what AMCL subscribes to',
     'request_nomotion_update': 'what AMCL serves',
-    'reinitialize_global_localization': "what Nav2's behaviour tree calls",
+    'reinitialize_global_localization': "what Nav2's behaviour tree calls; AMCL serves this name, "
+                                        'too',
 }
-# Where one is not given the file `parameters` decides, and then the node's own default.
+# An argument that is not given leaves the choice to the file `parameters`, then to the default.
 DETECTOR_PARAMETERS = {
     'model': 'YOLO weights',
     'image_transport': 'raw or compressed',
-    'autostart': 'false: a lifecycle manager configures and activates',
-    'use_sim_time': 'true: take the time from /clock',
+    'autostart': 'false: a lifecycle manager configures and activates the nodes',
+    'use_sim_time': 'true: use the time of /clock',
 }
 RELOCALIZER_PARAMETERS = {
-    'map': 'map file, the parameter map_file',
-    'base_frame': "frame whose pose is published; else the camera's",
-    'gravity': 'what tells the vertical: none, base_frame or imu',
+    'map_file': 'the map of objects',
+    'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
+    'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
     'mode': 'on_request or continuous',
     'clip_model': 'open_clip architecture',
     'clip_pretrained': 'tag or file',
     'image_transport': 'raw or compressed',
-    'autostart': 'false: a lifecycle manager configures and activates',
-    'use_sim_time': 'true: take the time from /clock',
+    'autostart': 'false: a lifecycle manager configures and activates the nodes',
+    'use_sim_time': 'true: use the time of /clock',
 }
 OTHERS = {
-    'parameters': ('', "file of the nodes' parameters; arguments that are given go before it"),
-    'namespace': ('', 'of both nodes: one for each robot, and for each camera'),
-    'tf': ('/tf', 'tf: in the namespace, as Nav2 has it for one robot of several'),
-    'detector': ('true', 'false: somebody else publishes detections'),
+    'parameters': ('', 'parameter file of both nodes; other arguments override it'),
+    'namespace': ('', 'of both nodes: one for each robot and for each camera'),
+    'tf': ('/tf', 'tf: transforms in the namespace, as Nav2 has them for several robots'),
+    'detector': ('true', 'false: another program publishes detections'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
 _TRUTH_VALUES = ('autostart', 'use_sim_time')
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return both nodes, with what people most often set as arguments."""
+    """Return both nodes, with the most common settings as arguments."""
     arguments = {name: (name, text) for name, text in NAMES.items()} | {
         name: ('', text) for name, text in (DETECTOR_PARAMETERS | RELOCALIZER_PARAMETERS).items()}
     declared = [DeclareLaunchArgument(name, default_value=default, description=text)
@@ -62,18 +68,26 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes, with those parameters that are given."""
+    """Return the nodes with the parameters that are given."""
+    check_parameter_file(context.launch_configurations['parameters'])
     given = {name for name, value in context.launch_configurations.items() if value}
     return [_node('detector', given & DETECTOR_PARAMETERS.keys(), given,
                   condition=IfCondition(LaunchConfiguration('detector'))),
             _node('relocalizer', given & RELOCALIZER_PARAMETERS.keys(), given)]
 
 
+def check_parameter_file(path: str) -> None:
+    """Raise RuntimeError if a file is named that does not exist; launch_ros would only warn."""
+    if path and not Path(path).is_file():
+        raise RuntimeError(f"parameters:={path}: there is no such file ('~' is not expanded); "
+                           'correct the path, or omit the argument to use the defaults')
+
+
 def _node(name: str, parameters: set[str], given: set[str], **keywords) -> Node:
     files = [ParameterFile(LaunchConfiguration('parameters'))] if 'parameters' in given else []
-    changes = {'map_file' if one == 'map' else one: ParameterValue(
-        LaunchConfiguration(one), value_type=bool if one in _TRUTH_VALUES else str)
-        for one in sorted(parameters)}
+    changes = {one: ParameterValue(LaunchConfiguration(one),
+                                   value_type=bool if one in _TRUTH_VALUES else str)
+               for one in sorted(parameters)}
     tf, image = LaunchConfiguration('tf'), LaunchConfiguration('image')
     return Node(
         package='cliploc_ros', executable=name, name=name, output='screen',

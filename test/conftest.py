@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all tests share: the data beside the project, a ROS domain of their own, the counts."""
 
+import importlib.util
 import os
 import signal
 import socket
@@ -14,6 +15,11 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
+# pytest-xdist gives a file to a worker as a whole, in this order: the longest come first, so that
+# no worker is left with one of them at the end.
+LONGEST_FIRST = ('nodes', 'demo', 'models', 'cli', 'core')
+#: Tests that a run leaves out, by the Python module that is missing.
+NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 
 # Equal runs draw equal examples; the first call of a compiled kernel would break any deadline.
 hypothesis.settings.register_profile('cliploc_ros', deadline=None, derandomize=True)
@@ -44,6 +50,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Keep the tests' nodes, which inherit the environment, away from every other node."""
+    config.stash[NOT_RUN] = {}
     # A shell lets what it runs in the background ignore Ctrl-C, and so would our processes.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, config.ros_domain_reservation = reserve_ros_domain()
@@ -51,14 +58,54 @@ def pytest_configure(config):
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     # The older name of the same; where both are set, ROS warns.
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
+    # As in the nodes: threads of PyTorch that wait for work leave the cores to others.
+    os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Leave out the tests that need what is not installed here, and put the longest first."""
+    left_out = [item for item in items if missing_module(item)]
+    for item in left_out:
+        config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = sorted((item for item in items if not missing_module(item)), key=place)
+
+
+def missing_module(item: pytest.Item) -> str | None:
+    """Return the first Python module that the markers ``needs`` name and that is not here."""
+    needed = [name for marker in item.iter_markers('needs') for name in marker.args]
+    return next((name for name in needed if importlib.util.find_spec(name) is None), None)
+
+
+def place(item: pytest.Item) -> int:
+    folder = item.path.parent.name
+    return LONGEST_FIRST.index(folder) if folder in LONGEST_FIRST else len(LONGEST_FIRST)
+
+
+def pytest_sessionfinish(session, exitstatus):
+    config = session.config
+    if hasattr(config, 'workeroutput'):  # a worker of pytest-xdist, which reports to the run
+        config.workeroutput['not_run'] = config.stash[NOT_RUN]
+        return
+    reporter = config.pluginmanager.get_plugin('terminalreporter')
+    if config.getoption('--no-skips') and count(reporter, 'skipped'):
+        reporter.write_line('\nskipped tests fail this run (--no-skips)', red=True)
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node, error):
+    """Take over what a worker of pytest-xdist left out; each has collected all tests."""
+    node.config.stash[NOT_RUN] |= getattr(node, 'workeroutput', {}).get('not_run', {})
 
 
 def count(reporter, *outcomes: str) -> int:
     return sum(len(reporter.stats.get(outcome, [])) for outcome in outcomes)
 
 
-def pytest_terminal_summary(terminalreporter):
-    """Print what tests measured, and one line of counts, which script/test repeats at its end."""
+def pytest_terminal_summary(terminalreporter, config):
+    """Print what tests measured, what was not run, and a line of counts for script/test."""
     measured = [report for report in terminalreporter.stats.get('passed', [])
                 if report.when == 'call' and report.capstdout.strip()]
     if measured:
@@ -67,6 +114,8 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(report.nodeid)
         for line in report.capstdout.strip().splitlines():
             terminalreporter.write_line(f'    {line}')
+    for module, tests in sorted(config.stash[NOT_RUN].items()):
+        terminalreporter.write_line(f'not run here, {module} is missing: {", ".join(tests)}')
     passed = count(terminalreporter, 'passed', 'xpassed')
     failed = count(terminalreporter, 'failed', 'error', 'xfailed')
     terminalreporter.write_line(
@@ -74,13 +123,6 @@ def pytest_terminal_summary(terminalreporter):
         f'{count(terminalreporter, "skipped")} skipped '
         f'(NumPy {np.__version__}, OpenCV {cv2.__version__})'
     )
-
-
-def pytest_sessionfinish(session, exitstatus):
-    reporter = session.config.pluginmanager.get_plugin('terminalreporter')
-    if session.config.getoption('--no-skips') and count(reporter, 'skipped'):
-        reporter.write_line('\nskipped tests fail this run (--no-skips)', red=True)
-        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(scope='session')

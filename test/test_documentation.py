@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The README and config/ say what the code declares."""
+"""README, doc/ and config/ say what the code declares."""
 
 import importlib.machinery
 import importlib.util
@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
 
 PROJECT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
 # what every node has
 OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
                     'change_state|get_state|get_available_.*|get_transition_graph|'
@@ -35,13 +37,40 @@ def test_documents_are_what_the_tables_say(document):
         assert path.read_text() == text, f'{path} is out of date: run script/document'
 
 
-@pytest.mark.parametrize('name', ['detector', 'relocalizer'])
-def test_the_readme_has_the_tables(name):
-    readme = (PROJECT / 'README.md').read_text()
-    rows = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}[name]
-    table = readme.split(f'<!-- {name} parameters -->')[1].split('<!-- end of')[0]
-    assert [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')] == [
-        row.name for row in rows]
+def test_the_readme_is_read_in_a_minute():
+    assert len((PROJECT / 'README.md').read_text().splitlines()) < 150
+
+
+def test_the_readme_leads_to_every_page():
+    linked = re.findall(r'\]\(doc/(\w+\.md)', (PROJECT / 'README.md').read_text())
+    assert set(linked) == {path.name for path in DOCUMENTS[1:]}
+
+
+def anchors(path):
+    """Return what can follow a # in a link to a page: its headings, as GitHub writes them."""
+    headings = re.findall('^#+ (.+)$', path.read_text(), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
+
+
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    for link in re.findall(r'\]\((?!https?:)([^)]+)\)', path.read_text()):
+        name, _, anchor = link.partition('#')
+        target = path.parent / name if name else path
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+def test_commands_run_what_there_is(path):
+    """Programs of this package, and the tests that a figure comes from."""
+    text = path.read_text()
+    for module in re.findall(r'python -m ((?:cliploc_ros|demo_world)[\w.]*)', text):
+        assert (PROJECT / module.replace('.', '/')).with_suffix('.py').is_file(), module
+    for test in re.findall(r'\b(test/[\w/]+\.py)', text):
+        assert (PROJECT / test).is_file(), test
+    for script in re.findall(r'\bscript/([\w.-]+)', text):
+        assert (PROJECT / 'script' / script).exists(), script
 
 
 def test_the_default_parameters_are_valid_together():
@@ -49,17 +78,26 @@ def test_the_default_parameters_are_valid_together():
 
 
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
-def test_the_readme_has_every_topic_and_service_and_no_other(node):
+def test_the_interface_has_every_topic_and_service_and_no_other(node):
     """The policy has them all; a test holds that equal to the graph."""
     policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
     profile = policy.find(f'.//profile[@node="{node}"]')
     used = {entry.text for group in profile for entry in group if not OF_ROS.search(entry.text)}
-    section = (PROJECT / 'README.md').read_text().split(f'\n### {node}\n')[1].split('<!--')[0]
+    section = (PROJECT / 'doc/interface.md').read_text().split(f'\n## {node}\n')[1]
+    section = re.split('^##', section, maxsplit=1, flags=re.MULTILINE)[0]
     cells = [line.split('|')[1] for line in section.splitlines() if line.startswith('| `')]
     named = [name for cell in cells for name in re.findall('`(.+?)`', cell)]
     assert len(named) == len(set(named))
     assert {name if name[0] == '/' else f'/{name}'.replace('/~', f'/{node}')
             for name in named} == used
+
+
+@pytest.mark.parametrize('page', ['README.md', 'doc/maps.md'])
+def test_the_map_of_the_documents_is_valid(page, tmp_path):
+    text = (PROJECT / page).read_text()
+    path = tmp_path / 'map.yaml'
+    path.write_text(re.search(r'    /\*\*:\n(?: {6}.*\n)+', text).group())
+    assert LandmarkMap.from_file(path).labels == ('a red mug with white dots',)
 
 
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])

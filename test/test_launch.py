@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Launch files: what they pass on exists; run where launch_ros is installed."""
+"""Launch files pass on only what exists, and make their descriptions."""
 
 import ast
-import importlib.util
 import re
 import runpy
 import xml.etree.ElementTree as ElementTree
@@ -15,20 +14,36 @@ from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
+DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]
 TABLES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
+# The arguments of Nav2 1.3.13's bringup_launch.py and localization_launch.py, and those that mean
+# the same in ours.
+OF_NAV2 = {'namespace', 'use_namespace', 'slam', 'map', 'use_localization', 'use_sim_time',
+           'params_file', 'autostart', 'use_composition', 'container_name', 'use_respawn',
+           'log_level'}
+SHARED_WITH_NAV2 = {'namespace', 'use_sim_time', 'autostart', 'log_level'}
 # what both nodes have in their own names' namespaces, and what ROS has at its root
 OWN = re.compile('/(detector|relocalizer|diagnostics|clock|parameter_events|rosout|tf(_static)?)'
                  '(/.*)?$')
 
 
+def relocalization_launch() -> list[ast.stmt]:
+    """Return the statements of the launch file, which cannot be imported without launch_ros."""
+    return ast.parse((LAUNCH / 'relocalization.launch.py').read_text()).body
+
+
 @pytest.fixture
 def constants():
     """The values that the launch file assigns to names, where these are literals."""
-    found = {}
-    for statement in ast.parse((LAUNCH / 'relocalization.launch.py').read_text()).body:
-        if isinstance(statement, ast.Assign):
-            found[statement.targets[0].id] = ast.literal_eval(statement.value)
-    return found
+    return {statement.targets[0].id: ast.literal_eval(statement.value)
+            for statement in relocalization_launch() if isinstance(statement, ast.Assign)}
+
+
+@pytest.fixture
+def arguments(constants):
+    """The names of all launch arguments."""
+    return set().union(*(constants[group] for group in (
+        'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
 
 
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
@@ -36,7 +51,7 @@ def test_arguments_are_parameters(constants, node):
     passed = constants[f'{node.upper()}_PARAMETERS'].keys()
     assert len(passed) > 3
     declared = {row.name for row in TABLES[node]} | {'use_sim_time'}
-    assert {'map_file' if name == 'map' else name for name in passed} <= declared
+    assert passed <= declared
 
 
 def test_no_argument_means_two_things(constants):
@@ -53,37 +68,72 @@ def test_every_topic_and_service_can_be_remapped(constants):
     assert set(constants['NAMES']) | {'image/compressed'} == relative
 
 
-def test_the_documents_give_arguments_that_exist(constants):
-    arguments = set().union(*(constants[group] for group in (
-        'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
+def test_no_argument_is_taken_for_one_of_nav2(arguments):
+    """An argument of a launch file that was included before would set ours."""
+    assert arguments & OF_NAV2 == SHARED_WITH_NAV2
+
+
+def test_the_documents_give_arguments_that_exist(arguments):
     given = set()
-    for path in ('README.md', 'doc/nav2.md'):
-        text = (LAUNCH.parent / path).read_text()
+    for path in DOCUMENTS:
         # node arguments are written `-p name:=value` and `-r name:=name`
-        given |= set(re.findall(r'(?<!-[pr] )\b(\w+):=', text))
+        given |= set(re.findall(r'(?<!-[pr] )\b([a-z]\w*):=', path.read_text()))
     assert len(given) > 10
     assert given <= arguments
 
 
-def test_nav2s_patience_is_longer_than_ours():
+def test_a_missing_parameter_file_is_refused(tmp_path):
+    """launch_ros would start the nodes with their defaults, and warn."""
+    functions = {one.name: one for one in relocalization_launch()
+                 if isinstance(one, ast.FunctionDef)}
+    namespace = {'Path': Path}
+    code = ast.Module([functions['check_parameter_file']], [])
+    exec(compile(code, 'relocalization.launch.py', 'exec'), namespace)
+    check = namespace['check_parameter_file']
+    missing = tmp_path / 'robot.yaml'
+    with pytest.raises(RuntimeError, match=f'parameters:={missing}: there is no such file'):
+        check(str(missing))
+    with pytest.raises(RuntimeError):
+        check(str(tmp_path))
+    missing.touch()
+    check(str(missing))
+    check('')
+    # before any node is made
+    assert ast.unparse(functions['_nodes'].body[1]) == (
+        "check_parameter_file(context.launch_configurations['parameters'])")
+
+
+def test_nav2_calls_our_service_and_waits_long_enough():
     text = (LAUNCH.parent / 'doc/nav2.md').read_text()
     tree = re.search(r'    <Parallel.*</Parallel>', text, re.DOTALL).group()
     call = ElementTree.fromstring(tree).find('ReinitializeGlobalLocalization')
+    (name,) = set(re.findall(r'reinitialize_global_localization:=(\w+)', text))
+    assert call.get('service_name') == name != 'reinitialize_global_localization'
     timeout_s = next(row.default for row in RELOCALIZER if row.name == 'timeout_s')
     assert int(call.get('server_timeout')) > 1000 * (timeout_s + 2.0)
 
 
-@pytest.mark.parametrize('path', sorted(LAUNCH.glob('*.launch.py')), ids=lambda path: path.name)
-def test_descriptions_are_made(path):
-    compile(path.read_text(), path, 'exec')
-    if importlib.util.find_spec('launch_ros') is None:
-        print(f'\nlaunch_ros is not installed here: {path.name} was compiled, not run')
-        return
+def made(name: str, **given: str) -> list:
+    """Return the nodes that a launch file makes."""
     from launch import LaunchContext
     from launch.actions import DeclareLaunchArgument, OpaqueFunction
-    description = runpy.run_path(str(path))['generate_launch_description']()
-    context, made = LaunchContext(), []
+    description = runpy.run_path(str(LAUNCH / name))['generate_launch_description']()
+    context, nodes = LaunchContext(), []
+    context.launch_configurations.update(given)
     for entity in description.entities:
         if isinstance(entity, DeclareLaunchArgument | OpaqueFunction):
-            made += entity.visit(context) or []
-    assert len(made) == (2 if path.name == 'relocalization.launch.py' else 0)
+            nodes += entity.visit(context) or []
+    return nodes
+
+
+@pytest.mark.needs('launch_ros')
+@pytest.mark.parametrize(('name', 'nodes'), [
+    ('relocalization.launch.py', 2), ('demo.launch.py', 0)])
+def test_descriptions_are_made(name, nodes):
+    assert len(made(name)) == nodes
+
+
+@pytest.mark.needs('launch_ros')
+def test_a_missing_parameter_file_stops_the_launch(tmp_path):
+    with pytest.raises(RuntimeError, match='there is no such file'):
+        made('relocalization.launch.py', parameters=str(tmp_path / 'robot.yaml'))

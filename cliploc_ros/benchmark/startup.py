@@ -21,7 +21,6 @@ from typing import Any
 
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.download import child_environment
 
 KINDS = ('open_clip', 'first start', 'warm cache')
 _LABELS = tuple(f'a label of a map, number {number}' for number in range(40))
@@ -59,7 +58,7 @@ def measure_startup(kind: str, options: ClipOptions) -> StartupResult:
     """Start CLIP in a new process and return what it cost."""
     command = [sys.executable, '-m', 'cliploc_ros.benchmark.startup', '--child', kind,
                '--options', json.dumps(asdict(options))]
-    done = subprocess.run(command, env=child_environment(), stdout=subprocess.PIPE, check=True)
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=True)
     return StartupResult(**json.loads(done.stdout))
 
 

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import OptionsError
-
-ASSETS = Path(__file__).resolve().parents[1] / 'demo' / 'assets'
 
 EPILOG = """\
 The recording is played to the real detector and relocalizer, each in its own process. Where the

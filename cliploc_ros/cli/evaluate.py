@@ -29,7 +29,6 @@ methods: {', '.join(PAPER_METHODS)};
 examples:
   evaluate --queries office.npz --map office.yaml --methods all --trials 5
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
-  evaluate --queries office.npz --map office.yaml --methods hybrid_b-prosac --tune
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
 """
@@ -47,12 +46,12 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Compare methods on the same input: the paper's table, results.json, "
+        description="Compare methods on the same input. Writes the paper's table, results.json, "
         'summary.csv, figures and trajectories. Needs no sourced ROS.')
     sources = parser.add_mutually_exclusive_group(required=True)
     sources.add_argument('--queries', type=Path, metavar='NPZ',
-                         help='boxes and similarities that were recorded')
-    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with true poses')
+                         help='recorded boxes and similarities')
+    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth')
     sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
     parser.add_argument('--map', type=Path, required=True, metavar='YAML')
     parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
@@ -61,15 +60,12 @@ def make_parser() -> argparse.ArgumentParser:
                         help="the paper's %(default)s by default")
     parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
-                        help='of query files: also the neighbours of the queries')
+                        help="of a query file; 'all' includes the neighbours of the queries")
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
     parser.add_argument('--workers', type=_positive_int, metavar='N',
                         default=len(os.sched_getaffinity(0)), help='processes (%(default)s)')
-    parser.add_argument('--resume', action='store_true', help='go on with a run that was stopped')
+    parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
-    parser.add_argument('--tune', action='store_true',
-                        help='choose k, IoU threshold, iterations and min_confidence of one '
-                        'method on half of the queries, and report on the other half')
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)
@@ -77,65 +73,64 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("of the paper's methods")
+    group = parser.add_argument_group("options of the paper's methods")
     group.add_argument('--iterations', type=int, default=500, help='(%(default)s)')
     group.add_argument('--k', type=int, default=3, help='(%(default)s)')
     group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
     group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
-                       help='cut each search short (never; results then vary)')
+                       help='limit of each search (none); with one, results vary')
     group.add_argument('--sweep', type=_positive_int, nargs='*', metavar='N',
                        default=[50, 100, 200, 1000],
                        help='numbers of iterations to compare (50 100 200 1000)')
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what is known besides the image')
+    group = parser.add_argument_group('simulated sensors besides the camera')
     group.add_argument('--gravity', action='store_true',
-                       help=f"'{AUTO}' knows the vertical, of the true poses; the paper's methods "
-                       'do not ask for it')
+                       help=f"'{AUTO}' knows the vertical, from the true poses; the paper's "
+                       'methods do not use it')
     group.add_argument('--gravity-noise-deg', type=_angle, default=0.0, metavar='DEG',
-                       help='and it is off by so much (standard deviation; 0)')
+                       help='standard deviation of the vertical (0)')
     group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
-                       help='heights in the map that a camera may have [m]')
+                       help='heights that the camera may have in the map [m]')
     group.add_argument('--fuse', action='store_true',
-                       help='search each query together with the other frames of its group, of '
-                       'which odometry knows how the camera moved: made of the true poses')
+                       help='localize each query with the other frames of its group, linked by '
+                       'odometry from the true poses')
     group.add_argument('--odometry-noise', type=_deviation, nargs=2, default=(0.0, 0.0),
                        metavar=('METRES', 'DEGREES'),
-                       help='and each step from one frame to the next is off by so much on each '
-                       'axis (standard deviations; 0 0)')
+                       help='standard deviations of each step of odometry, on each axis (0 0)')
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('for --bag and --tum')
+    group = parser.add_argument_group('options of --bag and --tum')
     group.add_argument('--save-queries', type=Path, metavar='NPZ',
-                       help='write what detector and CLIP said, for --queries')
+                       help='write the recorded boxes and similarities, for --queries')
     group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
     group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
     group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
     group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--every', type=_positive_int, default=1, metavar='N',
-                       help='take each N-th image of --tum only')
+                       help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
     group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
     group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC')
     group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
-                       help='x y z qx qy qz qw of the camera on what the ground truth is of')
-    group.add_argument('--rectified', action='store_true', help='the images of --bag are')
+                       help='x y z qx qy qz qw of the camera on the body of the ground truth')
+    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
 
 
 def evaluate(options: argparse.Namespace) -> int:
-    """Evaluate as the command line asks; return the exit code."""
-    # Late, so that --help is fast.
+    """Evaluate with the options of the command line; return the exit code."""
+    # imported late, so that --help is fast
     from cliploc_ros.core.landmark_map import LandmarkMap
     from cliploc_ros.core.options import RelocalizerOptions
+    from cliploc_ros.evaluation.evaluation import Evaluation
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
-    from cliploc_ros.evaluation.session import Session
     from cliploc_ros.evaluation.trials import make_queries
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
@@ -146,8 +141,6 @@ def evaluate(options: argparse.Namespace) -> int:
         height_range_m=tuple(options.height_range),
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg))
     methods = parse_methods(options.methods, paper, len(landmark_map))
-    if options.tune and len(methods) != 1:
-        raise OptionsError(f'--tune is for one method, not {len(methods)}: name it by --methods')
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)
     queries = make_queries(recorded, landmark_map, every_frame=True)
@@ -159,12 +152,9 @@ def evaluate(options: argparse.Namespace) -> int:
                                   noise_deg, options.seed)
     if options.frames == 'main':
         queries = tuple(query for query in queries if recorded[query.number].is_main)
-    session = Session(landmark_map, queries, options.out, options.trials, options.workers)
-    if options.tune:
-        session.tune(methods[0], options.seed)
-    else:
-        session.compare(methods, sweep=options.sweep, resume=options.resume,
-                        figures=options.figures, frames=recorded.frames)
+    evaluation = Evaluation(landmark_map, queries, options.out, options.trials, options.workers)
+    evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
+                       figures=options.figures, frames=recorded.frames)
     return 0
 
 
@@ -174,7 +164,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
 
     if options.queries is not None:
         if options.save_queries is not None:
-            raise OptionsError('--save-queries is for --bag and --tum')
+            raise OptionsError('--save-queries needs --bag or --tum')
         return load_queries(options.queries, landmark_map.landmark_ids)
     queries = _record(options, landmark_map)
     if options.save_queries is not None:
@@ -195,7 +185,7 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
     queries = recorded_once(frames, landmark_map, yolo, clip)
     without = frames.count - len(queries)
     if without:
-        print(f'left out, as no true pose lies within 20 ms: {without} of {frames.count} images',
+        print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
               flush=True)
     return queries
 
@@ -229,7 +219,7 @@ def _deviation(text: str) -> float:
 def _angle(text: str) -> float:
     value = float(text)
     if not 0.0 <= value <= 45.0:
-        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 45 degrees')
+        raise argparse.ArgumentTypeError(f'{text} is outside 0 to 45 degrees')
     return value
 
 

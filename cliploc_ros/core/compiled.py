@@ -23,8 +23,9 @@ ZERO = np.int64(0)
 
 logger = logging.getLogger(__name__)
 _kernels: list[Any] = []
-# Raised by numba when a file of its cache is truncated, as after a power cut.
-_DAMAGE = (EOFError, pickle.UnpicklingError)
+# Raised by numba for a file that is truncated, as after a power cut, and for one that names a
+# module or type of another version of this package.
+_DAMAGE = (EOFError, pickle.UnpicklingError, ImportError, AttributeError)
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -56,7 +57,8 @@ def warm_up(run: Callable[[], object]) -> None:
             run()
             return
         except _DAMAGE as error:
-            logger.warning('cached kernels are damaged: %r; compiling them again', error)
+            logger.warning('cached kernels are damaged or outdated: %r; compiling them again',
+                           error)
             _forget_cache()
         except OSError as error:  # as on a full disk: every kernel and every request would fail
             logger.warning('cannot cache compiled kernels: %s; each start takes a minute until '

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the camera saw at one instant: detections, and how well they match each label."""
+"""One frame of the camera: its detections, and how similar they are to each label."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Detections:
     Parameters
     ----------
     bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px] in the image as it came (distorted).
+        Left, top, right, bottom [px] in the distorted image.
     class_ids : tuple of str
         Class name of each detection, n of them.
     scores : ndarray (n,)
@@ -34,30 +34,30 @@ class Detections:
         return len(self.class_ids)
 
     def select(self, rows: NDArray[np.int64]) -> 'Detections':
-        """Return the detections of some rows, in their order."""
+        """Return the detections of some rows, in this order."""
         return Detections(self.bboxes_xyxy[rows], tuple(self.class_ids[i] for i in rows),
                           self.scores[rows])
 
     def usable(self, width: int, height: int, limit: int) -> 'Detections':
-        """Return the detections that can be localized with.
+        """Return the detections that are fit for localization, in their order.
 
-        Boxes that are not finite, are thinner than a pixel, exceed all measure or lie wholly
-        outside the image are left out; of the others the most confident ones stay, in their
-        order. Boxes that reach over the border stay as they are.
+        This drops boxes that are not finite, thinner than a pixel, three times as large as the
+        image, or wholly outside of it. Of the others it keeps the most confident ones. Boxes
+        that reach over the border stay unchanged.
 
         Parameters
         ----------
         width, height : int
             Image size [px].
         limit : int
-            The most detections to keep: what follows is bounded by it.
+            The most detections to keep. It bounds the time of a search.
         """
         left, top, right, bottom = self.bboxes_xyxy.reshape(-1, 4).T
         with np.errstate(invalid='ignore', over='ignore'):
             sound = (np.isfinite(self.bboxes_xyxy).all(axis=1) & np.isfinite(self.scores)
                      & (right > left) & (bottom > top)
                      & (right > 0) & (bottom > 0) & (left < width) & (top < height))
-            # A box far larger than its image, or thinner than a pixel, is a mistake of units.
+            # a box far larger than its image, or thinner than a pixel, has wrong units
             sound &= (right - left < 3 * width) & (bottom - top < 3 * height)
             sound &= (right - left >= 1.0) & (bottom - top >= 1.0)
         rows = np.nonzero(sound)[0]
@@ -78,12 +78,12 @@ class Observation:
         Cosine similarity of each detection's crop with the label of each of the map's L
         landmarks, in the map's order. None where only classes are known.
     stamp_ns : int
-        When the image was taken [ns].
+        Time of the image [ns].
     up_in_camera : ndarray (3,) or None
-        The vertical, a unit vector in the camera's optical frame; None where it is not known.
+        The vertical, a unit vector in the camera's optical coordinate frame; None if unknown.
     odom_from_camera : ndarray (4, 4) or None
-        The camera in a frame that is continuous, as odometry has it; what joins this frame with
-        others. None where it is not known.
+        The camera in the coordinate frame of odometry, which links this frame to others; None if
+        unknown.
     """
 
     camera: Camera

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How to relocalize: every choice the method leaves to its user."""
+"""Options of the method."""
 
 import math
 from dataclasses import dataclass
@@ -18,42 +18,41 @@ class RelocalizerOptions:
     Parameters
     ----------
     matching : str
-        'class', 'clip' or 'hybrid': what makes a correspondence candidate.
+        'class', 'clip' or 'hybrid': which pairs are correspondence candidates.
     algorithm : str
-        Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's;
-        'auto' tries every sample that boxes and map allow, in the order of b-prosac and without
-        repetition, as far as `iterations` and `time_budget_s` reach. In hybrid matching it goes
-        on to candidates of equal class when those of CLIP are done.
+        Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's.
+        'auto' tries all samples that boxes and map allow, in the order of b-prosac and without
+        repetition, until `iterations` or `time_budget_s` end it. In hybrid matching it goes on
+        to candidates of equal class after those of CLIP.
     k : int
-        Landmarks retrieved for each crop, at least 1.
+        Number of landmarks retrieved for each crop, at least 1.
     iterations : int
-        Minimal samples drawn, of auto the most that are tried; bf tries them all instead. The
-        paper's 500 find the best pose less often, and then not its rivals either.
+        Number of minimal samples drawn; for auto the most samples tried; bf ignores it. The
+        paper's 500 find the best pose less often, and its rivals less often, too.
     iou_threshold : float
-        A detection and a landmark that overlap more than this (0 to 1) are an inlier.
+        A detection is an inlier of a landmark if their IoU exceeds this, 0 to 1.
     random_seed : int
-        Equal seed and input give equal output; below 0 every search differs.
+        Equal seed and input give equal output. Below 0 every search differs.
     time_budget_s : float
-        Association, search and refinement take no longer than this [s], to within 10 %; what
-        is cut short, but for auto, is refused, and says how far it came. Results that it cuts
-        depend on the machine: the iterations are there to end a search before. 10,000 took
-        32 ms at most on the 258 recorded frames (40 landmarks, one idle core); crowded maps take
-        longer.
+        Limit of association, search and refinement [s], kept to within 10 %. A search that it
+        cuts is refused, except for auto. Such results depend on the machine, so iterations
+        should end a search first: 10,000 took at most 32 ms on the 258 recorded frames (40
+        landmarks, one idle core). Crowded maps take longer.
     height_range_m : tuple of float
-        The least and the greatest height of the camera in the map [m]; poses outside are left.
+        Least and greatest height of the camera in the map [m]; other poses are dropped.
     max_tilt_deg : float
-        How far the camera may be turned or tipped off upright [deg], 180 is any way; where the
-        vertical is known, how far it may be off at a pose from three points.
+        The most that the camera may be tilted against upright [deg]; 180 allows any pose. Where
+        the vertical is known, the limit for poses from three points against that vertical.
     vertical_deviation_deg : float
-        Standard deviation of a known vertical [deg], 1 sigma. Where one is known, auto samples
-        two candidates in place of three.
+        Standard deviation of a known vertical [deg]. With one, auto samples two candidates
+        instead of three.
     refine : bool
-        Improve the best hypotheses on all of their inliers, before the best of them is chosen;
-        the paper does not.
+        Refine the best hypotheses on all their inliers before the best one is chosen. The paper
+        does not.
     min_inliers : int
-        Fewer explained objects are refused.
+        A pose with fewer matched objects is refused.
     min_confidence : float
-        A pose that is within 1 m of the truth with less probability is refused (0 to 1), see
+        A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
         cliploc_ros.core.acceptance.confidence.
 
     Raises
@@ -77,12 +76,12 @@ class RelocalizerOptions:
     min_confidence: float = 0.99
 
     def __post_init__(self) -> None:
-        """Refuse values outside what each option allows."""
+        """Refuse values that an option does not allow."""
         _check_choice('matching', self.matching, MATCHINGS)
         _check_choice('algorithm', self.algorithm, ALGORITHMS)
         if self.matching == 'class' and 'prosac' in self.algorithm:
-            raise OptionsError(f"algorithm '{self.algorithm}' orders candidates by similarity, "
-                               "which matching 'class' has none of: use bf or ransac")
+            raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
+                               "'class' has none: set algorithm to auto, bf or ransac")
         _check_range('k', self.k, 1, math.inf)
         _check_range('iterations', self.iterations, 1, 1_000_000)
         _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)

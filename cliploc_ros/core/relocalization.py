@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a relocalizer answers."""
+"""The result of a relocalization."""
 
 from dataclasses import dataclass
 
@@ -8,22 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A pose the camera may have had.
+    """A possible pose of the camera.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
     score : float
-        Sum of the IoUs that speak for it.
+        Sum of the IoUs of its inliers.
     confidence : float
-        How likely it is within 1 m of the truth, 0 to 1.
+        Probability that it is within 1 m of the truth, 0 to 1.
     support : Support
-        Why so.
+        Basis of the confidence.
     """
 
     map_from_camera: NDArray[np.float64]
@@ -34,36 +35,39 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """What a search found, and whether to believe it.
+    """The hypotheses of a relocalization, and whether the best one is accepted.
 
     Parameters
     ----------
     accepted : bool
-        Whether the pose is to be acted on.
+        Whether to act on the pose.
     reason : str
-        Why not, in one line; empty when accepted.
+        Reason of a refusal, in one line; empty when accepted.
     hypotheses : tuple of Hypothesis
-        The distinct best, best first; empty when nothing was found.
+        The best distinct hypotheses, best first; empty when nothing was found.
     matches : tuple of Match
-        The inliers of the best, in the frame that was asked about.
+        Inliers of the best hypothesis in the newest frame.
+    evidence : Evidence or None
+        Evidence for the best hypothesis, which decided; None when nothing was found.
     covariance : ndarray (6, 6) or None
-        Of the best, see cliploc_ros.core.fit.covariance; None when nothing was found.
+        Of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was found.
     tried : int
-        How many hypotheses were made.
+        Number of hypotheses tried.
     best_iteration : int
-        In which iteration the best was found, from 1; 0 when nothing was found.
+        Iteration that found the best hypothesis, from 1; 0 when nothing was found.
     coverage : float
-        The share of its samples that the search could try in its time, 0 to 1.
+        Share of its samples that the search tried, 0 to 1.
     search_ms : float
-        How long association, search and verification took [ms].
+        Time of association, search and verification [ms].
     stamp_ns : int
-        Stamp of the observation [ns].
+        Stamp of the newest observation [ns].
     """
 
     accepted: bool
     reason: str
     hypotheses: tuple[Hypothesis, ...] = ()
     matches: tuple[Match, ...] = ()
+    evidence: Evidence | None = None
     covariance: NDArray[np.float64] | None = None
     tried: int = 0
     best_iteration: int = 0
@@ -73,17 +77,17 @@ class Relocalization:
 
     @property
     def solved(self) -> bool:
-        """Return whether any pose was found, believed or not."""
+        """Return whether any pose was found, accepted or not."""
         return bool(self.hypotheses)
 
     @property
     def map_from_camera(self) -> NDArray[np.float64] | None:
-        """Return the best pose (4, 4), believed or not; None when there is none."""
+        """Return the best pose (4, 4), accepted or not; None when there is none."""
         return self.hypotheses[0].map_from_camera if self.hypotheses else None
 
     @property
     def confidence(self) -> float:
-        """Return how likely the best pose is within 1 m; 0 when nothing was found."""
+        """Return the probability that the best pose is within 1 m; 0 when nothing was found."""
         return self.hypotheses[0].confidence if self.hypotheses else 0.0
 
     @property

@@ -1,19 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The one door to the method: Relocalizer.relocalize(observations) -> Relocalization."""
+"""The entry point of the method: Relocalizer.relocalize(observations) -> Relocalization."""
 
 import math
-import time
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import Support, View, confidences, support
+from cliploc_ros.core.acceptance.confidence import (
+    ComparedFrame,
+    Support,
+    agreeing_poses,
+    confidences,
+    support,
+)
+from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.fit.finalists import (
     Finalist,
@@ -23,36 +27,22 @@ from cliploc_ros.core.fit.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig, make_rig
-from cliploc_ros.core.fit.verification import choose_distinct, scores_of
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
-from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.frame_search import REFINED, Searched, search_frame
-from cliploc_ros.core.search.leaders import MAX_DISTINCT, Leaders, same_place
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.strategies import (
-    search_exhaustively,
-    search_progressively,
-    search_samples,
-)
+from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame, search_frame
+from cliploc_ros.core.search.leaders import MAX_DISTINCT, same_place
+from cliploc_ros.core.time_budget import TimeBudget
+from cliploc_ros.core.warm_up import call_every_kernel
 from cliploc_ros.errors import OptionsError
 
-#: The most frames that are fused. Each frame's leaders are verified on every frame, so that time
-#: grows with the square; and the tenth view of the same objects says little that is new.
+#: The most frames that are fused. The leaders of each frame are verified on every frame, so the
+#: time grows with the square; and the tenth view of the same objects adds little.
 MAX_FRAMES = 10
-# Of the time budget: when the search ends, and the refinement; judging the result takes the rest.
-_SEARCH_SHARE, _REFINED_SHARE = 0.8, 0.9
-# And so much earlier [s] for each further frame, on which what all have found is scored and
-# judged; as shares of a budget that is shorter than this.
-_EARLIER_SEARCH_S, _EARLIER_REFINED_S, _SHORT_BUDGET_S = 0.0025, 0.001, 0.05
+_NO_LOOKS = Looks()
 
 
 class Relocalizer:
@@ -66,7 +56,7 @@ class Relocalizer:
     Raises
     ------
     OptionsError
-        k is larger than the map.
+        k exceeds the number of landmarks.
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
@@ -78,154 +68,172 @@ class Relocalizer:
 
     def warm_up(self) -> None:
         """Compile the kernels, or read them from disk, before the first request needs them."""
-        warm_up(self._call_every_kernel)
+        warm_up(call_every_kernel)
 
-    @staticmethod
-    def _call_every_kernel() -> None:
-        rng = np.random.default_rng(0)
-        bboxes = np.array([[100, 100, 150, 160], [300, 120, 360, 150], [200, 300, 260, 390]],
-                          dtype=np.float64)
-        pairs = np.array([[0, 0], [1, 1], [2, 2]], dtype=np.int64)
-        centers = np.array([[0.0, 0, 5], [1, 0, 6], [0, 1, 5]])
-        shapes = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (3, 1))
-        scene = make_scene(Camera(640, 480, 500.0, 500.0, 320.0, 240.0).normalize_bboxes(bboxes),
-                           centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
-        list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
-        list(search_exhaustively(scene, Leaders.none_yet()))
-        list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
-        list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
-        rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
-        scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
-        choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
-        refine_rig(rig, np.eye(3), np.zeros(3))
-        same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
-        project_ellipsoids(np.eye(4), centers, shapes)
-
-    def relocalize(self, observations: Sequence[Observation],
-                   searched: list[Searched] | None = None) -> Relocalization:
+    def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
         """Find where the camera was when it saw the last of some frames.
 
-        Several frames are one question: hypotheses come from each of them, and are scored on and
-        refined with all of them. Of each frame's search the time budget is an equal share.
+        Several frames are localized as one: each of them gives hypotheses, which are scored and
+        refined on all of them. Each frame's search gets an equal share of the time budget.
 
         Parameters
         ----------
         observations : sequence of Observation
-            One frame, or up to MAX_FRAMES of one moving camera that odom_from_camera joins; the
-            last is the one whose pose is wanted.
-        searched : list of Searched, optional
-            What was found in the first of these frames when they were asked about before, in
-            their order; what is found in the others is appended. They have all of the time.
+            One frame, or up to MAX_FRAMES of one moving camera, linked by odom_from_camera. The
+            result is the pose of the last one.
 
         Returns
         -------
         Relocalization
-            Refused, with the reason, when the pose is not to be acted on.
+            Accepted, or refused with the reason.
 
         Raises
         ------
         OptionsError
-            The matching type needs similarities that are missing or of the wrong shape, the
-            vertical is no unit vector, of several frames odom_from_camera is missing or no rigid
-            transform, or there are no frames or too many.
+            Similarities that the matching type needs are missing or of the wrong shape; the
+            vertical is no unit vector; odom_from_camera is missing or no rigid transform; there
+            are no frames or too many.
         """
-        start = time.perf_counter()
-        cameras = _cameras_from_last(observations)
-        frames = [] if searched is None else searched
-        new = observations[len(frames):]
-        each_s = self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S, observations) / max(1, len(new))
-        for number, observation in enumerate(new):
-            deadline = start + each_s * (number + 1)
-            frames.append(search_frame(self._map, observation, self._options, deadline))
-        return self._conclude(observations, frames, cameras, start)
+        budget = self.begin(len(observations))
+        frames = [self.search(one, budget.search_end(number, len(observations)))
+                  for number, one in enumerate(observations, start=1)]
+        return self.locate(frames, budget)
 
-    def _time_s(self, share: float, earlier_s: float, observations: Sequence[Observation]
-                ) -> float:
-        """Return a share of the time budget [s], less what further frames need afterwards."""
-        budget_s = self._options.time_budget_s
-        shorter = min(1.0, budget_s / _SHORT_BUDGET_S)
-        return share * budget_s - shorter * earlier_s * (len(observations) - 1)
+    def begin(self, frames: int) -> TimeBudget:
+        """Return the time budget of a relocalization with some frames; it starts now."""
+        return TimeBudget.begin(self._options.time_budget_s, frames)
 
-    def _conclude(self, observations: Sequence[Observation], frames: Sequence[Searched],
-                  cameras: NDArray[np.float64], start: float) -> Relocalization:
-        """Turn what the searches found into an answer, and decide whether to believe it."""
-        answer = partial(Relocalization, tried=sum(one.progress.tried for one in frames),
-                         coverage=min(one.progress.coverage for one in frames),
-                         stamp_ns=observations[-1].stamp_ns)
+    def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
+        """Search one frame, until a deadline of time.perf_counter [s].
+
+        Raises
+        ------
+        OptionsError
+            See relocalize.
+        """
+        return search_frame(self._map, observation, self._options, deadline)
+
+    def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
+               looks: Looks = _NO_LOOKS) -> Relocalization:
+        """Find where the camera was when it saw the last of some searched frames.
+
+        Parameters
+        ----------
+        frames : sequence of SearchedFrame
+        budget : TimeBudget, optional
+            Time left for the refinement; a new one by default.
+        looks : Looks, optional
+            Results of earlier frames, which have to agree.
+
+        Raises
+        ------
+        OptionsError
+            See relocalize.
+        """
+        budget = budget or self.begin(len(frames))
+        cameras = _cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
-            return answer(False, f'{sum(len(one.detections) for one in observations)} detections '
-                          f'give fewer than {frames[-1].sample_size} different correspondence '
-                          'candidates')
+            detections = sum(len(one.observation.detections) for one in frames)
+            return _nothing_found(frames, budget, f'{detections} detections give fewer than '
+                                  f'{frames[-1].sample_size} distinct correspondence candidates; '
+                                  'turn the camera to more objects')
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]))
-        deadline = start + self._time_s(_REFINED_SHARE, _EARLIER_REFINED_S, observations)
+        finalists, is_upright = self._finalists(frames, rig, budget.refinement_end)
+        if not finalists:
+            return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
+                                                  'camera to more objects')
+        best, matches = finalists[0], [matches_of(rig, one) for one in finalists]
+        poses = np.array([one.map_from_camera for one in finalists])
+        supports = self._supports(frames, cameras, poses, matches)
+        likely = confidences(supports, poses, upright=is_upright)
+        evidence = self._evidence(frames, best, matches[0], supports[0], poses, likely,
+                                  looks.with_look(frames[-1].observation, poses[0]))
+        reason = refusal(evidence, self._options)
+        return Relocalization(
+            accepted=not reason, reason=reason,
+            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in finalists),
+                                 likely * evidence.found, supports)),
+            matches=matches[0][-1], evidence=evidence,
+            covariance=covariance_of(frames, rig, best, matches[0]),
+            tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
+            search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+
+    def _finalists(self, frames: Sequence[SearchedFrame], rig: Rig, deadline: float
+                   ) -> tuple[list[Finalist], NDArray[np.bool_]]:
+        """Return the best poses, best first, and which of them use the known vertical.
+
+        The others are their rivals: the best poses elsewhere that ignore the vertical, which may
+        be wrong.
+        """
         upright = find_finalists(frames, rig, self._options.refine, REFINED, deadline)
         if not upright:
-            return answer(False, 'no pose explains any three detections',
-                          search_ms=_elapsed_ms(start))
-        found = upright + self._tilted_rivals(upright, frames, rig, deadline)
-        poses = np.array([one.map_from_camera for one in found])
-        explained = [matches_of(rig, one) for one in found]
-        supports = self._supports(observations, frames, cameras, poses, explained)
-        likely = confidences(supports, poses, upright=np.arange(len(found)) < len(upright))
-        evidence = self._evidence(frames, found[0], explained[0], supports[0], likely)
-        reason = refusal(evidence, self._options)
-        hypotheses = tuple(map(Hypothesis, poses, (one.score for one in found),
-                               likely * evidence.found, supports))
-        return answer(not reason, reason, hypotheses, explained[0][-1],
-                      covariance_of(frames, rig, found[0], explained[0]),
-                      best_iteration=found[0].iteration, search_ms=_elapsed_ms(start))
+            return [], np.empty(0, dtype=np.bool_)
+        tilted = find_finalists([one._replace(leaders=one.tilted) for one in frames], rig,
+                                self._options.refine, MAX_DISTINCT, deadline)
+        elsewhere = [one for one in tilted if not any(
+            same_place(one.rotation, one.translation, other.rotation, other.translation)
+            for other in upright)]
+        finalists = upright + elsewhere
+        return finalists, np.arange(len(finalists)) < len(upright)
 
-    def _tilted_rivals(self, upright: Sequence[Finalist], frames: Sequence[Searched], rig: Rig,
-                       deadline: float) -> list[Finalist]:
-        """Return the best poses elsewhere that did not ask for a known vertical."""
-        tilted = [one._replace(leaders=one.tilted) for one in frames]
-        return [one for one in find_finalists(tilted, rig, self._options.refine, MAX_DISTINCT,
-                                              deadline)
-                if not any(same_place(one.rotation, one.translation, other.rotation,
-                                      other.translation) for other in upright)]
-
-    def _supports(self, observations: Sequence[Observation], frames: Sequence[Searched],
-                  cameras: NDArray[np.float64], poses: NDArray[np.float64],
-                  explained: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
-        """Return what speaks for each pose, by what it explains in each frame."""
-        views = [View(observation, one.scene, self._map, self._options.needs_similarities)
-                 for observation, one in zip(observations, frames, strict=True)]
+    def _supports(self, frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
+                  poses: NDArray[np.float64], matches: Sequence[list[tuple[Match, ...]]]
+                  ) -> list[Support]:
+        """Return the support of each pose, from its matches in each frame."""
+        compared = [ComparedFrame(
+            one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
+            one.observation.similarities if self._options.needs_similarities else None, one.scene)
+            for one in frames]
         last_from_cameras = np.linalg.inv(cameras)
-        return [support(views, pose @ last_from_cameras, matches)
-                for pose, matches in zip(poses, explained, strict=True)]
+        return [support(self._map, compared, pose @ last_from_cameras, found)
+                for pose, found in zip(poses, matches, strict=True)]
 
-    def _evidence(self, frames: Sequence[Searched], best: Finalist,
+    def _evidence(self, frames: Sequence[SearchedFrame], best: Finalist,
                   matches: Sequence[tuple[Match, ...]], its_support: Support,
-                  likely: NDArray[np.float64]) -> Evidence:
-        coverage = min(one.progress.coverage for one in frames)
+                  poses: NDArray[np.float64], likely: NDArray[np.float64], looks: Looks
+                  ) -> Evidence:
+        """Return the evidence for the best pose, the first of all."""
+        coverage = _coverage(frames)
+        rivals = likely[~agreeing_poses(poses)[0]]
         return Evidence(
-            its_support.inliers, likely[0], max(likely[1:], default=0.0), coverage,
+            its_support.inliers, likely[0], min(max(rivals, default=0.0), 1.0 - likely[0]),
+            coverage,
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
             else meetings_of(frames, best, matches),
-            unexplained=its_support.unexplained)
+            unexplained=its_support.unexplained, looks=len(looks), agreeing=looks.agreeing)
+
+
+def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str
+                   ) -> Relocalization:
+    return Relocalization(False, reason, tried=_tried(frames), coverage=_coverage(frames),
+                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+
+
+def _tried(frames: Sequence[SearchedFrame]) -> int:
+    return sum(one.progress.tried for one in frames)
+
+
+def _coverage(frames: Sequence[SearchedFrame]) -> float:
+    return min(one.progress.coverage for one in frames)
 
 
 def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
-    """Return each camera from the last (F, 4, 4), as odometry has it."""
+    """Return each camera from the last (F, 4, 4), by odometry."""
     if not 1 <= len(observations) <= MAX_FRAMES:
         raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
     cameras = np.tile(np.eye(4), (len(observations), 1, 1))
     if len(observations) == 1:
         return cameras
-    joined = []
+    linked = []
     for number, one in enumerate(observations, start=1):
         where = f'odom_from_camera of frame {number} of {len(observations)}'
         if one.odom_from_camera is None:
-            raise OptionsError(f'{where} is missing: it joins several frames')
+            raise OptionsError(f'{where} is missing: several frames need it')
         if not is_rigid(one.odom_from_camera):
             raise OptionsError(f'{where} is no rigid transform')
-        joined.append(one.odom_from_camera)
-    for row, odom_from_camera in enumerate(joined[:-1]):
-        cameras[row] = invert_transform(odom_from_camera) @ joined[-1]
+        linked.append(one.odom_from_camera)
+    for row, odom_from_camera in enumerate(linked[:-1]):
+        cameras[row] = invert_transform(odom_from_camera) @ linked[-1]
     return cameras
-
-
-def _elapsed_ms(start: float) -> float:
-    return (time.perf_counter() - start) * 1e3

@@ -1,3 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a synthetic world, models trained on it, and the whole system run in it."""
+"""The demo: a robot wakes up in a synthetic room, and the whole system runs.
+
+The code that built the room and trained the networks in ``assets`` is not installed; it lies in
+``demo_world`` at the root of the repository.
+"""
+
+from pathlib import Path
+
+#: The shipped room: sequence/ (a TUM folder), map.yaml, and the weights of YOLO and CLIP.
+ASSETS = Path(__file__).parent / 'assets'

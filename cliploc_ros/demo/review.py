@@ -17,7 +17,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
-from cliploc_ros.demo.world.reading import TrueBox, read_frames
+from cliploc_ros.demo.truth import TrueBox, read_frames
 
 #: Poses farther from the truth than this are wrong [m].
 WRONG_M = 1.0

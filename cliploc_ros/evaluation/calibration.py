@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fitting what makes confidences true: ``python -m cliploc_ros.evaluation.calibration --help``.
+"""Fitting the confidence: ``python -m cliploc_ros.evaluation.calibration --help``.
 
 Each frame is localized as it is, with boxes dropped or invented, by classes alone, and in a map
-whose objects have exchanged places, where nothing is right. The coefficients make what turned out
-right the likeliest. Half of the places choose them and the other half judges, and the other way
-round; neighbouring frames are always in the same half.
+whose objects have exchanged places, where every pose is wrong. The coefficients maximize the
+likelihood of what turned out right. For the report, they are fitted on half of the places and
+tested on the other half, both ways; neighbouring frames are always in the same half. The
+coefficients printed in the end are fitted on all frames.
 """
 
 import argparse
@@ -29,6 +30,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, make_queries
 from cliploc_ros.evaluation.troubles import (
     Change,
@@ -39,30 +41,30 @@ from cliploc_ros.evaluation.troubles import (
 
 RIGHT_M = 1.0
 _FIELDS = ('score', 'misfit', 'likeness', 'same_class', 'unlabelled', 'unexplained')
-# Nothing that speaks for a pose may count against it, whatever a small data set says.
+# Support must not count against a pose, whatever a small data set says.
 _BOUNDS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
-# Where a robot wakes up is hardly ever a place that its map does not show.
+# Weight of frames at a place that the map does not show. A guess: robots rarely start there.
 _ELSEWHERE = 0.01
 
 
 @dataclass(frozen=True)
 class Round:
-    """How all frames are localized once.
+    """One pass over all frames.
 
     Parameters
     ----------
     weight : float
-        Of a frame, in the fit.
+        Weight of a frame in the fit.
     matching : str
     change : Change
-        What goes wrong.
+        Simulated error of map or detections.
     level : float
-        And by how much; nothing with 0.
+        Its level; 0 changes nothing.
     is_elsewhere : bool
-        Whether the map shows another place, so that no pose is right.
+        Whether the map shows another place, so that every pose is wrong.
     """
 
     weight: float
@@ -73,11 +75,12 @@ class Round:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether labels are matched and nothing goes wrong: what is reported on."""
+        """Return whether labels are matched and nothing is changed; the report is on these."""
         return self.matching == 'hybrid' and self.level == 0.0
 
 
-# What was made harder shows what wrong poses look like, but is not what is asked: it weighs less.
+# Simulated errors provide wrong poses, but are not the task: they weigh less. The weights are
+# guesses.
 WHOLE = Round(1.0)
 ROUNDS = (WHOLE, *(Round(0.1, level=level) for level in (0.3, 0.3, 0.5, 0.5)),
           Round(0.1, change=invent_detections, level=0.5),
@@ -88,12 +91,12 @@ ROUNDS = (WHOLE, *(Round(0.1, level=level) for level in (0.3, 0.3, 0.5, 0.5)),
 
 @dataclass(frozen=True)
 class Case:
-    """What a search found, and what of it is right.
+    """The hypotheses of a search, and which of them are right.
 
     Parameters
     ----------
     place : str
-        Frames of one place are never parted.
+        Frames of one place stay in one half.
     round : Round
     supports : tuple of m Support
     poses : ndarray (m, 4, 4)
@@ -109,7 +112,7 @@ class Case:
 
 def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: str,
           of_round: Round = WHOLE) -> Case:
-    """Return what a search found, judged by the truth (4, 4)."""
+    """Return the hypotheses of a search, compared with the true pose (4, 4)."""
     poses = np.array([one.map_from_camera for one in found.hypotheses])
     errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
     return Case(place, of_round, tuple(one.support for one in found.hypotheses), poses,
@@ -118,16 +121,16 @@ def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: st
 
 def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequence[str],
             seed: int = 0) -> Iterator[Case | None]:
-    """Localize frames as they are and in trouble, see ROUNDS.
+    """Localize frames in all rounds, see ROUNDS.
 
     Parameters
     ----------
     landmark_map : LandmarkMap
     queries : sequence of Query
     places : sequence of str
-        Of each query.
+        Place of each query.
     seed : int
-        Of what goes wrong.
+        Seed of the simulated errors.
 
     Yields
     ------
@@ -145,7 +148,7 @@ def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequenc
 
 
 def fit(cases: Sequence[Case]) -> Calibration:
-    """Return the coefficients that make what is right the likeliest.
+    """Return the coefficients of maximum likelihood.
 
     Parameters
     ----------
@@ -154,11 +157,12 @@ def fit(cases: Sequence[Case]) -> Calibration:
     Raises
     ------
     OptionsError
-        Nothing is right, or nothing is wrong: that says nothing.
+        All poses are right, or all are wrong.
     """
     first = np.array([case.right[0] for case in cases], dtype=bool)
     if first.all() or not first.any():
-        raise OptionsError(f'of {len(first)} poses {first.sum()} are right: a fit needs both')
+        raise OptionsError(f'{first.sum()} of {len(first)} poses are right; a fit needs right and '
+                           'wrong ones')
     support, given, right = _padded(cases)
     scale = np.append(support[given].std(axis=0) + 1e-9, 1.0)
     weights = np.array([case.round.weight for case in cases])
@@ -182,7 +186,7 @@ def fit(cases: Sequence[Case]) -> Calibration:
 
 def _padded(cases: Sequence[Case]) -> tuple[NDArray[np.float64], NDArray[np.bool_],
                                              NDArray[np.bool_]]:
-    """Return supports (n, h, 6), which hypotheses there are (n, h), and which are right."""
+    """Return supports (n, h, 6), which hypotheses exist (n, h), and which are right (n, h)."""
     support = np.zeros((len(cases), MAX_DISTINCT, len(_FIELDS)))
     given = np.zeros((len(cases), MAX_DISTINCT), dtype=bool)
     right = np.zeros_like(given)
@@ -197,7 +201,7 @@ def _padded(cases: Sequence[Case]) -> tuple[NDArray[np.float64], NDArray[np.bool
 def _loss(coefficients: NDArray[np.float64], support: NDArray[np.float64],
           given: NDArray[np.bool_], right: NDArray[np.bool_], weights: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
-    """Return how surprising what is right is, and the derivatives (7,) by the coefficients."""
+    """Return the negative log likelihood and its derivatives (7,) by the coefficients."""
     utility = np.where(given, support @ coefficients[:-1], -1e9)
     utility = np.column_stack([utility, np.full(len(utility), coefficients[-1])])
     odds = np.exp(utility - utility.max(axis=1, keepdims=True))
@@ -218,7 +222,7 @@ def confidence(cases: Iterable[Case], calibration: Calibration = DEFAULT) -> NDA
 
 
 def halves(cases: Sequence[Case], seed: int = 0) -> tuple[set[str], set[str]]:
-    """Return the places in two halves, at random."""
+    """Return two random halves of the places."""
     places = sorted({case.place for case in cases})
     order = np.random.default_rng(seed).permutation(len(places))
     return ({places[row] for row in order[::2]}, {places[row] for row in order[1::2]})
@@ -226,15 +230,15 @@ def halves(cases: Sequence[Case], seed: int = 0) -> tuple[set[str], set[str]]:
 
 def cross_fitted(cases: Sequence[Case], seed: int = 0, elsewhere: bool = False
                  ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
-    """Return confidence and rightness of each half's frames, as the other half has them.
+    """Return confidence and correctness of each half's frames, fitted on the other half.
 
     Parameters
     ----------
     cases : sequence of Case
     seed : int
-        Of the halves.
+        Seed of the halves.
     elsewhere : bool
-        Of the rounds in maps of another place; else of the whole frames.
+        Test on the rounds in maps of another place; else on the unchanged frames.
     """
     judged = []
     for own in halves(cases, seed):
@@ -264,10 +268,12 @@ def _read(options: argparse.Namespace) -> list[Case]:
 def _report(name: str, likely: NDArray[np.float64], right: NDArray[np.bool_]) -> str:
     lines = [f'{name}: {len(right)} poses, {right.sum()} of them within {RIGHT_M:g} m']
     for least in (0.9, 0.95, 0.98, 0.99, 0.995):
-        believed = likely >= least
-        lines.append(f'  min_confidence {least:5}: {believed.sum():4} believed, '
-                     f'{(believed & ~right).sum()} of them wrong, '
-                     f'recall {(believed & right).sum() / max(int(right.sum()), 1):.3f}')
+        accepted = likely >= least
+        false, count = int((accepted & ~right).sum()), int(accepted.sum())
+        low, high = wilson_interval(count - false, count) if count else (0.0, 1.0)
+        lines.append(f'  min_confidence {least:5}: {count:4} accepted, {false} of them wrong, '
+                     f'precision {low:.3f} to {high:.3f} (95 %), '
+                     f'recall {(accepted & right).sum() / max(int(right.sum()), 1):.3f}')
     return '\n'.join(lines)
 
 
@@ -280,13 +286,13 @@ def _draw(folder: Path, judged: dict[str, tuple[NDArray[np.float64], NDArray[np.
     make_folder(folder)
     figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')
     draw_reliability(axes, judged)
-    axes.set_title('each half as the other half has it', fontsize=9)
+    axes.set_title('each half, fitted on the other half', fontsize=9)
     add_legend(figure)
     print(f'wrote {save_figure(figure, folder / "reliability.png")}')
 
 
 def run(arguments: list[str]) -> int:
-    """Fit, judge, print."""
+    """Fit, test and print."""
     parser = argparse.ArgumentParser(prog='calibration', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--queries', type=Path, required=True, nargs='+', metavar='NPZ')
@@ -298,7 +304,7 @@ def run(arguments: list[str]) -> int:
     cases = _read(options)
     judged = cross_fitted(cases, options.seed)
     for number, half in enumerate(judged, start=1):
-        print(_report(f'half {number}, as the other half has it', *half))
+        print(_report(f'half {number}, fitted on the other half', *half))
     print(_report('both', np.concatenate([half[0] for half in judged]),
                   np.concatenate([half[1] for half in judged])))
     elsewhere = cross_fitted(cases, options.seed, elsewhere=True)
@@ -306,7 +312,7 @@ def run(arguments: list[str]) -> int:
                   np.concatenate([half[1] for half in elsewhere])))
     if options.out is not None:
         _draw(options.out, {f'half {number}': half for number, half in enumerate(judged, start=1)})
-    print('\nfitted on all, for cliploc_ros/core/acceptance/confidence.py:\n'
+    print('\nfitted on all frames, for cliploc_ros/core/acceptance/confidence.py:\n'
           + ', '.join(f'{name}={value:.3g}' for name, value in fit(cases)._asdict().items()))
     return 0
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's figures and more, as PNG and SVG."""
+"""The paper's figures and others, as PNG and SVG."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,8 +19,8 @@ from cliploc_ros.evaluation.summary import Summary, find_best
 from cliploc_ros.evaluation.trials import Query, Result
 from cliploc_ros.evaluation.trust import draw_consistency, draw_reliability
 
-# Okabe and Ito's colours, which the colour-blind tell apart: one for each kind of matching, and
-# the rest for methods of other names. The algorithm is the line's style and marker.
+# The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
+# others for other methods. Line style and marker show the algorithm.
 _COLORS = {'class': '#D55E00', 'clip': '#009E73', 'hybrid': '#0072B2'}
 _OTHER_COLORS = ('#CC79A7', '#E69F00', '#56B4E9', '#000000', '#F0E442')
 _STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 1.5)), 's'),
@@ -36,26 +36,26 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
              results: Sequence[Result], summaries: Sequence[Summary],
              sweep: Mapping[str, Mapping[int, Summary]], observing_ms: Mapping[str, float]
              ) -> list[Path]:
-    """Draw every figure there is data for.
+    """Draw every figure that has data.
 
     Parameters
     ----------
     folder : Path
-        Where they go.
+        Folder of the figures.
     landmark_map : LandmarkMap
     queries : sequence of Query
     results : sequence of Result
     summaries : sequence of Summary
         Of the results.
     sweep : mapping of str to mapping of int to Summary
-        Of each method that draws samples, by their number.
+        Of each sampling method, by its number of iterations.
     observing_ms : mapping of str to float
-        Mean times of the stages before the search, where they were recorded.
+        Mean times of the stages before the search, where recorded.
 
     Returns
     -------
     list of Path
-        The PNG files; beside each is an SVG.
+        The PNG files; each has an SVG beside it.
     """
     sampled = [one for one in summaries if _style(one.method)[2] is not None
                and not one.method.endswith('_bf')]
@@ -78,8 +78,8 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, and as SVG beside it; return the path."""
-    # Without its date, an SVG of the same results is the same file.
+    """Write a figure as PNG and as SVG beside it; return the path."""
+    # without its date, an SVG of the same results is the same file
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
     write_file(path.with_suffix('.svg'),
                lambda partial: figure.savefig(partial, metadata={'Date': None}))
@@ -87,7 +87,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
 
 
 def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
-    """Return a figure and its axes, in the style of all."""
+    """Return a figure and its axes in the common style."""
     figure = Figure(figsize=_SIZE, layout='constrained')
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel)
@@ -171,8 +171,8 @@ def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
 
 
 def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = new_axes('recall: right poses that are believed',
-                        f'precision: believed poses within {_SUCCESS_M:g} m')
+    figure, axes = new_axes('recall: right poses that are accepted',
+                        f'precision: accepted poses within {_SUCCESS_M:g} m')
     for one in summaries:
         color, line, marker = _style(one.method)
         recall, precision = precision_recall(one)
@@ -184,7 +184,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
             axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
                       markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
-    axes.set_title('lines: every threshold of the confidence; markers: the options as run',
+    axes.set_title('lines: all thresholds of the confidence; markers: the options as run',
                    fontsize=9)
     add_legend(figure)
     return figure
@@ -192,42 +192,44 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
 
 def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return recall (m,) and precision (m,) of believing all poses above each confidence.
+    """Return recall and precision of accepting all poses above each confidence.
 
     Parameters
     ----------
     one : Summary
     limit_m : float
-        What counts as right.
+        Limit of success.
 
     Returns
     -------
     recall, precision : ndarray (m,)
-        From the strictest threshold on; empty if no pose is right.
+        From the strictest threshold to the loosest; empty if no pose is right.
     """
     solved = np.isfinite(one.errors_m)
     order = np.argsort(-one.confidence[solved], kind='stable')
     right = (one.errors_m[solved] < limit_m)[order]
     if not right.any():
         return np.empty(0), np.empty(0)
-    believed = np.cumsum(right)
-    # of equal confidence all or none are believed
+    accepted = np.cumsum(right)
+    # of equal confidence all poses are accepted, or none
     last = np.append(np.diff(one.confidence[solved][order]) != 0, True)
-    return (believed / right.sum())[last], (believed / np.arange(1, right.size + 1))[last]
+    return (accepted / right.sum())[last], (accepted / np.arange(1, right.size + 1))[last]
 
 
 def _reliability(one: Summary) -> Figure:
+    """Draw the reliability of the installed calibration, which the same frames may have fitted."""
     figure, axes = new_axes('confidence', f'share of poses within {_SUCCESS_M:g} m')
     solved = np.isfinite(one.errors_m)
     draw_reliability(axes, {one.method: (one.confidence[solved],
                                          one.errors_m[solved] < _SUCCESS_M)})
+    axes.set_title('installed calibration: not held out on the frames of its fit', fontsize=9)
     add_legend(figure)
     return figure
 
 
 def _consistency(summaries: Sequence[Summary]) -> Figure:
     figure, axes = new_axes('squared error in its own covariance (NEES)',
-                            'share of believed poses below')
+                            'share of accepted poses below')
     draw_consistency(axes, {one.method: one.nees[one.accepted] for one in summaries
                             if one.nees.size and one.accepted.any()})
     add_legend(figure)
@@ -289,5 +291,5 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
 
 def _groups(results: Sequence[Result]) -> Iterator[tuple[str, str, str, list[Result]]]:
     found = [one for one in results if one.error_m is not None]
-    yield 'believed', '#0072B2', 'o', [one for one in found if one.accepted]
-    yield 'not believed', '#D55E00', 'X', [one for one in found if not one.accepted]
+    yield 'accepted', '#0072B2', 'o', [one for one in found if one.accepted]
+    yield 'refused', '#D55E00', 'X', [one for one in found if not one.accepted]

@@ -20,21 +20,21 @@ class Journal:
 
     @property
     def exists(self) -> bool:
-        """Return whether a run was stopped here."""
+        """Return whether an unfinished run is here."""
         return self._path.exists()
 
     def read(self, run: Mapping[str, Any]) -> list[Result]:
-        """Return what is done of a run.
+        """Return the results of an unfinished run.
 
         Parameters
         ----------
         run : mapping
-            What the run is about, as JSON knows it.
+            Description of the run, as JSON keeps it.
 
         Raises
         ------
         OptionsError
-            The file is about another run, and names what differs.
+            The file belongs to another run; names what differs.
         """
         try:
             lines = self._path.read_text(encoding='utf-8').splitlines()
@@ -43,16 +43,16 @@ class Journal:
         except OSError as error:
             raise OptionsError(f'{self._path}: cannot be read: {error.strerror}') from error
         except (ValueError, TypeError, IndexError) as error:
-            raise OptionsError(f'{self._path}: is damaged: remove it to begin again') from error
+            raise OptionsError(f'{self._path}: is damaged; remove it to start again') from error
         differing = [key for key in run if header.get(key) != run[key]]
         if differing:
-            raise OptionsError(f'{self._path}: was begun with another {" and ".join(differing)}: '
-                               'give the same, or remove it to begin again')
+            raise OptionsError(f'{self._path}: was begun with another {" and ".join(differing)}; '
+                               'give the same, or remove it to start again')
         return done
 
     @contextmanager
     def writing(self, run: Mapping[str, Any], done: Sequence[Result]) -> Iterator['Journal']:
-        """Write what is done, and open the file for more.
+        """Open the file for results, and write those that are done.
 
         Raises
         ------
@@ -66,15 +66,15 @@ class Journal:
                     self.add(done)
                 yield self
         except OSError as error:
-            raise OptionsError(f'{self._path}: cannot be written: {error.strerror}; what is done '
-                               'is kept: go on with --resume') from error
+            raise OptionsError(f'{self._path}: cannot be written: {error.strerror}; continue with '
+                               '--resume') from error
 
     def add(self, results: Sequence[Result]) -> None:
         """Write the results of a part."""
         self._line([result.as_dict() for result in results])
 
     def remove(self) -> None:
-        """Remove the file: the run is done."""
+        """Remove the file; the run is finished."""
         self._path.unlink(missing_ok=True)
 
     def _line(self, content: object) -> None:
@@ -83,7 +83,7 @@ class Journal:
 
 
 def _whole(lines: list[str]) -> Iterator[Any]:
-    """Yield the content of lines but of a last one that was cut off."""
+    """Yield the content of each line, except of a last line that was cut off."""
     for number, line in enumerate(lines, start=1):
         try:
             yield json.loads(line)

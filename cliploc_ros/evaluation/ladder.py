@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What each part of the method buys: ``python -m cliploc_ros.evaluation.ladder``.
+"""The gain of each part of the method: ``python -m cliploc_ros.evaluation.ladder``.
 
-The first rung is the paper's own configuration, the last ones know what most robots know: how
-high the camera is, which way is up, and how it moved between five images. Both of the latter are
-made of the true poses, with noise.
+The first rung is the paper's configuration. The last ones know what most robots know: the height
+of the camera, the vertical, and the motion between five images. Vertical and motion are simulated
+from the true poses, with noise.
 """
 
 import argparse
@@ -33,13 +33,13 @@ _FOUND_ONLY = RelocalizerOptions(refine=False)
 _DEFAULT = RelocalizerOptions()
 _VERTICAL_NOISE_DEG = 1.0
 _STEP_NOISE = 0.01, 0.5  # of odometry from frame to frame [m], [deg]
-_HEADER = ('what is added', 'success at .25 / .5 / 1 m', 'error [m]: median, mean', 'believed',
-           'of the right ones', 'wrong by > 1 m', 'search [ms]')
+_HEADER = ('what is added', 'success at .25 / .5 / 1 m', 'error [m]: median, mean', 'accepted',
+           'recall', 'precision (95 %)', 'false accepts', 'search [ms]')
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One step: its options, and what the robot knows besides its image."""
+    """One step: its options, and the sensors besides the camera."""
 
     name: str
     options: RelocalizerOptions
@@ -62,7 +62,7 @@ def rungs(height_range_m: tuple[float, float]) -> tuple[Rung, ...]:
 
 
 def climb(landmark_map: LandmarkMap, recorded: Queries, ladder: Sequence[Rung], *,
-          every_frame: bool = False, workers: int = 1,
+          every_frame: bool = False,
           advance: Callable[[int], object] = lambda searches: None) -> list[Summary]:
     """Run each rung on the queries.
 
@@ -72,16 +72,14 @@ def climb(landmark_map: LandmarkMap, recorded: Queries, ladder: Sequence[Rung], 
     recorded : Queries
     ladder : sequence of Rung
     every_frame : bool
-        Also the neighbouring frames, each as a question of its own.
-    workers : int
-        Processes.
+        Use the neighbouring frames as queries, too.
     advance : callable, optional
         Called with the number of searches done.
 
     Returns
     -------
     list of Summary
-        One for each rung, over three draws of whatever is drawn: samples or noise.
+        One for each rung, over three draws of its samples or noise.
     """
     found = []
     for rung in ladder:
@@ -90,14 +88,14 @@ def climb(landmark_map: LandmarkMap, recorded: Queries, ladder: Sequence[Rung], 
         for trial, queries in enumerate(_draws(landmark_map, recorded, rung, every_frame)):
             seeded = replace(method, options=replace(rung.options, random_seed=trial))
             results += [replace(one, trial=trial) for one in run_methods(
-                landmark_map, [seeded], queries, trials=1, workers=workers,
+                landmark_map, [seeded], queries, trials=1,
                 advance=lambda some: advance(len(some)))]
         found += summarize(results)
     return found
 
 
 def count_searches(ladder: Sequence[Rung], queries: int) -> int:
-    """Return how many searches climb makes."""
+    """Return the number of searches of climb."""
     return sum(_trials(rung) for rung in ladder) * queries
 
 
@@ -108,7 +106,7 @@ def _trials(rung: Rung) -> int:
 
 def _draws(landmark_map: LandmarkMap, recorded: Queries, rung: Rung, every_frame: bool
            ) -> Iterator[tuple[Query, ...]]:
-    """Yield the queries with what a rung knows, each time with other noise."""
+    """Yield the queries with the sensors of a rung, each time with other noise."""
     queries = make_queries(recorded, landmark_map, every_frame=True)
     groups = [frame.group for frame in recorded]
     for seed in range(_trials(rung)):
@@ -119,20 +117,21 @@ def _draws(landmark_map: LandmarkMap, recorded: Queries, rung: Rung, every_frame
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
-    """Return the cells of the table, its header first. The median is of the poses found."""
+    """Return the cells of the table, its header first. The median is that of the solved."""
     return [_HEADER, *((
         one.method, ' / '.join(f'{one.success(limit):.2f}' for limit in LIMITS_M),
         f'{np.median(one.errors_m[np.isfinite(one.errors_m)]):.3f}, {one.mean_error_m:.2f}',
         f'{one.accepted.mean():.2f}', f'{one.recall():.2f}',
-        f'{one.wrongly_accepted()} of {one.errors_m.size}', f'{one.mean_search_ms:.0f}')
+        '{:.2f} ({:.2f} to {:.2f})'.format(one.precision(), *one.precision_interval()),
+        f'{one.false_accepts()} of {int(one.accepted.sum())}', f'{one.mean_search_ms:.0f}')
         for one in summaries)]
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Climb the ladder as the command line asks, and print the table."""
+    """Climb the ladder with the options of the command line, and print the table."""
     parser = argparse.ArgumentParser(
         prog='python -m cliploc_ros.evaluation.ladder',
-        description='Print what each part of the method buys on recorded queries.')
+        description='Print the gain of each part of the method on recorded queries.')
     parser.add_argument('--queries', type=Path, required=True, metavar='NPZ')
     parser.add_argument('--map', type=Path, required=True, metavar='YAML')
     parser.add_argument('--height-range', type=float, nargs=2, default=(0.8, 2.2),

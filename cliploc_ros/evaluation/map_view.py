@@ -12,26 +12,26 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.landmark_map import LandmarkMap
 
-#: Sets writing off from what it stands on.
+#: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
 _MOST_NAMES = 100
-# Landmarks above each other share one place for their names.
+# Landmarks nearer than this share one place for their names.
 _SAME_PLACE_M = 0.14
 
 
 def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
-    """Draw each landmark as seen from above, with its name where names are few.
+    """Draw each landmark from above, with its name if there are few.
 
     Parameters
     ----------
     axes : Axes
-        Of equal scales, x and y of the map [m].
+        x and y of the map [m], with equal scales.
     landmark_map : LandmarkMap
 
     Returns
     -------
     dict of str to tuple of float
-        The colour of each class.
+        Colour of each class.
     """
     classes = sorted(set(landmark_map.class_ids))
     palette = color_sequences['tab20'][::2] + color_sequences['tab20'][1::2]
@@ -48,7 +48,7 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
 
 
 def _places(landmark_map: LandmarkMap) -> list[tuple[NDArray[np.float64], list[str]]]:
-    """Return where to write names: those of landmarks above each other at one place."""
+    """Return places and the names to write there; stacked landmarks share one."""
     places: list[tuple[NDArray[np.float64], list[int]]] = []
     for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
         center = landmark_map.centers[row, :2]

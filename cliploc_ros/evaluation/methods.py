@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is compared: the paper's ten methods, our defaults, and named sets of options."""
+"""Methods to compare: the paper's ten, our defaults, and named sets of options."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -12,11 +12,11 @@ import yaml
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 
-#: The rows of the paper's Table 1. Class has no similarities to order candidates by.
+#: The rows of the paper's Table 1. PROSAC needs similarities, which class matching has not.
 PAPER_METHODS = ('class_bf', 'class_ransac', 'clip_bf', 'clip_ransac', 'clip_prosac',
                  'clip_b-prosac', 'hybrid_bf', 'hybrid_ransac', 'hybrid_prosac',
                  'hybrid_b-prosac')
-#: The options of the relocalizer node as it is installed.
+#: The default options of the relocalizer node.
 AUTO = 'auto'
 ALL = 'all'
 _FIELDS = {field.name: field for field in fields(RelocalizerOptions)}
@@ -24,31 +24,31 @@ _FIELDS = {field.name: field for field in fields(RelocalizerOptions)}
 
 @dataclass(frozen=True)
 class Method:
-    """A name and the options that it stands for."""
+    """A name and its options."""
 
     name: str
     options: RelocalizerOptions
 
     @property
     def draws_nothing(self) -> bool:
-        """Return whether it tries samples in a fixed order: all trials would be equal."""
+        """Return whether it tries samples in a fixed order, so that all trials are equal."""
         return self.options.algorithm in ('auto', 'bf')
 
 
 def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int
                   ) -> tuple[Method, ...]:
-    """Return the methods that words name.
+    """Return the methods with some names.
 
     Parameters
     ----------
     words : iterable of str
-        Names of the paper's methods, 'all' of these, 'auto', or files in YAML: a mapping of
-        names to options, each of which may build on another method by 'base'.
+        Names of the paper's methods, 'all' of these, 'auto', or YAML files: a mapping of names
+        to options, where 'base' names a method whose options are the defaults.
     paper : RelocalizerOptions
-        What holds for the paper's methods besides matching and algorithm; of auto, its seed and
-        what is known of vertical and height.
+        Options of the paper's methods besides matching and algorithm. auto takes its seed,
+        height range and vertical deviation from them.
     landmarks : int
-        Size of the map: k is at most that.
+        Number of landmarks of the map; it limits k.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where results go: a file is there complete, or not at all."""
+"""Output files: each is written completely, or not at all."""
 
 import os
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from cliploc_ros.errors import OptionsError
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder that was given for results, with its parents.
+    """Create the output folder and its parents.
 
     Raises
     ------
     OptionsError
-        If it cannot be made or written to.
+        The folder cannot be created or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -33,24 +33,24 @@ def write_text(path: Path, text: str) -> None:
     Raises
     ------
     OptionsError
-        If it cannot be written; nothing is left behind then.
+        The file cannot be written; nothing is left behind.
     """
     write_file(path, lambda partial: _write(partial, text))
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let a function write a file, which takes its name only when it is complete.
+    """Let a function write a file, which gets its name only when it is complete.
 
     Parameters
     ----------
     path : Path
     write : callable
-        Takes the path to write to, which ends like the file's own.
+        Takes the path to write to, which has the suffix of the file.
 
     Raises
     ------
     OptionsError
-        If it cannot be written; nothing is left behind then.
+        The file cannot be written; nothing is left behind.
     """
     partial = path.with_name(f'.{os.getpid()}.{path.name}')
     try:

@@ -1,30 +1,31 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's table, for people and for programs."""
+"""The paper's table as text, Markdown and CSV, and all results as JSON."""
 
 import csv
 import io
 import json
 from collections.abc import Sequence
 
+from cliploc_ros.core.acceptance.confidence import FITTED_ON
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary, compare, find_best
 from cliploc_ros.evaluation.trials import Result
 
 _HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
-           'search [ms]', 'believed', 'wrong by > 1 m')
+           'search [ms]', 'accepted', 'precision (95 %)', 'false accepts')
 _WITHIN_NOISE = '~'
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     """Return the cells of the table, its header first.
 
-    What the queries are too few to tell from the best method is marked with a '~'.
+    A '~' marks methods that the queries are too few to separate from the best one.
 
     Parameters
     ----------
     summaries : sequence of Summary
-        On the same queries.
+        Of the same queries.
     """
     best = find_best(summaries)
     return [_HEADER, *(_row(one, best) for one in summaries)]
@@ -41,7 +42,8 @@ def _row(one: Summary, best: Summary) -> tuple[str, ...]:
     cut = '' if one.coverage.min() == 1.0 else f' ({one.coverage.mean():.0%} tried)'
     return (matching, algorithm, rates, f'{one.median_error_m:.3f}, {one.mean_error_m:.2f}',
             f'{one.mean_search_ms:.1f}{cut}', _rate(float(one.accepted.mean())),
-            f'{one.wrongly_accepted()} of {one.errors_m.size}')
+            f'{_rate(one.precision())} ({" to ".join(map(_rate, one.precision_interval()))})',
+            f'{one.false_accepts()} of {int(one.accepted.sum())}')
 
 
 def _rate(value: float) -> str:
@@ -49,13 +51,15 @@ def _rate(value: float) -> str:
 
 
 def notes(summaries: Sequence[Summary]) -> list[str]:
-    """Return what a reader of the table must know, in sentences."""
+    """Return sentences that explain the table."""
     best = find_best(summaries)
     lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
-             '(bf and auto one: they draw nothing); ± is the standard deviation over '
-             'trials, at 1 m.']
+             '(one of bf and auto, which draw no samples); ± is the standard deviation over '
+             'trials, at 1 m.',
+             f'Confidences are fitted on {FITTED_ON}: on these frames, precision and recall are '
+             'not held out.']
     if len(summaries) > 1:
-        lines.append(f'{_WITHIN_NOISE}: not to be told from {best.method} by so many queries '
+        lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
     return lines
 
@@ -82,8 +86,8 @@ def as_csv(summaries: Sequence[Summary]) -> str:
     writer.writerow(['method', 'queries', 'trials', *(f'success_{limit:g}m' for limit in LIMITS_M),
                      *(f'success_{limit:g}m_std' for limit in LIMITS_M), 'median_error_m',
                      'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
-                     'recall_1m', 'wrongly_accepted', 'less_than_best_1m',
-                     'less_than_best_low', 'less_than_best_high'])
+                     'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
+                     'less_than_best_1m', 'less_than_best_low', 'less_than_best_high'])
     for one in summaries:
         difference = compare(one, best)
         writer.writerow([
@@ -91,12 +95,12 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             *(one.success(limit) for limit in LIMITS_M),
             *(one.success_deviation(limit) for limit in LIMITS_M), one.median_error_m,
             one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
-            float(one.accepted.mean()), one.precision(), one.recall(), one.wrongly_accepted(),
-            difference.mean, difference.low, difference.high])
+            float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
+            one.false_accepts(), difference.mean, difference.low, difference.high])
     return text.getvalue()
 
 
 def as_json(results: Sequence[Result]) -> str:
-    """Return all results, one a line."""
+    """Return all results, one on each line."""
     lines = ',\n'.join(json.dumps(result.as_dict()) for result in results)
     return f'[\n{lines}\n]\n'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recording queries: detector and CLIP run once, every method then meets the same input."""
+"""Recording queries: detector and CLIP run once, so every method gets the same input."""
 
 import hashlib
 import json
@@ -26,10 +26,11 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
 
-#: The most confident detections of an image that are used, as by the relocalizer node.
+#: The most detections of an image that are used, as in the relocalizer node.
 MAX_DETECTIONS = 50
 Progress = Callable[[Iterable[Frame]], Iterable[Frame]]
 
@@ -42,7 +43,7 @@ def record_queries(frames: Frames, landmark_map: LandmarkMap, detector: ObjectDe
     ----------
     frames : Frames
     landmark_map : LandmarkMap
-        Whose labels the observer compares with.
+        The observer compares crops with its labels.
     detector : ObjectDetector
     observer : Observer
     progress : callable, optional
@@ -51,13 +52,12 @@ def record_queries(frames: Frames, landmark_map: LandmarkMap, detector: ObjectDe
     Returns
     -------
     Queries
-        Each image is a query of its own. Which landmark a box shows is not known: -1. Boxes are
-        undistorted.
+        Each image is a query. The true landmark of a box is unknown: -1. Boxes are undistorted.
 
     Raises
     ------
     DatasetError
-        If an image cannot be read, no image has ground truth, or the camera changes.
+        An image cannot be read, no image has ground truth, or the camera changes.
     """
     recorded: list[QueryFrame] = []
     camera: Camera | None = None
@@ -66,7 +66,7 @@ def record_queries(frames: Frames, landmark_map: LandmarkMap, detector: ObjectDe
             continue
         if camera not in (None, frame.camera):
             raise DatasetError(f'{frames.source}: the camera changes at '
-                               f'{frame.stamp_ns / 1e9:.6f}: a query file has one')
+                               f'{frame.stamp_ns / NS_PER_S:.6f}, but a query file has one camera')
         camera = frame.camera
         recorded.append(_record(frame, detector, observer, len(recorded)))
     if camera is None:
@@ -105,7 +105,7 @@ def _undistorted(detections: Detections, camera: Camera) -> np.ndarray:
 
 def recorded_once(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, clip: ClipOptions
                   ) -> Queries:
-    """Return queries from the cache beside the images, or record them and keep them there.
+    """Return queries from the cache beside the images, or record and cache them.
 
     Parameters
     ----------
@@ -113,22 +113,22 @@ def recorded_once(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, 
     landmark_map : LandmarkMap
     yolo : YoloOptions
     clip : ClipOptions
-        A cache that was made with others is not used.
+        Other options need another cache.
 
     Raises
     ------
     CliplocError
-        From loading the networks and from recording. A cache that cannot be read or written is
-        but a warning.
+        From loading the networks and from recording. A cache that cannot be read or written
+        gives a warning only.
     """
     cache = cache_path(frames, landmark_map, yolo, clip)
     if cache.exists():
         try:
             queries = load_queries(cache, landmark_map.landmark_ids)
-            logger.warning('boxes and similarities of an earlier run: %s', cache)
+            logger.warning('using boxes and similarities of an earlier run: %s', cache)
             return queries
         except DatasetError as error:
-            logger.warning('recording anew: %s', error)
+            logger.warning('recording again: %s', error)
     queries = record_queries(
         frames, landmark_map, YoloDetector(yolo),
         Observer(*load_encoder(clip, landmark_map.labels)),
@@ -142,7 +142,7 @@ def recorded_once(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, 
 
 def cache_path(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, clip: ClipOptions
                ) -> Path:
-    """Return where queries are kept: beside their source, by all that they depend on."""
+    """Return the cache file: beside the images, named after all that the queries depend on."""
     source = frames.source.resolve()
     parts: list[Any] = [frames.count, landmark_map.landmark_ids, landmark_map.labels,
                         asdict(yolo), asdict(clip),
@@ -153,7 +153,7 @@ def cache_path(frames: Frames, landmark_map: LandmarkMap, yolo: YoloOptions, cli
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Return what changes when a file does; None for the name of a published model."""
+    """Return what changes with a file; None for the name of a published model."""
     try:
         stat = path.stat()
     except OSError:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map or a detector gone wrong costs: ``python -m cliploc_ros.evaluation.robustness``.
+"""The cost of a wrong map or detector: ``python -m cliploc_ros.evaluation.robustness``.
 
-Landmarks are removed, moved, mislabelled and exchange places, detections are dropped and invented,
-ever more of them; each time all queries are localized. Success counts poses believed or not; a
-wrong pose believed is what a robot must never get.
+Landmarks are removed, moved, mislabelled and exchanged, detections are dropped and invented, at
+increasing levels. At each level all queries are localized. Success counts poses accepted or not; a
+false accept is the worst outcome.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from cliploc_ros.evaluation.figures import save_figure
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.run import run_methods
-from cliploc_ros.evaluation.summary import Summary, summarize
+from cliploc_ros.evaluation.summary import Summary, summarize, wilson_interval
 from cliploc_ros.evaluation.trials import Query, make_queries
 from cliploc_ros.evaluation.troubles import (
     Change,
@@ -39,7 +39,6 @@ from cliploc_ros.evaluation.troubles import (
     move_landmarks,
     remove_landmarks,
 )
-from cliploc_ros.evaluation.trust import wilson_interval
 
 _SUCCESS_M = 1.0
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -51,7 +50,7 @@ _LABEL_WIDTH = 22
 
 @dataclass(frozen=True)
 class Trouble:
-    """What goes wrong, by how much, and how that is written on an axis."""
+    """A change of map or detections, its levels, and the label of its axis."""
 
     name: str
     label: str
@@ -72,21 +71,20 @@ TROUBLES = (
             invent_detections))
 
 
-def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Trouble, seed: int,
-            workers: int = 1) -> Iterator[Summary]:
+def measure(landmark_map: LandmarkMap, queries: Sequence[Query], trouble: Trouble, seed: int
+            ) -> Iterator[Summary]:
     """Localize all queries at each level of a trouble, with the default options."""
     for level in trouble.levels:
-        # equal draws at each level: what goes wrong is only ever more
+        # equal draws, so that each level contains the one before
         rng = np.random.default_rng(seed)
         changed, asked = trouble.change(landmark_map, queries, level, rng)
         options = RelocalizerOptions()
         options = replace(options, k=min(options.k, len(changed)))
-        yield summarize(run_methods(changed, [Method(AUTO, options)], asked, trials=1,
-                                    workers=workers))[0]
+        yield summarize(run_methods(changed, [Method(AUTO, options)], asked, trials=1))[0]
 
 
 def draw(folder: Path, found: Sequence[tuple[Trouble, Sequence[Summary]]]) -> Path:
-    """Draw success, what is believed, and what is believed and wrong, with 95 % intervals."""
+    """Draw success, accepted poses and false accepts, with 95 % intervals."""
     rows, columns = ceil(len(found) / _COLUMNS), min(len(found), _COLUMNS)
     figure = Figure(figsize=(_PANEL_SIZE[0] * columns, _PANEL_SIZE[1] * rows),
                     layout='constrained')
@@ -105,9 +103,9 @@ def draw(folder: Path, found: Sequence[tuple[Trouble, Sequence[Summary]]]) -> Pa
 def _draw_panel(axes: Axes, trouble: Trouble, summaries: Sequence[Summary]) -> None:
     counts = (('within 1 m', '#0072B2', 'o', [int((one.errors_m < _SUCCESS_M).sum())
                                               for one in summaries]),
-              ('believed', '#009E73', 's', [int(one.accepted.sum()) for one in summaries]),
-              ('believed and wrong', '#D55E00', 'X', [one.wrongly_accepted(_SUCCESS_M)
-                                                      for one in summaries]))
+              ('accepted', '#009E73', 's', [int(one.accepted.sum()) for one in summaries]),
+              ('false accepts', '#D55E00', 'X', [one.false_accepts(_SUCCESS_M)
+                                                 for one in summaries]))
     total = summaries[0].errors_m.size
     for label, color, marker, found in counts:
         intervals = np.array([wilson_interval(one, total) for one in found])
@@ -139,8 +137,8 @@ def run(arguments: list[str]) -> int:
                               trouble.name, len(trouble.levels), disable=None))
         print(f'{trouble.label}:')
         for level, one in zip(trouble.levels, summaries, strict=True):
-            print(f'  {level:4.2f}: success {one.success(_SUCCESS_M):.3f}, believed '
-                  f'{one.accepted.mean():.3f}, of these wrong {one.wrongly_accepted(_SUCCESS_M)} '
+            print(f'  {level:4.2f}: success {one.success(_SUCCESS_M):.3f}, accepted '
+                  f'{one.accepted.mean():.3f}, false accepts {one.false_accepts(_SUCCESS_M)} '
                   f'of {one.accepted.sum()}')
         found.append((trouble, summaries))
     print(f'wrote {draw(options.out, found)}')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""All trials of all methods on all queries, on all cores; what is done survives Ctrl-C."""
+"""All trials of all methods on all queries, on all cores."""
 
 import ctypes
 import multiprocessing
@@ -18,17 +18,17 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
 
-# What is lost at most by each core when a run is stopped.
+# A stopped run loses at most this many queries of each core.
 _QUERIES_A_PART = 8
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class RunError(CliplocError):
-    """The run could not be ended."""
+    """The run could not be finished."""
 
 
 class _Part(NamedTuple):
-    """One trial of a method on some queries, by their places in the input."""
+    """One trial of a method on some queries, given by their rows in the input."""
 
     method: Method
     trial: int
@@ -44,15 +44,15 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     ----------
     landmark_map : LandmarkMap
     methods : sequence of Method
-        Those that draw nothing run one trial.
+        A method that draws no samples runs one trial.
     queries : sequence of Query
     trials : int
     workers : int
-        Processes; 1 works in this one. Results do not depend on it.
+        Number of processes; 1 uses this process. Results do not depend on it.
     done : sequence of Result
-        What need not be run again.
+        Results of an earlier run, which are not run again.
     advance : callable, optional
-        Called with the results of each part as it is done.
+        Called with the results of each finished part.
 
     Returns
     -------
@@ -67,8 +67,9 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     known = {(result.method, result.trial, result.query) for result in done}
     parts = list(_parts(methods, queries, trials, known))
     results = list(done)
-    work = _in_processes if workers > 1 and len(parts) > 1 else _here
-    for part_results in work(landmark_map, queries, parts, workers):
+    finished = _in_processes(landmark_map, queries, parts, workers) \
+        if workers > 1 and len(parts) > 1 else _here(landmark_map, queries, parts)
+    for part_results in finished:
         results += part_results
         advance(part_results)
     order = {method.name: number for number, method in enumerate(methods)}
@@ -76,13 +77,13 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
 
 
 def count_searches(methods: Sequence[Method], queries: int, trials: int) -> int:
-    """Return how many searches a run makes."""
+    """Return the number of searches of a run."""
     return sum(1 if method.draws_nothing else trials for method in methods) * queries
 
 
 def _parts(methods: Sequence[Method], queries: Sequence[Query], trials: int,
            known: set[tuple[str, int, int]]) -> Iterator[_Part]:
-    """Yield what is to be done, those that draw nothing first: they take longest."""
+    """Yield the parts to run; methods that draw no samples first, since they take longest."""
     for method in sorted(methods, key=lambda method: not method.draws_nothing):
         for trial in range(1 if method.draws_nothing else trials):
             places = [place for place, query in enumerate(queries)
@@ -91,8 +92,8 @@ def _parts(methods: Sequence[Method], queries: Sequence[Query], trials: int,
                 yield _Part(method, trial, some)
 
 
-def _here(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_Part],
-          workers: int) -> Iterator[list[Result]]:
+def _here(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_Part]
+          ) -> Iterator[list[Result]]:
     _prepare(landmark_map, queries)
     for part in parts:
         yield _run_part(part)
@@ -100,10 +101,10 @@ def _here(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_
 
 def _in_processes(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_Part],
                   workers: int) -> Iterator[list[Result]]:
-    # Spawned: forking a process that has run PyTorch's threads may hang.
+    # spawned, since forking a process that has run PyTorch's threads may hang
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'),
                                initializer=_begin_worker, initargs=(landmark_map, queries))
-    # The pool forgets its processes once it is told to end.
+    # the pool forgets its processes when it shuts down
     processes = pool._processes
     futures: list[Future[list[Result]]] = []
     try:
@@ -111,11 +112,11 @@ def _in_processes(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Se
         for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool as error:
-        raise RunError('a worker process died, of too little memory perhaps; what is done is '
-                       'kept: go on with --resume, and fewer --workers') from error
+        raise RunError('a worker process died, perhaps out of memory; continue with --resume and '
+                       'fewer --workers') from error
     except BaseException:
         for process in [*processes.values()]:
-            process.terminate()  # an exhaustive search may take minutes more
+            process.terminate()  # an exhaustive search may take minutes
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -126,14 +127,14 @@ _queries: Sequence[Query]
 
 
 def _begin_worker(landmark_map: LandmarkMap, queries: Sequence[Query]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
-    # Killed itself, the parent could end nothing any more: then the kernel does.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    # a killed parent cannot end its workers, so the kernel does
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     _prepare(landmark_map, queries)
 
 
 def _prepare(landmark_map: LandmarkMap, queries: Sequence[Query]) -> None:
-    """Keep what all parts share, and compile before anything is timed."""
+    """Keep what all parts share, and compile the kernels before a search is timed."""
     global _landmark_map, _queries  # a pool's workers have no other memory
     _landmark_map, _queries = landmark_map, queries
     Relocalizer(landmark_map, RelocalizerOptions(matching='class', algorithm='bf')).warm_up()

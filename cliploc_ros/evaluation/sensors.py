@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot knows besides its image, made of the true poses and of noise: simulated."""
+"""Simulated sensors besides the camera, made of the true poses and of noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,16 +18,16 @@ from cliploc_ros.evaluation.trials import Query
 
 def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 0
                   ) -> tuple[Query, ...]:
-    """Return queries that know the vertical, as an accelerometer does.
+    """Return queries with a known vertical, as from an accelerometer.
 
     Parameters
     ----------
     queries : sequence of Query
     noise_deg : float
-        Standard deviation of the angle by which each vertical is turned, about a level axis of
-        random direction [deg].
+        Standard deviation of the error of each vertical [deg], a rotation about a random level
+        axis.
     seed : int
-        Equal seeds give equal noise, whatever the queries' order.
+        Equal seeds give equal noise in any order of the queries.
     """
     found = []
     for query in queries:
@@ -39,7 +39,7 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
 
 def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: float = 0.0,
                     noise_deg: float = 0.0, seed: int = 0) -> tuple[Query, ...]:
-    """Return queries that bring the other frames of their group, joined by odometry.
+    """Return queries with the other frames of their group, linked by odometry.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: fl
     groups : sequence of int
         The group of each.
     noise_m, noise_deg : float
-        Standard deviation of the error of each step from one frame to the next in time, along
-        each axis [m] and about each axis [deg].
+        Standard deviations of the error of each step from one frame to the next in time, on each
+        axis.
     seed : int
         Equal seeds give equal noise.
 
@@ -76,7 +76,7 @@ def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: fl
 
 def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
               rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Return each frame's odom_from_camera (4, 4), of steps that are off at random."""
+    """Return odom_from_camera (4, 4) of each frame, with a random error of each step."""
     poses = [np.eye(4)]
     for before, after in pairwise(frames):
         step = invert_transform(before.map_from_camera) @ after.map_from_camera
@@ -88,7 +88,7 @@ def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
 
 def _turned(direction: NDArray[np.float64], angle: float, rng: np.random.Generator
             ) -> NDArray[np.float64]:
-    """Return a direction turned by an angle [rad] about a random axis perpendicular to it."""
+    """Return a direction rotated by an angle [rad] about a random perpendicular axis."""
     axis = np.cross(direction, rng.normal(size=3))
     turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
     return np.asarray(turn.apply(direction))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a method's results come to, and whether two methods differ by more than noise."""
+"""Statistics of a method's results, and whether two methods differ by more than noise."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.evaluation.trials import Result
 
-#: Poses nearer than these [m] are reported as success. The paper does not state its own; 1 m
-#: reproduces its level.
+#: Limits of success [m]. The paper does not state its own; 1 m reproduces its level.
 LIMITS_M = (0.25, 0.5, 1.0)
 _RESAMPLES = 10_000
 
@@ -28,7 +27,7 @@ class Summary:
     queries : tuple of int
         Their numbers.
     errors_m : ndarray (t, q)
-        Distance of the best pose from the truth; infinite where none was found.
+        Position error of the best pose; infinite where none was found.
     accepted : ndarray (t, q) of bool
     confidence : ndarray (t, q)
     search_ms : ndarray (t, q)
@@ -52,7 +51,7 @@ class Summary:
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     def success(self, limit_m: float) -> float:
-        """Return the share of poses within a distance of the truth, believed or not."""
+        """Return the share of poses within a distance of the truth, accepted or not."""
         return float((self.errors_m < limit_m).mean())
 
     def success_deviation(self, limit_m: float) -> float:
@@ -61,7 +60,7 @@ class Summary:
 
     @property
     def median_error_m(self) -> float:
-        """Return the median error; a query without any pose counts as infinitely far."""
+        """Return the median error [m]; a query without a pose counts as infinitely far."""
         return float(np.median(self.errors_m))
 
     @property
@@ -75,28 +74,45 @@ class Summary:
         """Return the mean time of a search [ms]."""
         return float(self.search_ms.mean())
 
-    def wrongly_accepted(self, limit_m: float = 1.0) -> int:
-        """Return how many believed poses are farther from the truth than a limit."""
+    def false_accepts(self, limit_m: float = 1.0) -> int:
+        """Return how many accepted poses are farther from the truth than a limit."""
         return int((self.accepted & ~(self.errors_m < limit_m)).sum())
 
     def precision(self, limit_m: float = 1.0) -> float:
-        """Return the share of believed poses that are right; 1 if none is believed."""
-        believed = int(self.accepted.sum())
-        return 1.0 - self.wrongly_accepted(limit_m) / believed if believed else 1.0
+        """Return the share of accepted poses that are right; 1 if none is accepted."""
+        accepted = int(self.accepted.sum())
+        return 1.0 - self.false_accepts(limit_m) / accepted if accepted else 1.0
+
+    def precision_interval(self, limit_m: float = 1.0) -> tuple[float, float]:
+        """Return the 95 % interval of the precision (Wilson); 0 to 1 if none is accepted.
+
+        Trials of one query are not independent, so all trials count as one.
+        """
+        count = self.accepted.sum() / len(self.accepted)
+        return wilson_interval(self.precision(limit_m) * count, count) if count else (0.0, 1.0)
 
     def recall(self, limit_m: float = 1.0) -> float:
-        """Return the share of right poses that are believed; 1 if none is right."""
+        """Return the share of right poses that are accepted; 1 if none is right."""
         right = self.errors_m < limit_m
         return float(self.accepted[right].mean()) if right.any() else 1.0
 
 
+def wilson_interval(right: float, count: float, deviations: float = 1.96) -> tuple[float, float]:
+    """Return the 95 % interval of a share that was seen right times of count (Wilson 1927)."""
+    share, square = right / count, deviations**2
+    middle = (share + square / (2 * count)) / (1 + square / count)
+    half = deviations / (1 + square / count) * np.sqrt(
+        share * (1 - share) / count + square / (4 * count**2))
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+
+
 def summarize(results: Iterable[Result]) -> list[Summary]:
-    """Return a summary for each method, in their order.
+    """Return a summary of each method, in their order.
 
     Parameters
     ----------
     results : iterable of Result
-        By method, trial and query, as run_methods returns them.
+        Sorted by method, trial and query, as run_methods returns them.
     """
     return [_summary(method, list(rows))
             for method, rows in groupby(results, key=lambda result: result.method)]
@@ -119,7 +135,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
 
 @dataclass(frozen=True)
 class Difference:
-    """By how much a method succeeds more often than another, with its 95 % interval."""
+    """Success of one method less that of another, with its 95 % interval."""
 
     mean: float
     low: float
@@ -127,22 +143,22 @@ class Difference:
 
     @property
     def is_noise(self) -> bool:
-        """Return whether the queries are too few to tell the two apart."""
+        """Return whether the queries are too few to separate the two."""
         return self.low <= 0.0 <= self.high
 
 
 def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -> Difference:
     """Compare two methods on the same queries.
 
-    The queries are drawn again and again, with replacement (the paired bootstrap, Efron and
-    Tibshirani 1993): what another building's queries would have given is uncertain by that.
+    The interval is that of the paired bootstrap (Efron and Tibshirani 1993): queries are drawn
+    with replacement, 10,000 times.
 
     Parameters
     ----------
     one, other : Summary
         Of the same queries.
     limit_m : float
-        What counts as success.
+        Limit of success.
     seed : int
 
     Returns
@@ -159,5 +175,5 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
 
 
 def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
-    """Return the summary of the greatest success, of equals the one of the least error."""
+    """Return the summary of the greatest success; of equal ones that of the least error."""
     return max(summaries, key=lambda one: (one.success(limit_m), -one.median_error_m))

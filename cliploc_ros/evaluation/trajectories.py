@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates as trajectories in TUM's format, which ``evo`` reads."""
+"""Estimates as trajectories in the TUM format, for evo and other tools."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.evaluation.output import make_folder, write_text
-from cliploc_ros.evaluation.trials import NS_PER_S, Query, Result
+from cliploc_ros.evaluation.trials import Query, Result
+from cliploc_ros.units import NS_PER_S
 
 GROUND_TRUTH = 'ground_truth.txt'
 
 
 def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:
-    """Write ground_truth.txt, and of each method's first trial METHOD.txt and METHOD.accepted.txt.
+    """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial.
 
     Parameters
     ----------
@@ -41,35 +42,3 @@ def _text(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> str:
         numbers = [*pose[:3, 3], *quaternion_from_transform(pose)]
         lines.append(' '.join([f'{timestamp:.6f}', *(f'{number:.9f}' for number in numbers)]))
     return '\n'.join(lines) + '\n'
-
-
-def absolute_trajectory_error(folder: Path, method: str) -> float | None:
-    """Return the root mean square of evo's absolute pose error [m] of what a method believed.
-
-    Nothing is aligned: both are poses in the map.
-
-    Parameters
-    ----------
-    folder : Path
-        Of write_trajectories.
-    method : str
-
-    Returns
-    -------
-    float or None
-        None where evo is not installed, or fewer than two poses are believed.
-    """
-    try:
-        from evo.core import metrics, sync
-        from evo.tools import file_interface
-    except ImportError:
-        return None
-    estimate = folder / f'{method}.accepted.txt'
-    if len(estimate.read_text(encoding='utf-8').splitlines()) < 3:
-        return None
-    truth, found = sync.associate_trajectories(
-        file_interface.read_tum_trajectory_file(folder / GROUND_TRUTH),
-        file_interface.read_tum_trajectory_file(estimate))
-    error = metrics.APE(metrics.PoseRelation.translation_part)
-    error.process_data((truth, found))
-    return float(error.get_statistic(metrics.StatisticsType.rmse))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Methods run on queries: what each search found, and how far that is from the truth."""
+"""Methods run on queries: the pose that each search found, and its error."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,23 +19,22 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import Queries, QueryFrame
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.methods import Method
-
-NS_PER_S = 1e9
+from cliploc_ros.units import NS_PER_S
 
 
 @dataclass(frozen=True)
 class Query:
-    """One question: an observation, and the true answer.
+    """An observation to localize, and the true pose.
 
     Parameters
     ----------
     number : int
-        Of the frame in its query file, from 0.
+        Number of the frame in its query file, from 0.
     observation : Observation
     map_from_camera : ndarray (4, 4)
         Ground truth.
     neighbours : tuple of Observation
-        Frames around it that odometry joins with it.
+        Other frames, which odometry links to it.
     """
 
     number: int
@@ -46,42 +45,42 @@ class Query:
 
 @dataclass(frozen=True)
 class Result:
-    """What one search found.
+    """The result of one search.
 
     Parameters
     ----------
     method : str
     trial : int
-        From 0; its seed is the run's plus this.
+        From 0; added to the seed of the run.
     query : int
         Number of the frame in its query file.
     timestamp : float
         Of the image [s].
     boxes : int
-        How many detections it has.
+        Number of detections.
     solved, accepted : bool
-        Whether a pose was found, and whether it was believed.
+        Whether a pose was found, and whether it was accepted.
     map_from_camera : list of list of float or None
-        The best pose; None where none was found, and so the errors.
+        The best pose; None where none was found.
     error_m, error_deg : float or None
-        Its distance from the truth.
+        Error of the best pose; None where none was found.
     score : float
-        Sum of its IoUs.
+        Sum of the IoUs of its inliers.
     confidence : float
-        How likely the pose is within 1 m, as the relocalizer has it.
+        Probability that it is within 1 m, according to the relocalizer.
     nees : float or None
-        Squared error of the pose in its own covariance, see normalized_square.
+        Squared error in its own covariance, see normalized_square.
     inliers : int
     hypotheses : int
-        How many were tried.
+        Number of hypotheses tried.
     best_iteration : int
-        In which one the best was found, from 1.
+        Iteration that found the best pose, from 1.
     coverage : float
-        The share of its samples that the search tried.
+        Share of its samples that the search tried.
     reason : str
-        Why it was not believed.
+        Reason of the refusal; empty when accepted.
     search_ms : float
-        Alone of all this, it differs from run to run.
+        The only field that differs from run to run.
     """
 
     method: str
@@ -111,14 +110,14 @@ class Result:
 
 def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool = False
                  ) -> tuple[Query, ...]:
-    """Return the questions of a query file, with similarities in the map's order.
+    """Return the queries of a file, with similarities in the map's order.
 
     Parameters
     ----------
     queries : Queries
     landmark_map : LandmarkMap
     every_frame : bool
-        Also the neighbouring frames, each as a question of its own.
+        Use the neighbouring frames as queries, too.
 
     Raises
     ------
@@ -128,12 +127,12 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     column = {one: number for number, one in enumerate(queries.landmark_ids)}
     missing = [one for one in landmark_map.landmark_ids if one not in column]
     if missing:
-        raise DatasetError(f"the queries say nothing about the map's landmark '{missing[0]}'"
-                           f'{f" and {len(missing) - 1} more" if missing[1:] else ""}: they were '
-                           'recorded against another map')
+        more = f' and {len(missing) - 1} more' if missing[1:] else ''
+        raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
+                           'recorded with another map')
     columns = [column[one] for one in landmark_map.landmark_ids]
     fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
-    # The image's size is not recorded, and nothing here asks for it.
+    # the file does not hold the size of the image, and localizing does not use it
     camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
     return tuple(Query(number, _observation(frame, camera, columns), frame.map_from_camera)
                  for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What may go wrong with a map or a detector, done to recorded queries: simulated."""
+"""Simulated errors of a map or a detector, applied to recorded queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], Wo
 
 def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                      rng: np.random.Generator) -> World:
-    """Leave a share of the landmarks out of the map; their detections stay."""
+    """Remove a share of the landmarks from the map; their detections stay."""
     count = len(landmark_map)
     kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
     fewer = replace(landmark_map, landmark_ids=tuple(landmark_map.landmark_ids[row]
@@ -34,7 +34,7 @@ def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share:
 
 def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
                    rng: np.random.Generator) -> World:
-    """Move a third of the landmarks by a distance, each in a direction of its own."""
+    """Move a third of the landmarks by a distance, in random directions."""
     steps = rng.normal(size=landmark_map.centers.shape)
     steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
     steps[rng.random(len(steps)) > 1 / 3] = 0.0
@@ -43,7 +43,7 @@ def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance
 
 def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                        rng: np.random.Generator) -> World:
-    """Let a share of the landmarks exchange places; with all of them it is another place."""
+    """Exchange the places of a share of the landmarks; all of them make another place."""
     count = len(landmark_map)
     chosen = rng.permutation(count)[:round(share * count)]
     centers = landmark_map.centers.copy()
@@ -53,7 +53,7 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
 
 def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                        rng: np.random.Generator) -> World:
-    """Give a share of the landmarks each other's labels and classes."""
+    """Exchange labels and classes of a share of the landmarks."""
     count = len(landmark_map)
     chosen = rng.permutation(count)[:round(share * count)]
     source = np.arange(count)
@@ -66,18 +66,18 @@ def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
 
 def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                     rng: np.random.Generator) -> World:
-    """Leave a share of the boxes out."""
+    """Drop a share of the boxes."""
     return landmark_map, [_without_boxes(query, share, rng) for query in queries]
 
 
 def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                       rng: np.random.Generator) -> World:
-    """Add boxes anywhere, so many for each true one, that look like landmarks at random."""
+    """Add random boxes, a number for each true one, that look like random landmarks."""
     return landmark_map, [_with_invented(query, share, rng) for query in queries]
 
 
 def _without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query with a share of its boxes dropped at random."""
+    """Return a query without a random share of its boxes."""
     observation = query.observation
     rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
     similarities = observation.similarities
@@ -92,7 +92,7 @@ def _with_similarities(query: Query, similarities: np.ndarray) -> Query:
 
 
 def _with_invented(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query with boxes whose crops look like those of its own, in another order."""
+    """Return a query with random boxes, whose similarities are permuted ones of its own."""
     observation, true = query.observation, query.observation.detections
     count = int(rng.binomial(len(true), share)) if len(true) else 0
     camera, similarities = observation.camera, np.asarray(observation.similarities)

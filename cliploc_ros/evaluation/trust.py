@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether confidences and covariances are true, as figures."""
+"""Figures that compare confidences and covariances with the true errors."""
 
 from collections.abc import Mapping
 
@@ -9,20 +9,13 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-# Finer where poses are believed.
+from cliploc_ros.evaluation.summary import wilson_interval
+
+# finer where poses are accepted
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 _FREEDOM = 6
 _COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 _MARKERS = 'osD^vP'
-
-
-def wilson_interval(right: int, count: int, deviations: float = 1.96) -> tuple[float, float]:
-    """Return the interval of a share of which so many of so many were seen (Wilson 1927)."""
-    share, square = right / count, deviations**2
-    middle = (share + square / (2 * count)) / (1 + square / count)
-    half = deviations / (1 + square / count) * np.sqrt(
-        share * (1 - share) / count + square / (4 * count**2))
-    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
 
 
 def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
@@ -33,9 +26,9 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
     ----------
     axes : Axes
     judged : mapping of str to (ndarray (n,), ndarray (n,) of bool)
-        Confidences, and which poses are right, by name.
+        Confidences, and whether each pose is right, by name.
     """
-    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='true confidences')
+    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
     for number, (name, (confidence, right)) in enumerate(judged.items()):
         bins = np.clip(np.digitize(confidence, _BINS) - 1, 0, len(_BINS) - 2)
         color = _COLORS[number % len(_COLORS)]
@@ -51,7 +44,7 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
 
 
 def draw_consistency(axes: Axes, nees: Mapping[str, NDArray[np.float64]]) -> None:
-    """Draw the distribution of squared errors in their own covariances.
+    """Draw the distribution of the normalized squared errors (NEES).
 
     Parameters
     ----------
@@ -61,7 +54,7 @@ def draw_consistency(axes: Axes, nees: Mapping[str, NDArray[np.float64]]) -> Non
     """
     levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
     axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
-              label='true covariances')
+              label='ideal')
     axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
                  label='95 % ellipsoid')
     for number, (name, squares) in enumerate(nees.items()):
@@ -74,5 +67,5 @@ def draw_consistency(axes: Axes, nees: Mapping[str, NDArray[np.float64]]) -> Non
 
 
 def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:
-    """Return how many of the poses lie in the ellipsoids that are to hold a share of them."""
+    """Return the share of poses within the ellipsoids that should hold a given share."""
     return float((squares < chi2.ppf(share, _FREEDOM)).mean())

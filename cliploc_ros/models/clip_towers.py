@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_checkpoint import copy_tensors, read_state_dict
+from cliploc_ros.models.clip_checkpoint import read_state_dict
 from cliploc_ros.models.clip_weights import ClipWeights
 
 if TYPE_CHECKING:
@@ -113,27 +113,30 @@ def _fill(
     weights: ClipWeights,
     device: 'torch.device',
 ) -> None:
-    """Give a tower on the meta device its weights, every one of them."""
-    wanted = {f'{tower}.{name}': tensor for name, tensor in module.state_dict().items()}
-    misfits = _misfits(wanted, {name: tensor.shape for name, tensor in state.items()
-                                if name.startswith(f'{tower}.')})
+    """Give a tower on the meta device its weights, every one of them.
+
+    The tower gets copies, not the mapped tensors: a process dies when a file that it has mapped is
+    cut short, as a copy over the old weights does.
+    """
+    found = {name.removeprefix(f'{tower}.'): tensor for name, tensor in state.items()
+             if name.startswith(f'{tower}.')}
+    misfits = [f'{tower}.{misfit}' for misfit in _misfits(module.state_dict(), found)]
     if misfits:
         more = f' (and {len(misfits) - 1} more)' if len(misfits) > 1 else ''
         raise ModelError(f'{weights.file} does not hold the weights of CLIP model '
                          f"'{weights.model}': {misfits[0]}{more}")
-    copies = copy_tensors(weights.file, state, wanted, device)
-    module.load_state_dict({name.removeprefix(f'{tower}.'): tensor
-                            for name, tensor in copies.items()}, strict=True, assign=True)
+    module.to_empty(device=device).load_state_dict(found)
     if getattr(module, 'attn_mask', None) is not None:
         module.attn_mask = module.build_causal_mask().to(device)  # type: ignore[operator]
 
 
 def _misfits(
-    wanted: 'dict[str, torch.Tensor]', found: 'dict[str, torch.Size]'
+    wanted: 'dict[str, torch.Tensor]', found: 'dict[str, torch.Tensor]'
 ) -> list[str]:
-    """Say what is not exactly as wanted among the tensors that a checkpoint has for a tower."""
-    return ([f'{name} has shape {tuple(found[name])} there and {tuple(tensor.shape)} in the model'
-             for name, tensor in wanted.items() if found.get(name, tensor.shape) != tensor.shape]
+    """List how the tensors of a checkpoint differ from those of a tower, in names and shapes."""
+    return ([f'{name} has shape {tuple(found[name].shape)} there and {tuple(tensor.shape)} in the '
+             'model' for name, tensor in wanted.items()
+             if found.get(name, tensor).shape != tensor.shape]
             + [f'{name} is missing' for name in wanted if name not in found]
             + [f'{name} is not part of the model' for name in found if name not in wanted])
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.devices import check_precision
-from cliploc_ros.models.download import announce_start, download
+from cliploc_ros.models.download import download
 from cliploc_ros.models.files import check_weights_file, fingerprint_file, resolve_cache_dir
 
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
@@ -43,8 +43,6 @@ class ClipOptions:
         Most crops in one forward pass; it bounds the memory.
     cache_dir : str
         Folder for downloads and label embeddings; '' is the user's cache.
-    download_timeout_s : float
-        Give up a download when no byte has arrived for so long [s].
 
     Raises
     ------
@@ -59,16 +57,12 @@ class ClipOptions:
     precision: str = 'auto'
     max_batch: int = 64
     cache_dir: str = ''
-    download_timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_precision(self.precision)
         if self.max_batch < 1:
             raise OptionsError(f'max_batch must be at least 1, not {self.max_batch}')
-        if not self.download_timeout_s > 0.0:
-            raise OptionsError(f'download_timeout_s must be positive, not '
-                               f'{self.download_timeout_s}')
 
 
 @dataclass(frozen=True)
@@ -169,27 +163,6 @@ def is_torchscript(file: Path) -> bool:
         return any(name.endswith('/constants.pkl') for name in archive.namelist())
 
 
-def fetch_from_hub(repository: str, names: str, folder: str) -> str:
-    """Download the first of some comma-separated files that a repository has; return the file.
-
-    Runs in the child process of `cliploc_ros.models.download`. It is what open_clip does, without
-    importing torch for it.
-    """
-    import huggingface_hub
-    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
-
-    announce_start()
-    *alternatives, last = names.split(',')
-    for name in alternatives:
-        try:
-            return huggingface_hub.hf_hub_download(repository, name, cache_dir=folder)
-        except LocalEntryNotFoundError:  # the hub was not reached: no reason to ask it again
-            raise
-        except EntryNotFoundError:
-            continue
-    return huggingface_hub.hf_hub_download(repository, last, cache_dir=folder)
-
-
 def _unknown_pretrained(model: str, options: ClipOptions) -> ModelError:
     import open_clip
 
@@ -211,20 +184,21 @@ def _weights_folder(options: ClipOptions) -> Path:
     return resolve_cache_dir(options.cache_dir) / 'weights'
 
 
-def _hub_files(tag: dict[str, Any]) -> tuple[str, list[str]]:
-    """Return the repository of a tag's weights and the names they may have there, best first."""
+def _hub_files(tag: dict[str, Any]) -> tuple[str, tuple[str, str]]:
+    """Return the repository of a tag's weights and their two possible names, safetensors first."""
     from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
 
     repository, name = os.path.split(tag.get('hf_hub', ''))
     if not name:
-        return repository, [HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME]
-    return repository, [str(Path(name).with_suffix('.safetensors')), name]
+        return repository, (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME)
+    return repository, (str(Path(name).with_suffix('.safetensors')), name)
 
 
 def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
-    """Return the file of an earlier download, here or in the hub's own cache.
+    """Return the file of an earlier download, from our folder or the hub's own cache.
 
-    To ask the hub would be to ask the network first: a robot without one would wait at each start.
+    `hf_hub_download` would ask the network first, and a robot without one would wait at each
+    start.
     """
     import huggingface_hub
 
@@ -238,14 +212,20 @@ def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
 
 
 def _download(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
-    repository, names = _hub_files(tag)
+    import huggingface_hub
+
+    repository, (newer, older) = _hub_files(tag)
+    folder = _weights_folder(options)
     what = f"the weights '{options.pretrained}' of CLIP model '{model}'"
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
                          'clip_checkpoint_path to the file')
-    remedy = (f'Without a network: download {names[0]} or {names[1]} from '
-              f'https://huggingface.co/{repository} on another machine and set '
-              'clip_checkpoint_path to the file')
-    return download('cliploc_ros.models.clip_weights:fetch_from_hub',
-                    [repository, ','.join(names)], _weights_folder(options), what, remedy,
-                    options.download_timeout_s)
+
+    def fetch() -> str:
+        # Where packets are dropped, this gives up after 10 s and hf_hub_download after 6 minutes.
+        name = newer if huggingface_hub.file_exists(repository, newer) else older
+        return str(huggingface_hub.hf_hub_download(repository, name, cache_dir=folder))
+
+    return download(what, folder, (
+        f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
+        'on another machine and set clip_checkpoint_path to the file'), fetch)

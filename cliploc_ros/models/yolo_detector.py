@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.devices import check_precision, resolve_device, resolve_precision
-from cliploc_ros.models.download import announce_start, download
+from cliploc_ros.models.download import download, first_line
 from cliploc_ros.models.files import check_weights_file, resolve_cache_dir
 from cliploc_ros.models.images import check_image_rgb
 
@@ -54,8 +54,6 @@ class YoloOptions:
         'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'.
     cache_dir : str
         Folder for downloads; '' is the user's cache.
-    download_timeout_s : float
-        Give up a download when no byte has arrived for so long [s].
 
     Raises
     ------
@@ -71,7 +69,6 @@ class YoloOptions:
     device: str = 'auto'
     precision: str = 'auto'
     cache_dir: str = ''
-    download_timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -82,9 +79,6 @@ class YoloOptions:
         for name in ('imgsz', 'max_det'):
             if getattr(self, name) < 1:
                 raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
-        if not self.download_timeout_s > 0.0:
-            raise OptionsError(f'download_timeout_s must be positive, not '
-                               f'{self.download_timeout_s}')
 
 
 class YoloDetector:
@@ -160,21 +154,6 @@ class YoloDetector:
             scores=boxes.conf.astype(np.float64))
 
 
-def fetch_yolo_weights(name: str, folder: str) -> str:
-    """Download published weights into a folder with ultralytics' own function; return the file.
-
-    Runs in the child process of `cliploc_ros.models.download`.
-    """
-    import_ultralytics()
-    from ultralytics.utils.downloads import attempt_download_asset
-
-    announce_start()
-    try:
-        return attempt_download_asset(Path(folder) / name)
-    except ConnectionError as error:
-        raise ConnectionError(_reason(error)) from error
-
-
 @cache
 def import_ultralytics() -> Any:
     """Import ultralytics so that it neither asks the network, installs, nor writes to the home."""
@@ -229,15 +208,21 @@ def _resolve_file(options: YoloOptions) -> Path:
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
-    from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
+    from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
         raise ModelError(f"'{options.model}' is neither a file here nor a published YOLO model"
                          f'{_nearest(name, GITHUB_ASSETS_NAMES)}')
-    remedy = (f'Without a network: download {name} from https://github.com/ultralytics/assets/'
-              'releases on another machine and set the model to the path of the file')
-    return download('cliploc_ros.models.yolo_detector:fetch_yolo_weights', [name], folder, name,
-                    remedy, options.download_timeout_s)
+
+    def fetch() -> Path:
+        # Ultralytics' early versions write to the final path: only a whole file is moved there.
+        with tempfile.TemporaryDirectory(dir=folder) as desk:
+            whole = attempt_download_asset(Path(desk) / name, progress=False)
+            return Path(whole).replace(folder / name)
+
+    return download(name, folder, (
+        f'Without a network: download {name} from https://github.com/ultralytics/assets/releases '
+        'on another machine and set the model to the path of the file'), fetch)
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
@@ -252,12 +237,6 @@ def _half_precision() -> dict[str, Any]:
     return {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
 
 
-def _reason(error: Exception) -> str:
-    """Return the first line of an error, without ultralytics' pictures."""
-    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
-    return lines[0].removeprefix('ERROR').strip() if lines else type(error).__name__
-
-
 def _load(file: Path) -> Any:
     """Return ultralytics' model of a file of weights."""
     ultralytics = import_ultralytics()
@@ -268,8 +247,9 @@ def _load(file: Path) -> Any:
         try:
             model = ultralytics.YOLO(neutral)
         except Exception as error:  # ultralytics raises what comes
+            reason = first_line(error).removeprefix('ERROR').strip()
             raise ModelError(f'{file} is no detection model of YOLO: '
-                             f'{_reason(error).replace(str(neutral), "it")}') from error
+                             f'{reason.replace(str(neutral), "it")}') from error
     if model.task != 'detect':
         raise ModelError(f"{file} is a YOLO model for the task '{model.task}': one for 'detect' "
                          'is needed')

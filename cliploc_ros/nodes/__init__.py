@@ -4,6 +4,6 @@
 
 import os
 
-# Two threads of OpenBLAS wait for each other by spinning: on a robot whose cores are busy, labels
-# are compared ten times as fast by one. Read when NumPy is loaded, so before any import of it.
+# OpenBLAS's threads wait for each other by spinning. Where a robot's cores are busy, one thread
+# compares labels ten times as fast as two. NumPy reads this when it is loaded.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')

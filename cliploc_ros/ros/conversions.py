@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to values and back. Nothing here trusts a message."""
+"""Conversion of messages to values and back. No field of a message is taken for valid."""
 
 import math
 from collections.abc import Mapping
@@ -20,18 +20,19 @@ from vision_msgs.msg import (
 
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.units import NS_PER_S
 
 
 def stamp_ns(stamp: Time) -> int:
     """Return a message's time stamp in nanoseconds."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | None = None
                         ) -> Detections:
     """Return the detections of a message, each with its most confident class.
 
-    A detection without any class keeps the empty name, which no landmark has.
+    A detection without a class gets the empty name, which no landmark has.
 
     Parameters
     ----------
@@ -46,8 +47,9 @@ def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | No
     boxes = [(box.center.position.x, box.center.position.y, box.center.theta, box.size_x,
               box.size_y) for box in (detection.bbox for detection in msg.detections)]
     x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
-    # a turned box stands as the upright one around it; with theta 0 the sizes stay to the bit
-    with np.errstate(invalid='ignore'):  # an infinite angle makes a box of NaN, left out later
+    # A turned box becomes the upright one around it. With theta 0 the sizes stay exactly equal. An
+    # infinite angle gives a box of NaN, which is left out later.
+    with np.errstate(invalid='ignore'):
         cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
     return Detections(
@@ -57,12 +59,12 @@ def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | No
 
 
 def _confidence(hypothesis: ObjectHypothesis) -> float:
-    """Return a score to sort by; NaN comes last."""
+    """Return the score to sort by; NaN sorts last."""
     return hypothesis.score if not math.isnan(hypothesis.score) else -math.inf
 
 
 def detections_to_msg(detections: Detections, header: Header) -> Detection2DArray:
-    """Return a message with the header of the image that the detections are of."""
+    """Return detections as a message with the header of their image."""
     msg = Detection2DArray(header=header)
     for box, class_id, score in zip(detections.bboxes_xyxy, detections.class_ids,
                                     detections.scores, strict=True):
@@ -76,24 +78,24 @@ def detections_to_msg(detections: Detections, header: Header) -> Detection2DArra
     return msg
 
 
-def pose_to_msg(map_from_frame: NDArray[np.float64]) -> Pose:
+def pose_to_msg(parent_from_child: NDArray[np.float64]) -> Pose:
     """Return a pose (4, 4) as a message."""
     pose = Pose()
-    pose.position.x, pose.position.y, pose.position.z = map(float, map_from_frame[:3, 3])
+    pose.position.x, pose.position.y, pose.position.z = map(float, parent_from_child[:3, 3])
     (pose.orientation.x, pose.orientation.y, pose.orientation.z,
-     pose.orientation.w) = map(float, quaternion_from_transform(map_from_frame))
+     pose.orientation.w) = map(float, quaternion_from_transform(parent_from_child))
     return pose
 
 
-def pose_with_covariance_msg(header: Header, map_from_frame: NDArray[np.float64],
+def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float64],
                              covariance: NDArray[np.float64]) -> PoseWithCovarianceStamped:
     """Return a pose (4, 4) and its covariance (6, 6) in ROS order as a message."""
     msg = PoseWithCovarianceStamped(header=header)
-    msg.pose.pose = pose_to_msg(map_from_frame)
+    msg.pose.pose = pose_to_msg(parent_from_child)
     msg.pose.covariance = covariance.ravel()
     return msg
 
 
 def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArray:
-    """Return poses (4, 4) as a message, in their order."""
+    """Return poses (4, 4) as a message, in the same order."""
     return PoseArray(header=header, poses=[pose_to_msg(pose) for pose in poses])

@@ -1,14 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame of messages to a relocalization: what the node keeps loaded between requests."""
+"""From a frame to a relocalization: the map and the network that stay loaded between requests."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import takewhile
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -16,6 +13,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
@@ -23,13 +21,20 @@ from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
 )
-from cliploc_ros.ros.frame_window import FrameWindow
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.odometry import CameraPlace
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.node.map_parameters import load_map
-from cliploc_ros.ros.outputs.debug_image import View
+from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
+
+
+class Localized(NamedTuple):
+    """The result of one frame, what was seen in it, and how long each stage took."""
+
+    found: Relocalization
+    seen: SeenImage
+    times: StageTimes
 
 
 class Localizer:
@@ -51,9 +56,8 @@ class Localizer:
         self.device = device
         self._map = landmark_map
         self._observer = observer
-        self._relocalizer = relocalizer
         self._options = options
-        self._window = FrameWindow()
+        self._session = Session(relocalizer)
         relocalizer.warm_up()
 
     @property
@@ -63,7 +67,7 @@ class Localizer:
 
     @property
     def map_frame(self) -> str:
-        """Return the frame that poses are given in."""
+        """Return the coordinate frame of the poses."""
         return self._map.frame_id
 
     @property
@@ -78,7 +82,7 @@ class Localizer:
         Raises
         ------
         CliplocError
-            Names what in the map is to be mended; this localizer is as it was.
+            Names what to fix in the map; this localizer stays as it was.
         """
         options = relocalizer_options(values)
         landmark_map = load_map(node, values['map_file'])
@@ -90,28 +94,21 @@ class Localizer:
                                                          landmark_map.labels))
         return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
-    def localize(self, frame: Frame, values: Mapping[str, Any],
-                 up_in_camera: NDArray[np.float64] | None = None,
-                 views: list[View] | None = None, place: CameraPlace | None = None
-                 ) -> tuple[Relocalization, StageTimes]:
-        """Find where the camera was, by a frame and those before that odometry joins to it.
+    def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState) -> Localized:
+        """Find where the camera was, with a frame and those that odometry links to it.
 
         Parameters
         ----------
         frame : Frame
         values : mapping
-            Of the relocalizer's parameters, as they are now.
-        up_in_camera : ndarray (3,) or None
-            The vertical, where it is known.
-        views : list of View or None
-            Takes what was seen, for pictures of it.
-        place : CameraPlace or None
-            Where odometry has the camera; None: the frame is asked about alone.
+            The relocalizer's parameters, as they are now.
+        state : RobotState
+            At the stamp of the frame.
 
         Raises
         ------
         CliplocError
-            Names what in the frame or in the parameters is to be mended.
+            Names what to fix in the frame or in the parameters.
         """
         times = StageTimes(frame.received_at)
         times.mark('waiting')
@@ -126,35 +123,25 @@ class Localizer:
         observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
             else self._observer.observe(image, camera, detections, stamp)
         times.mark('CLIP')
-        if views is not None:
-            views.append(View(image, observation))
-        found = self._relocalize(replace(observation, up_in_camera=up_in_camera), place, values)
+        found = self._relocalize(replace(observation, up_in_camera=state.up_in_camera),
+                                 state.place, values)
         times.mark('search')
-        return found, times
+        return Localized(found, SeenImage(image, observation), times)
 
     def _relocalize(self, observation: Observation, place: CameraPlace | None,
                     values: Mapping[str, Any]) -> Relocalization:
-        """Ask about a frame, together with those before that are still of use."""
-        relocalizer = self._with_options(values)
+        """Localize with a frame and those before it that odometry links to it."""
+        session = self._session_for(relocalizer_options(values))
         if place is None:
-            return relocalizer.relocalize([observation])
-        frames = self._window.join(
-            replace(observation, odom_from_camera=place.odom_from_camera), place.run,
-            values['fuse_frames'], values['fuse_window_s'])
-        searched = [one for one in takewhile(lambda one: one is not None,
-                                             (frame.searched for frame in frames)) if one]
-        found = relocalizer.relocalize([frame.observation for frame in frames], searched)
-        for frame, one in zip(frames, searched, strict=True):
-            frame.searched = one
-        return self._window.judge(found)
+            return session.localize(observation)
+        return session.localize(replace(observation, odom_from_camera=place.odom_from_camera),
+                                place.run, values['fuse_frames'], values['fuse_window_s'])
 
-    def _with_options(self, values: Mapping[str, Any]) -> Relocalizer:
-        """Return the relocalizer for the options as they are now."""
-        options = relocalizer_options(values)
+    def _session_for(self, options: RelocalizerOptions) -> Session:
+        """Return the session; other options begin a new one."""
         if options != self._options:
-            self._relocalizer, self._options = Relocalizer(self._map, options), options
-            self._window.forget_searches()
-        return self._relocalizer
+            self._session, self._options = Session(Relocalizer(self._map, options)), options
+        return self._session
 
 
 def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every parameter of the two nodes, and the options that their values become."""
+"""Every parameter of the two nodes, and the options made from them."""
 
 import math
 from collections.abc import Mapping
@@ -15,32 +15,36 @@ from cliploc_ros.ros.node.parameters import ParameterRow, Value
 TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 
+# Of timeout_s, for algorithms other than auto.
+_SEARCH_SHARE = 0.5
+
 _AUTOSTART = ParameterRow(
-    'autostart', True, 'Configure and activate by itself; false: a lifecycle manager does.',
+    'autostart', True, 'Configure and activate at start-up; false: wait for a lifecycle manager.',
     read_only=True)
 _STALE_AFTER = ParameterRow(
-    'stale_after_s', 2.0, 'An input that is silent for longer is warned of in the diagnostics.',
+    'stale_after_s', 2.0, 'The diagnostics warn of an input that is silent for longer.',
     unit='s', low=0.1, high=3600.0)
 _IMAGE_TRANSPORT = ParameterRow(
-    'image_transport', 'raw', "Listen to 'image' or to 'image/compressed'.",
+    'image_transport', 'raw', "Subscribe to 'image' or to 'image/compressed'.",
     choices=TRANSPORTS, read_only=True)
 _DEVICE = ParameterRow(
-    'device', 'auto', "Where the network runs: 'auto' takes a GPU if there is one, else 'cpu', "
-    "'cuda' or 'cuda:N'.", read_only=True)
+    'device', 'auto', "Where the network runs: 'auto' (a GPU if there is one), 'cpu', 'cuda' or "
+    "'cuda:N'.", read_only=True)
 _CACHE_DIR = ParameterRow(
-    'cache_dir', '', 'Where downloads and label embeddings are kept; empty: '
+    'cache_dir', '', 'Folder of downloads and label embeddings; empty: '
     '~/.cache/cliploc_ros.', read_only=True)
 
 DETECTOR = (
     ParameterRow('model', 'yolov8x.pt', 'Weights: a local file, or a name that ultralytics '
                  'downloads once.', read_only=True),
-    ParameterRow('conf', 0.1, 'Detections below this confidence are left out.',
+    ParameterRow('conf', 0.1, 'Drop detections below this confidence.',
                  low=0.0, high=1.0),
-    ParameterRow('iou', 0.7, 'Of two boxes of a class that overlap more than this, one stays.',
+    ParameterRow('iou', 0.7, 'Drop the weaker of two boxes of one class that overlap more.',
                  low=0.0, high=1.0),
-    ParameterRow('imgsz', 640, 'The longer side of the image that the network sees.',
+    ParameterRow('imgsz', 640, 'Longer side of the image as the network sees it.',
                  unit='px', low=32, high=4096),
-    ParameterRow('max_det', 100, 'The most confident detections published.', low=1, high=1000),
+    ParameterRow('max_det', 100, 'Publish only the most confident detections, this many.',
+                 low=1, high=1000),
     _DEVICE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
@@ -49,49 +53,50 @@ DETECTOR = (
 )
 
 RELOCALIZER = (
-    ParameterRow('map_file', '', "A map to load when the node is configured and by reload_map; "
-                 "empty: the map stands in the parameters below 'map'."),
-    ParameterRow('mode', 'on_request', 'When to localize: when a service is called, or '
-                 'continuously.', choices=MODES, read_only=True),
-    ParameterRow('timeout_s', 10.0, 'How long a request waits for fresh frames.', unit='s',
+    ParameterRow('map_file', '', "Map file, read when the node is configured and by reload_map; "
+                 "empty: the parameters below 'map' hold the map."),
+    ParameterRow('mode', 'on_request', 'Localize on request, or with every '
+                 'frame.', choices=MODES, read_only=True),
+    ParameterRow('timeout_s', 10.0, 'A request is answered within this time.', unit='s',
                  low=0.1, high=3600.0),
-    ParameterRow('matching', 'hybrid', 'What makes a candidate: equal classes, similarity by '
+    ParameterRow('matching', 'hybrid', 'Correspondence candidates: equal classes, similarity by '
                  'CLIP, or CLIP with classes for verification.', choices=MATCHINGS,
                  read_only=True),
-    ParameterRow('algorithm', 'auto', 'How minimal samples are chosen: auto goes through all '
-                 "that can be, the likeliest first; bf tries all; the others are the paper's.",
+    ParameterRow('algorithm', 'auto', 'How minimal samples are chosen: auto tries all '
+                 "compatible ones, the likeliest first; bf tries all; the others are the paper's.",
                  choices=ALGORITHMS),
     ParameterRow('k', 3, 'Landmarks retrieved for each crop.', low=1, high=1000),
-    ParameterRow('iterations', 10_000, 'The most minimal samples tried for a request.', low=1,
+    ParameterRow('iterations', 10_000, 'Try at most this many minimal samples per frame.', low=1,
                  high=1_000_000),
-    ParameterRow('iou_threshold', 0.2, 'Overlap above which a detection shows a landmark.',
+    ParameterRow('iou_threshold', 0.2, 'IoU above which a detection matches a landmark.',
                  low=0.0, high=1.0),
-    ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0 every search differs.'),
-    ParameterRow('time_budget_ms', 50.0, 'Search and refinement of auto take no longer; the other '
-                 'algorithms have timeout_s, and what they are cut short in is refused.',
+    ParameterRow('random_seed', 0, 'Equal seeds repeat results; below 0, every search differs.'),
+    ParameterRow('time_budget_ms', 50.0, 'Limit of search and refinement with auto. The other '
+                 'algorithms have half of timeout_s; a search that is cut short is refused.',
                  unit='ms', low=1.0, high=3.6e6),
-    ParameterRow('gravity', 'none', 'What tells the vertical: the robot stands upright on '
-                 'base_frame, or the topic imu. auto then needs two objects in place of three.',
+    ParameterRow('gravity', 'none', 'Source of the vertical: base_frame (the robot stands '
+                 'upright) or the topic imu. auto then needs two objects instead of three.',
                  choices=SOURCES, read_only=True),
     ParameterRow('vertical_deviation_deg', 1.0, 'Standard deviation of that vertical.',
                  unit='deg', low=0.01, high=45.0),
     ParameterRow('height_range_m', [0.0, 0.0], 'Least and greatest height of the camera in the '
-                 'map; equal: any.', unit='m'),
-    ParameterRow('max_tilt_deg', 180.0, 'How far the camera may be tipped off upright; 180: any '
-                 'way.', unit='deg', low=0.0, high=180.0),
-    ParameterRow('refine', True, 'Improve the best poses on all of their inliers; the paper does '
+                 'map; equal values: any height.', unit='m'),
+    ParameterRow('max_tilt_deg', 180.0, 'Greatest tilt of the camera off upright; 180: '
+                 'any.', unit='deg', low=0.0, high=180.0),
+    ParameterRow('refine', True, 'Refine the best poses on all of their inliers; the paper does '
                  'not.'),
-    ParameterRow('min_inliers', 3, 'A pose that explains fewer objects is refused.', low=3,
+    ParameterRow('min_inliers', 3, 'Refuse a pose with fewer inliers.', low=3,
                  high=1000),
-    ParameterRow('min_confidence', 0.99, 'A pose that is within 1 m with less probability is '
-                 'refused.', low=0.0, high=1.0),
-    ParameterRow('fuse_frames', 5, 'The most frames that are asked about together where odom '
-                 'joins them; 1: each alone.', low=1, high=MAX_FRAMES),
-    ParameterRow('fuse_window_s', 5.0, 'Older frames are not asked about any more.', unit='s',
+    ParameterRow('min_confidence', 0.99, 'Refuse a pose that is less likely to be within 1 m of '
+                 'the truth.', low=0.0, high=1.0),
+    ParameterRow('fuse_frames', 5, 'Localize with up to this many frames together where odom '
+                 'links them; 1: each frame alone.', low=1, high=MAX_FRAMES),
+    ParameterRow('fuse_window_s', 5.0, 'Drop frames older than this from fusion.', unit='s',
                  low=0.1, high=60.0),
     ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
                  "'tvmonitor=tv, pottedplant=potted plant'."),
-    ParameterRow('max_detections', 50, 'The most confident detections used.', low=3, high=1000),
+    ParameterRow('max_detections', 50, 'Use only the most confident detections, this many.',
+                 low=3, high=1000),
     ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config '
                  '(.json).', read_only=True),
     ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
@@ -103,24 +108,26 @@ RELOCALIZER = (
     _IMAGE_TRANSPORT,
     _AUTOSTART,
     _STALE_AFTER,
-    ParameterRow('rectified', False, 'The image is rectified: take P of camera_info and no '
+    ParameterRow('rectified', False, 'The image is rectified: use P of camera_info and no '
                  'distortion.'),
-    ParameterRow('base_frame', '', "Publish the pose of this frame; empty: the camera's."),
+    ParameterRow('base_frame', '', 'Coordinate frame to publish the pose of; empty: the camera.'),
     ParameterRow('base_from_camera', [0.0] * 7, 'Mount of the camera on base_frame: x, y, z [m] '
                  'and quaternion x, y, z, w; all zeros: ask tf2.', unit='m'),
-    ParameterRow('max_speed_m_s', 0.1, 'No initialpose is published while odom tells of a faster '
+    ParameterRow('max_speed_m_s', 0.1, 'Withhold initialpose while odom shows a faster '
                  'robot.', unit='m/s', low=0.0, high=100.0),
-    ParameterRow('max_turn_rad_s', 0.2, 'No initialpose is published while odom tells of a faster '
+    ParameterRow('max_turn_rad_s', 0.2, 'Withhold initialpose while odom shows a faster '
                  'turn.', unit='rad/s', low=0.0, high=100.0),
-    ParameterRow('nomotion_updates', 5, 'How often request_nomotion_update is called after an '
-                 'initialpose, where AMCL serves it, so that a standing robot converges.',
+    ParameterRow('nomotion_updates', 10, 'Call request_nomotion_update this often after '
+                 "initialpose, where it is served, so that AMCL's particles converge.",
                  low=0, high=100),
-    ParameterRow('publish_tf', False, 'Broadcast the transform from odom_frame to the map (REP '
-                 '105) after each accepted pose; only if no other localizer does.',
+    ParameterRow('require_localizer', True, 'A request succeeds only if a localizer such as AMCL '
+                 'subscribes to initialpose; false: without one, for ~/pose or publish_tf.'),
+    ParameterRow('publish_tf', False, 'Broadcast map -> odom_frame (REP 105) after an accepted '
+                 'pose; only where no other localizer does.',
                  read_only=True),
-    ParameterRow('odom_frame', 'odom', 'What publish_tf ties to the map.'),
-    ParameterRow('tf_timeout_s', 0.5, "How long to wait for tf2 at the image's stamp.", unit='s',
-                 low=0.0, high=60.0),
+    ParameterRow('odom_frame', 'odom', 'Coordinate frame of odometry, for publish_tf.'),
+    ParameterRow('tf_timeout_s', 0.5, "Wait this long for a transform at the image's stamp.",
+                 unit='s', low=0.0, high=60.0),
 )
 
 
@@ -130,7 +137,7 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     Raises
     ------
     OptionsError
-        Names the option and what it allows.
+        Names the parameter and its allowed values.
     """
     names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s'}
     _check_mount(values['base_from_camera'])
@@ -142,8 +149,10 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
     given: dict[str, Any] = {name: values[name] for name in names}
     budget_ms, timeout_s = values['time_budget_ms'], values['timeout_s']
     assert isinstance(budget_ms, float) and isinstance(timeout_s, float)
-    # what the paper's algorithms are cut short in is refused: they get what a request may take
-    given['time_budget_s'] = budget_ms / 1e3 if values['algorithm'] == 'auto' else timeout_s
+    # A search of the paper's algorithms that is cut short is refused, so they get more time; the
+    # rest of the request waits for frames, runs the networks and hands over.
+    given['time_budget_s'] = budget_ms / 1e3 if values['algorithm'] == 'auto' \
+        else _SEARCH_SHARE * timeout_s
     given['height_range_m'] = _height_range(values['height_range_m'])
     return RelocalizerOptions(**given)
 
@@ -154,7 +163,7 @@ def parse_class_map(text: str) -> dict[str, str]:
     Raises
     ------
     OptionsError
-        A pair is none, or a name stands twice.
+        A pair has not the form theirs=ours, or a name occurs twice.
     """
     found: dict[str, str] = {}
     for pair in filter(None, map(str.strip, text.split(','))):
@@ -162,7 +171,7 @@ def parse_class_map(text: str) -> dict[str, str]:
         if not (theirs and sign and ours):
             raise OptionsError(f"class_map: '{pair}' is not of the form theirs=ours")
         if theirs in found:
-            raise OptionsError(f"class_map: '{theirs}' stands twice")
+            raise OptionsError(f"class_map: '{theirs}' occurs twice")
         found[theirs] = ours
     return found
 

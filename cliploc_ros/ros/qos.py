@@ -1,34 +1,34 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service by name. All can be overridden by ``qos_overrides`` parameters."""
+"""Quality of service by name. Parameters ``qos_overrides`` override each of them."""
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 
 # Inputs are best effort unless all their publishers are reliable, see AdaptiveSubscription.
-# Of images the newest is the one that counts.
+# Only the newest image counts.
 IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
                    reliability=ReliabilityPolicy.BEST_EFFORT,
                    durability=DurabilityPolicy.VOLATILE)
-# Small messages that must not be lost to a burst: they are paired with images by stamp.
+# Small messages, paired with images by stamp: a burst must not displace them.
 CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                          reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_IN = CAMERA_INFO
-# A burst of the fastest usual IMU while something else is called back.
+# What the fastest usual IMU sends while another callback runs.
 IMU = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                  reliability=ReliabilityPolicy.BEST_EFFORT)
-# The same of the fastest usual odometry.
+# The same for odometry.
 ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                   reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                             reliability=ReliabilityPolicy.RELIABLE)
 POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                   reliability=ReliabilityPolicy.RELIABLE)
-# What late listeners are to get, too.
+# For late subscribers, too.
 LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
                      reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Requests are answered one after another; so many may wait.
+# Requests are answered one after another; this many may wait.
 SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                      reliability=ReliabilityPolicy.RELIABLE)
 
@@ -38,6 +38,6 @@ _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIAB
 
 
 def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
-    """Return the options that let a user override all policies but some."""
+    """Return the options that let a user override all policies except some."""
     return QoSOverridingOptions(
         policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])

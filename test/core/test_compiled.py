@@ -3,6 +3,7 @@
 """The compiled kernels' cache on disk may be damaged; the search still works."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -11,21 +12,17 @@ import numpy as np
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
-# A few kernels of one module, which are compiled within a second.
+# A few kernels of one module, which are compiled within a second; then one that calls them.
 FEW = """
 from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 warm_up(lambda: unit_circle_overlap(0.1, 0.2, 1.0, 2.0))
 print('warm')
 """
-ALL = """
-import numpy as np
-from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalizer
-room = LandmarkMap('map', ('a',) * 3, ('a',) * 3, ('a',) * 3, np.zeros((3, 3)), np.ones((3, 3)),
-                   np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
-Relocalizer(room, RelocalizerOptions(k=1)).warm_up()
+CALLER = """
+from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.geometry.ellipse import ellipse_iou
+warm_up(lambda: ellipse_iou(0.0, 0.0, 1.0, 2.0, 0.1, 0.2, 1.0, 0.0, 1.0))
 print('warm')
 """
 
@@ -37,7 +34,7 @@ def run(code, folder):
                           env=os.environ | {'NUMBA_CACHE_DIR': str(folder)})
 
 
-@pytest.mark.parametrize(('ending', 'size', 'code'), [('nbi', 0, FEW), ('nbc', 100, ALL)])
+@pytest.mark.parametrize(('ending', 'size', 'code'), [('nbi', 0, FEW), ('nbc', 100, CALLER)])
 def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
     assert run(FEW, tmp_path).stdout == 'warm\n'
     files = list(tmp_path.rglob(f'*.{ending}'))
@@ -49,6 +46,20 @@ def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
     assert 'compiling them again' in done.stderr
     # and is whole again
     assert 'compiling them again' not in run(code, tmp_path).stderr
+
+
+def test_a_cache_of_another_version_is_replaced(tmp_path):
+    """After an upgrade, the index of a kernel may name a module that is gone."""
+    assert run(FEW, tmp_path).stdout == 'warm\n'
+    for file in tmp_path.rglob('*.nbi'):
+        with file.open('rb') as index:
+            pickle.load(index)  # numba's version
+            end = index.tell()
+        file.write_bytes(file.read_bytes()[:end] + b'ccliploc_ros.core.gone\nThing\n.')
+    done = run(FEW, tmp_path)
+    assert done.stdout == 'warm\n', done.stderr
+    assert 'compiling them again' in done.stderr
+    assert 'compiling them again' not in run(FEW, tmp_path).stderr
 
 
 FULL_DISK = """

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from cliploc_ros.demo import train_clip
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
+from demo_world import train_clip
 
 
 def test_equal_labels_are_all_right_answers():

@@ -6,10 +6,10 @@ import re
 
 import numpy as np
 
-from cliploc_ros.demo import train_detector
-from cliploc_ros.demo.world.appearance import CLASSES
-from cliploc_ros.demo.world.reading import read_frames
+from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from demo_world import train_detector
+from demo_world.appearance import CLASSES
 
 
 def test_labels_are_parts_of_the_image(worlds, tmp_path):

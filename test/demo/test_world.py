@@ -18,13 +18,14 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.demo.world.appearance import CLASSES, COLORS, Appearance, draw_appearance
-from cliploc_ros.demo.world.reading import find_worlds, hold_out, read_frames
-from cliploc_ros.demo.world.recording import find_boxes, record, write_fitted_map, write_true_map
-from cliploc_ros.demo.world.renderer import Light, Renderer
-from cliploc_ros.demo.world.room import make_room, move_objects
-from cliploc_ros.demo.world.trajectories import CAMERA, draw_views, mapping_walk, query_walk
+from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.errors import DatasetError
+from demo_world.appearance import CLASSES, COLORS, Appearance, draw_appearance
+from demo_world.recording import find_boxes, record, write_fitted_map, write_true_map
+from demo_world.renderer import Light, Renderer
+from demo_world.room import make_room, move_objects
+from demo_world.trajectories import CAMERA, draw_views, mapping_walk, query_walk
+from demo_world.worlds import find_worlds, hold_out
 
 
 @pytest.fixture(scope='module')

@@ -144,7 +144,7 @@ def test_unknown_name():
 
 @pytest.mark.parametrize('change', [
     {'conf': 1.5}, {'iou': -0.1}, {'imgsz': 0}, {'max_det': 0}, {'precision': 'int8'},
-    {'conf': float('nan')}, {'download_timeout_s': 0.0}])
+    {'conf': float('nan')}])
 def test_options_out_of_range(change):
     with pytest.raises(OptionsError, match=next(iter(change))):
         YoloOptions(**change)

@@ -112,7 +112,7 @@ def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
 @pytest.mark.parametrize(('name', 'value', 'reason'), [
     ('algorithm', 'luck', 'is none of auto, bf, ransac'),
     ('algorithm', 'b-prosc', "did you mean 'b-prosac'"),
-    ('algorithm', 'prosac', "which matching 'class' has none of"),
+    ('algorithm', 'prosac', "matching 'class' has none"),
     ('iterations', 0, 'out of range'),
     ('iterations', 'many', 'Wrong parameter type'),
     ('iou_threshold', NAN, 'out of range'),

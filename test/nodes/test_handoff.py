@@ -47,14 +47,15 @@ def odom(tester):
         return future.result()
     yield feed
     tester.destroy_publisher(publisher)
-    tester.wait(lambda: not tester.count_subscribers('/odom'), 'what was heard to be forgotten')
+    ended_s = time.monotonic()
+    tester.wait(lambda: time.monotonic() > ended_s + 2.0, 'what was heard to be too old')
 
 
 def test_a_standing_robot_settles_before_the_answer(relocalizer, tester, updates, odom):
     tester.wait(lambda: tester.count_clients('/request_nomotion_update') == 1, 'the client')
     answer = odom(make_frame(), drive=0.0)
     assert answer.success
-    assert len(updates) == 5
+    assert len(updates) == 10, relocalizer.output()
     gaps_s = [later[0] - earlier[0] for earlier, later in pairwise(updates)]
     assert min(gaps_s) > 0.1, 'a scan lies between them'
     assert len(tester.initial_poses) == 1
@@ -84,7 +85,7 @@ def test_without_amcl_and_odometry_the_answer_comes_at_once(relocalizer, tester)
     answer = tester.relocalize(make_frame())
     assert answer.success
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    assert 'nobody publishes /odom: the robot is taken to stand' in relocalizer.output()
+    assert 'nobody publishes /odom: the robot is taken to rest' in relocalizer.output()
 
 
 def test_an_image_from_the_future_gives_no_pose_from_there(relocalizer, tester):

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for.
-
-Runs where tf2_ros is installed; elsewhere its absence is what is named.
-"""
-
-import importlib.util
+"""A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for."""
 
 import numpy as np
 import pytest
@@ -18,7 +13,7 @@ from std_msgs.msg import Header
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
 from cliploc_ros.ros.outputs.map_to_odom import transform_msg
 
-HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
+pytestmark = pytest.mark.needs('tf2_ros')
 
 
 def base_from_camera(height_m):
@@ -29,9 +24,6 @@ def base_from_camera(height_m):
 @pytest.fixture
 def lift(tester):
     """Tell tf2 how high the camera was: heights [m] by time [s]."""
-    if not HAS_TF2:
-        yield None
-        return
     from tf2_msgs.msg import TFMessage
     publisher = tester.create_publisher(TFMessage, '/tf', 100)
 
@@ -48,11 +40,6 @@ def lift(tester):
 
 def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift):
     process = own_relocalizer(expect='', base_frame='base_link', tf_timeout_s=0.5)
-    if not HAS_TF2:
-        print('\ntf2_ros is not installed here: moving cameras were not run')
-        process.wait_for_output('tf2_ros is not installed')
-        assert 'or set base_from_camera' in tester.answer(tester.ask()).message
-        return
     frame = make_frame(stamp_s=100.5)
     future = tester.ask()
 
@@ -73,10 +60,7 @@ def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift)
 
 
 def test_an_inactive_relocalizer_hears_no_transforms(own_relocalizer, tester):
-    process = own_relocalizer(expect='', base_frame='base_link')
-    if not HAS_TF2:
-        process.wait_for_output('tf2_ros is not installed')
-        return
+    own_relocalizer(expect='', base_frame='base_link')
     tester.wait(lambda: tester.count_subscribers('/tf') == 1, 'it to listen')
     request = ChangeState.Request(
         transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
@@ -85,11 +69,8 @@ def test_an_inactive_relocalizer_hears_no_transforms(own_relocalizer, tester):
 
 
 def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester):
-    process = own_relocalizer(expect='', base_frame='base_link', publish_tf=True,
-                              base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
-    if not HAS_TF2:
-        process.wait_for_output('tf2_ros is not installed')
-        return
+    own_relocalizer(expect='', base_frame='base_link', publish_tf=True,
+                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
     from tf2_msgs.msg import TFMessage
     odom_from_base = transform_from_pose(np.array([5.0, 0.0, 0.0]), np.array([0, 0, 0.6, 0.8]))
     publisher, heard = tester.create_publisher(TFMessage, '/tf', 100), []

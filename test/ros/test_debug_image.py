@@ -10,7 +10,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.ros.outputs.debug_image import View, draw_view
+from cliploc_ros.ros.outputs.debug_image import SeenImage, draw_debug_image
 
 BOX, ELLIPSE, UNMATCHED = (86, 180, 233), (230, 159, 0), (255, 255, 255)
 
@@ -28,9 +28,9 @@ def found(room):
     return found
 
 
-def grey_view(room, **fields):
+def grey_image(room, **fields):
     image = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
-    return View(image, replace(Observation(CAMERA, see_room(room)), **fields))
+    return SeenImage(image, replace(Observation(CAMERA, see_room(room)), **fields))
 
 
 def pixels_of(canvas, color):
@@ -38,10 +38,10 @@ def pixels_of(canvas, color):
 
 
 def test_boxes_and_outlines_are_where_they_were_seen(room, found):
-    view = grey_view(room)
-    canvas = draw_view(view, found, room, 'accepted')
-    assert (view.image_rgb == 128).all(), 'the image itself stays'
-    box = view.observation.detections.bboxes_xyxy[0]
+    seen = grey_image(room)
+    canvas = draw_debug_image(seen, found, room, 'accepted')
+    assert (seen.image_rgb == 128).all(), 'the image itself stays'
+    box = seen.observation.detections.bboxes_xyxy[0]
     middle = (box[:2] + box[2:]) / 2
     outline = pixels_of(canvas, ELLIPSE)
     inside = outline[(np.abs(outline - middle) <= (box[2:] - box[:2]) / 2 + 3).all(axis=1)]
@@ -53,30 +53,31 @@ def test_boxes_and_outlines_are_where_they_were_seen(room, found):
 
 
 def test_what_is_not_matched_is_white(room, found):
-    canvas = draw_view(grey_view(room), replace(found, matches=found.matches[:1]), room, '')
+    canvas = draw_debug_image(grey_image(room), replace(found, matches=found.matches[:1]), room,
+                              '')
     assert len(pixels_of(canvas, UNMATCHED)) > 100
 
 
 @pytest.mark.parametrize('similarities', [None, np.full((12, 12), 0.3, np.float32)])
 def test_nothing_found_is_drawn_too(room, similarities):
-    view = grey_view(room, similarities=similarities)
+    seen = grey_image(room, similarities=similarities)
     verdict = 'refused: ' + 50 * 'nothing at all ' + 'ellipsoïde'
-    canvas = draw_view(view, Relocalization(False, 'nothing'), room, verdict)
+    canvas = draw_debug_image(seen, Relocalization(False, 'nothing'), room, verdict)
     assert len(pixels_of(canvas, (213, 94, 0))) > 500, 'the verdict is red'
 
 
 def test_similarities_are_written(room, found):
-    blind, seeing = (draw_view(grey_view(room, similarities=similarities), found, room, '')
+    blind, seeing = (draw_debug_image(grey_image(room, similarities=similarities), found, room, '')
                      for similarities in (None, np.full((12, 12), 0.3, np.float32)))
     assert len(pixels_of(seeing, BOX)) > len(pixels_of(blind, BOX)) + 100
 
 
 def test_boxes_beyond_all_measure_do_no_harm(room, found):
-    view = grey_view(room)
-    boxes = view.observation.detections.bboxes_xyxy.copy()
+    seen = grey_image(room)
+    boxes = seen.observation.detections.bboxes_xyxy.copy()
     boxes[:, 2:] = 1e300
-    detections = replace(view.observation.detections, bboxes_xyxy=boxes)
-    draw_view(View(view.image_rgb, replace(view.observation, detections=detections)), found,
-              room, 'x')
-    small = View(np.zeros((1, 1, 3), np.uint8), view.observation)
-    assert draw_view(small, found, room, 'accepted: ' + 99 * 'x').shape == (1, 1, 3)
+    detections = replace(seen.observation.detections, bboxes_xyxy=boxes)
+    huge = replace(seen.observation, detections=detections)
+    draw_debug_image(SeenImage(seen.image_rgb, huge), found, room, 'x')
+    small = SeenImage(np.zeros((1, 1, 3), np.uint8), seen.observation)
+    assert draw_debug_image(small, found, room, 'accepted: ' + 99 * 'x').shape == (1, 1, 3)

@@ -13,6 +13,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
 
@@ -43,8 +44,13 @@ def localizer(make_node, values):
     return load_localizer(make_node(), values)
 
 
+def localize(localizer, frame, values, up_in_camera=None):
+    return localizer.localize(frame, values, RobotState(np.eye(4), up_in_camera)).found
+
+
 def test_a_perfect_view_gives_the_true_pose(localizer, values):
-    found, times = localizer.localize(make_frame(), values)
+    found, view, times = localizer.localize(make_frame(), values, RobotState(np.eye(4)))
+    assert view.image_rgb.shape == (CAMERA.height, CAMERA.width, 3)
     distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
     assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
     stages = [stage.split()[0] for stage in str(times).split(', ')]
@@ -56,37 +62,37 @@ def test_a_perfect_view_gives_the_true_pose(localizer, values):
 def test_a_rectified_image_is_measured_with_p(localizer, values):
     useless = {'k': [0.0] * 9, 'distortion_model': 'plumb_bob', 'd': [0.5] * 5}
     with pytest.raises(CameraError, match='camera_info: K'):
-        localizer.localize(make_frame(**useless), values)
-    found, _ = localizer.localize(make_frame(**useless), values | {'rectified': True})
+        localize(localizer, make_frame(**useless), values)
+    found = localize(localizer, make_frame(**useless), values | {'rectified': True})
     assert pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):
-    assert localizer.localize(make_frame(), values)[0].accepted
-    assert not localizer.localize(make_frame(), values | {'min_confidence': 1.0})[0].accepted
-    found, _ = localizer.localize(make_frame(), values | {'algorithm': 'ransac'})
+    assert localize(localizer, make_frame(), values).accepted
+    assert not localize(localizer, make_frame(), values | {'min_confidence': 1.0}).accepted
+    found = localize(localizer, make_frame(), values | {'algorithm': 'ransac'})
     assert found.accepted and localizer.description.endswith('class_ransac')
 
 
 def test_more_detections_than_allowed_are_not_searched(localizer, values):
-    assert not localizer.localize(make_frame(), values | {'max_detections': 3})[0].accepted
+    assert not localize(localizer, make_frame(), values | {'max_detections': 3}).accepted
 
 
 def test_nothing_seen_is_no_pose_and_no_error(localizer, values):
     nothing = see_room(make_room()).select(np.array([], dtype=np.int64))
-    found, _ = localizer.localize(make_frame(detections=nothing), values)
+    found = localize(localizer, make_frame(detections=nothing), values)
     assert not found.accepted and found.hypotheses == () and found.reason
 
 
 def test_a_bad_image_is_named(localizer, values):
     with pytest.raises(ImageError, match="encoding 'yuv422'"):
-        localizer.localize(make_frame(encoding='yuv422'), values)
+        localize(localizer, make_frame(encoding='yuv422'), values)
 
 
 @pytest.mark.parametrize(('changes', 'error', 'message'), [
     ({'map_file': ''}, MapError, 'no map: set map_file'),
     ({'map_file': '/nowhere/room.yaml'}, MapError, '/nowhere/room.yaml'),
-    ({'algorithm': 'b-prosac'}, OptionsError, 'orders candidates by similarity'),
+    ({'algorithm': 'b-prosac'}, OptionsError, 'needs similarities'),
     ({'base_from_camera': [1.0] * 7}, OptionsError, 'base_from_camera')])
 def test_a_bad_start_is_named(make_node, values, changes, error, message):
     with pytest.raises(error, match=message):
@@ -96,15 +102,15 @@ def test_a_bad_start_is_named(make_node, values, changes, error, message):
 def test_heights_and_verticals_reach_the_search(localizer, values):
     values = values | {'algorithm': 'auto'}
     height = MAP_FROM_CAMERA[2, 3]
-    blind, _ = localizer.localize(make_frame(), values)
-    upright, _ = localizer.localize(make_frame(), values, MAP_FROM_CAMERA[2, :3])
+    blind = localize(localizer, make_frame(), values)
+    upright = localize(localizer, make_frame(), values, MAP_FROM_CAMERA[2, :3])
     assert blind.accepted and upright.accepted
     # tilts are what a vertical makes sure
     assert np.trace(upright.covariance[3:5, 3:5]) < np.trace(blind.covariance[3:5, 3:5])
-    askew, _ = localizer.localize(make_frame(), values, -MAP_FROM_CAMERA[2, :3])
+    askew = localize(localizer, make_frame(), values, -MAP_FROM_CAMERA[2, :3])
     assert not askew.accepted
     values['height_range_m'] = [height + 5.0, height + 6.0]
-    outside, _ = localizer.localize(make_frame(), values)
+    outside = localize(localizer, make_frame(), values)
     assert not outside.accepted
 
 
@@ -114,4 +120,4 @@ def test_heights_and_verticals_reach_the_search(localizer, values):
 ])
 def test_values_that_do_not_fit_together_are_named(localizer, values, changes, named):
     with pytest.raises(OptionsError, match=named):
-        localizer.localize(make_frame(), values | changes)
+        localize(localizer, make_frame(), values | changes)

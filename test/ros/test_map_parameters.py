@@ -6,7 +6,7 @@ import yaml
 from scene import make_room, write_map
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.node.map_parameters import load_map
+from cliploc_ros.ros.map_parameters import load_map
 
 CUP = {'label': 'a red cup', 'class_id': 'cup', 'center': [1.0, 2.0, 3.0],
        'semi_axes': [0.1, 0.2, 0.3], 'orientation': [0.0, 0.0, 0.0, 1.0]}
@@ -61,7 +61,7 @@ def test_whole_numbers_are_numbers(load):
 
 
 def test_a_node_without_any_map_says_what_to_do(make_node):
-    with pytest.raises(MapError, match=r'set map_file, or give .* with --params-file'):
+    with pytest.raises(MapError, match=r'set map_file, or load a map with --params-file'):
         load_map(make_node(), '')
 
 
@@ -101,5 +101,5 @@ def test_a_value_beside_its_own_fields_is_named(make_node):
     node = make_node()
     node.declare_parameter('map.frame_id', 'map')
     node.declare_parameter('map.frame_id.name', 'map')
-    with pytest.raises(MapError, match="'frame_id' is a value and holds fields"):
+    with pytest.raises(MapError, match="'frame_id' has both a value and fields"):
         load_map(node, '')

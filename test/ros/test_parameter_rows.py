@@ -183,7 +183,7 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'matching': 'class', 'algorithm': 'b-prosac'},
-     "algorithm 'b-prosac' orders candidates by similarity"),
+     "algorithm 'b-prosac' needs similarities"),
     ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera: .* not of unit length'),
     ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera: .* not of unit length')])
 def test_values_that_do_not_fit_together(changes, message):

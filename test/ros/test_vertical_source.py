@@ -12,7 +12,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource, sample_from_msg
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
@@ -38,7 +38,7 @@ def values(gravity='imu', base_frame='base_link'):
 @pytest.fixture
 def source(make_node):
     node = make_node()
-    return VerticalSource(node, BaseFrame(node))
+    return VerticalSource(node, CoordinateFrames(node))
 
 
 def up(source, **changes):
@@ -60,11 +60,83 @@ def test_an_accelerometer_at_rest_points_up(source):
     np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
 
 
-def test_an_orientation_counts_more_than_an_acceleration(source):
-    tilt = Rotation.from_euler('xyz', [5.0, -8.0, 30.0], degrees=True)
-    source.take(imu((3.0, 0.0, 9.0), tilt.as_quat()))
-    expected = CAMERA_FROM_BASE[:3, :3] @ tilt.inv().apply([0, 0, 1])
-    np.testing.assert_allclose(up(source), expected, atol=1e-12)
+TILT = Rotation.from_euler('xyz', [5.0, -8.0, 30.0], degrees=True)
+GRAVITY = tuple(9.81 * TILT.inv().apply([0, 0, 1]))
+TILTED_UP = CAMERA_FROM_BASE[:3, :3] @ TILT.inv().apply([0, 0, 1])
+
+
+@pytest.mark.parametrize('acceleration', [
+    GRAVITY,
+    (3.0, 0.0, 11.0),  # of a robot that moves
+    (0.0, 0.0, 0.0),  # not filled
+    (GRAVITY[0] + 0.5, *GRAVITY[1:]),  # 3 degrees off: a cheap accelerometer
+])
+def test_an_orientation_counts_more_than_an_acceleration(source, acceleration):
+    source.take(imu(acceleration, TILT.as_quat()))
+    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
+
+
+def test_an_orientation_without_an_acceleration_counts(source):
+    msg = imu(quat_xyzw=TILT.as_quat())
+    msg.linear_acceleration_covariance = NOT_MEASURED
+    source.take(msg)
+    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
+
+
+def test_a_default_orientation_is_none(source):
+    """rclcpp, rclpy and every driver that fills the acceleration alone send w = 1."""
+    source.take(imu(GRAVITY, (0, 0, 0, 1)))
+    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
+
+
+def test_a_default_message_says_nothing(source):
+    source.take(imu((0.0, 0.0, 0.0), (0, 0, 0, 1)))
+    with pytest.raises(NoVerticalError, match='/imu has neither an orientation nor an acc'):
+        up(source)
+
+
+def test_an_upright_robot_has_its_vertical_by_either(source):
+    """A simulator without noise: no rotation, and a covariance of zeros or of its own."""
+    for covariance in (0.0, 1e-6):
+        source.forget()
+        msg = imu((0.0, 0.0, 9.81), (0, 0, 0, 1))
+        msg.orientation_covariance[0] = covariance
+        source.take(msg)
+        np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(('quat_xyzw', 'acceleration', 'named'), [
+    ((0, 0, 0, 1), GRAVITY, '9 degrees off gravity'),  # a constant one, with a covariance
+    ((1, 0, 0, 0), (0.0, 0.0, 9.81), '180 degrees off gravity'),  # NED in place of ENU
+    ((0, 0, 0, 1), (9.81, 0.0, 0.0), '90 degrees off gravity'),  # mounted on its side
+])
+def test_an_orientation_that_contradicts_gravity_is_refused(source, quat_xyzw, acceleration,
+                                                            named):
+    msg = imu(acceleration, quat_xyzw)
+    msg.orientation_covariance[0] = 1e-4
+    source.take(msg)
+    with pytest.raises(NoVerticalError, match=f'^the orientation of /imu is {named}.*set '
+                                              r'orientation_covariance\[0\] to -1$'):
+        up(source)
+
+
+def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
+    """It was seen to be wrong at rest; now the accelerometer cannot show it."""
+    wrong = Rotation.from_euler('y', 60, degrees=True).as_quat()
+    for number in range(20):
+        acceleration = (0.0, 0.0, 9.81) if number < 15 else (4.0, 0.0, 9.81)
+        source.take(imu(acceleration, wrong, seconds=48.1 + 0.1 * number))
+    with pytest.raises(NoVerticalError, match='60 degrees off gravity'):
+        up(source)
+
+
+def test_a_right_orientation_is_kept_when_the_robot_starts(source):
+    """2 m/s^2 for a moment: 11 degrees off, but no farther from gravity than noise."""
+    for number in range(20):
+        start = 2.0 if number > 15 else 0.0
+        source.take(imu((GRAVITY[0] + start, *GRAVITY[1:]), TILT.as_quat(),
+                        seconds=48.1 + 0.1 * number))
+    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
 
 
 def test_an_imu_in_the_camera_needs_no_transform(source):
@@ -79,13 +151,17 @@ def test_an_imu_that_nobody_places_is_an_error(source):
 
 
 @pytest.mark.parametrize(('messages', 'named'), [
-    ([], 'no usable message of /imu'),
+    ([], 'no message of /imu is within 100 ms'),
     ([imu(seconds=51.0)], 'within 100 ms'),
     ([imu(frame_id='')], 'no frame_id'),
-    ([imu((0.0, 0.0, 11.0))], 'being moved: it measures 11.00'),
-    ([imu((0.0, 0.0, 0.0))], 'being moved'),
-    ([imu((float('nan'), 0.0, 9.81))], 'no usable message'),
-    ([imu(seconds=50.0), imu(seconds=10.0)], 'no usable message'),  # time jumped back
+    ([imu((0.0, 0.0, 11.0))], r'the IMU is moving: it measures 11\.00 m/s\^2'),
+    ([imu((0.0, 0.0, 1.0))], r'measures 1\.00'),  # in units of gravity
+    ([imu((0.0, 0.0, 0.0))], 'neither an orientation nor an acceleration'),
+    ([imu((float('nan'), 0.0, 9.81))], 'neither an orientation nor an acceleration'),
+    ([imu(quat_xyzw=Rotation.from_euler('y', angle, degrees=True).as_quat(), seconds=seconds,
+          acceleration=(0.0, 0.0, 0.0)) for angle, seconds in ((-40, 49.95), (40, 50.05))],
+     'turns too fast'),
+    ([imu(seconds=50.0), imu(seconds=10.0)], 'no message of /imu is within'),  # a jump
 ])
 def test_what_is_not_known_is_said(source, messages, named):
     for msg in messages:
@@ -98,16 +174,21 @@ def test_fields_that_are_not_measured_say_nothing():
     msg = imu()
     msg.linear_acceleration_covariance = NOT_MEASURED
     assert sample_from_msg(msg) is None
-    assert sample_from_msg(imu(quat_xyzw=(0, 0, 0, 0))).is_acceleration  # no quaternion at all
+    for quat_xyzw in ((0, 0, 0, 0), (0, 0, 0, 2), (float('nan'), 0, 0, 1)):
+        assert sample_from_msg(imu(quat_xyzw=quat_xyzw)).up is None
 
 
-def test_it_listens_only_while_it_is_asked(source, make_node, spin_until):
+def test_it_listens_from_open_to_close(source, make_node, spin_until):
     talker = make_node('imu_driver')
     publisher = talker.create_publisher(Imu, 'imu', 10)
-    with source.listening('base_frame'):
-        assert source._subscription is None
-    with source.listening('imu'), source.listening('imu'):
-        spin_until([talker, source._node], lambda: len(source._samples),
-                   'a message', work=lambda: publisher.publish(imu()))
-        np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
+    source.open('base_frame')
+    assert source._subscription is None
+    for _ in range(2):  # opened twice, closed twice: it is all the same
+        source.open('imu')
+    spin_until([talker, source._node], lambda: len(source._samples),
+               'a message', work=lambda: publisher.publish(imu()))
+    np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
+    assert publisher.get_subscription_count() == 1
+    for _ in range(2):
+        source.close()
     assert source._subscription is None and not source._samples

@@ -32,7 +32,7 @@ def test_what_nobody_looks_at_is_not_computed(visualization):
     shown.set_map(ROOM)
     # there is nothing to compute it from
     shown.show(HEADER, None, None, None)
-    assert not shown.wants_view
+    assert not shown.wants_debug_image
 
 
 @pytest.mark.parametrize(('topic', 'message_type'), [
@@ -47,12 +47,12 @@ def test_each_is_made_for_itself(visualization, make_node, spin_until, topic, me
     found = Relocalizer(ROOM, RelocalizerOptions(matching='class', algorithm='bf')).relocalize(
         [Observation(CAMERA, see_room(ROOM))])
     if topic == 'debug_image':
-        spin_until([node, viewer], lambda: shown.wants_view, 'it to be wanted')
+        spin_until([node, viewer], lambda: shown.wants_debug_image, 'it to be wanted')
         shown.show(HEADER, None, None, None)  # the others are not looked at
         return
     spin_until([node, viewer], lambda: heard, 'what is shown',
                lambda: shown.show(HEADER, ROOM, found, CAMERA_FROM_BASE))
-    assert not shown.wants_view
+    assert not shown.wants_debug_image
     if topic == 'hypotheses':
         assert heard[0].header == HEADER
         best = found.hypotheses[0].map_from_camera @ CAMERA_FROM_BASE

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a pose may be off, from how well its inliers' boxes fit."""
+"""The covariance of a pose, from how well the boxes of its inliers fit."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,26 +10,29 @@ from cliploc_ros.core.fit.box_edges import RELATIVE_DEVIATION
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
-# The scatter of box centres, as a share of the box, before anything is seen, and how many
-# measurements that belief is worth: three boxes alone would seem to fit perfectly.
+# Scatter of box centres assumed before any box is seen, as a share of the box, and how many
+# measurements this prior counts as. Without it three boxes alone would seem to fit perfectly.
 _PRIOR_SCATTER = 0.1
 _PRIOR_WEIGHT = 6.0
-# Errors of box and map are shared by neighbouring edges, so fewer are independent than counted.
-# Doubling the variance brings accepted poses of real TUM frames near their 95 % ellipsoids.
+# Neighbouring edges share errors of box and map, so fewer edges are independent than counted.
+# Both factors are chosen on the 258 TUM frames that also fitted the confidence: with them 94 to
+# 95 % of the accepted poses lie in their 95 % ellipsoids. The second one is for refined poses.
 _VARIANCE_INFLATION = 2.0
-# The same for refined poses: 94 to 95 % of accepted ones lie in their ellipsoids then.
 _REFINED_INFLATION = 1.2
-# No box centre is known better than this on the plane z = 1: a twentieth of a pixel or so.
+# The least deviation of a box centre on the plane z = 1: about a twentieth of a pixel.
 _MIN_DEVIATION = 1e-4
 # Finite-difference steps of position [m] and rotation [rad].
 _STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
-# A direction the boxes do not fix is uncertain by this much, not infinitely: m^2 and rad^2.
+# Variance of a direction that the boxes do not fix: m^2 and rad^2.
 _PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
 
-# What odometry adds to the pose of several frames, on each axis: five real frames whose steps are
-# off by four times this lie in their 95 % ellipsoids nine times of ten.
-_ODOMETRY_DEVIATION_M = 0.005
-_ODOMETRY_DEVIATION_RAD = np.radians(0.25)
+# Deviation of odometry between two frames, on each axis: a floor, which covers stamps and
+# interpolation, and a share of the way. The shares are guesses: wheels and visual odometry drift
+# by 1 to 5 % of distance and angle. The floors were chosen on the TUM frames, see
+# odometry_covariance.
+_ODOMETRY_FLOOR_M = 0.005
+_ODOMETRY_FLOOR_RAD = np.radians(0.25)
+_ODOMETRY_DRIFT = 0.03
 
 
 def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64],
@@ -43,7 +46,7 @@ def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64]
     box_ellipses : ndarray (m, 4)
         Centre and semi-axes of the ellipses inscribed in the inliers' boxes.
     views : float
-        How many of the inliers show one object: together they measure like one.
+        Mean number of inliers that show the same object; together they count as one.
     """
     size = 2.0 * box_ellipses[:, 2:]
     center_errors = (ellipses[:, :2] - box_ellipses[:, :2]) / size
@@ -59,11 +62,11 @@ def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64]
 def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.float64],
                     box_sizes: NDArray[np.float64], scatter: float,
                     vertical: NDArray[np.float64] = VERTICAL_UNKNOWN) -> NDArray[np.float64]:
-    """Return the covariance of a pose that three box centres fix, or two and the vertical.
+    """Return the covariance of a pose from three box centres, or from two and the vertical.
 
-    A minimal pose has no error but that of its bearings, and of the vertical. Bearings scatter
-    with the size of their boxes, by as much as the inliers' boxes miss the projected landmarks;
-    the linearized projection carries the scatter to the pose.
+    The error of a minimal pose comes from its bearings and its vertical only. Bearings scatter
+    in proportion to their boxes, as much as the boxes of the inliers miss the projected
+    landmarks. The linearized projection propagates this scatter to the pose.
 
     Parameters
     ----------
@@ -93,7 +96,7 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
     variances = _VARIANCE_INFLATION * np.maximum(box_sizes.ravel() * scatter, _MIN_DEVIATION)**2
     information = (jacobian.T @ (jacobian / variances[:, None])
                    + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
-    if vertical[6] > 0.0:  # it tells of turns about level axes
+    if vertical[6] > 0.0:  # it measures the rotation about level axes
         up = vertical[3:6]
         information[3:, 3:] += (np.eye(3) - np.outer(up, up)) / vertical[6] ** 2
     covariance = np.linalg.inv(information)
@@ -107,9 +110,9 @@ def refined_covariance(information: NDArray[np.float64], scatter: float
     Parameters
     ----------
     information : ndarray (6, 6)
-        Of the last linearized system, of residuals in assumed deviations, see refine_rig.
+        Of the last linearized system, whose residuals are in assumed deviations, see refine_rig.
     scatter : float
-        See box_scatter: by how much the deviations assumed are to be stretched.
+        See box_scatter; where it exceeds the assumed deviation, it stretches the covariance.
 
     Returns
     -------
@@ -122,17 +125,66 @@ def refined_covariance(information: NDArray[np.float64], scatter: float
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def odometry_covariance() -> NDArray[np.float64]:
-    """Return what a pose is off by (6, 6) as odometry misplaces the frames that it is seen in."""
-    return np.diag(np.repeat(np.square([_ODOMETRY_DEVIATION_M, _ODOMETRY_DEVIATION_RAD]), 3))
+def vertical_information(rotations: NDArray[np.float64], verticals: NDArray[np.float64]
+                         ) -> NDArray[np.float64]:
+    """Return what all frames' verticals contribute to the information of refine_rig.
+
+    A camera turned by w about axes of the map sees the vertical at R (up + up x w), so the
+    Jacobian is R [up]x / sigma. The weights are the refinement's (Cauchy).
+
+    Parameters
+    ----------
+    rotations : ndarray (F, 3, 3)
+        camera_from_map of each frame.
+    verticals : ndarray (F, 7)
+        See make_rig; frames without a vertical contribute nothing.
+
+    Returns
+    -------
+    ndarray (6, 6)
+        Zero but for the rotation.
+    """
+    information = np.zeros((6, 6))
+    for rotation, vertical in zip(rotations, verticals, strict=True):
+        if vertical[6] > 0.0:
+            up_in_camera, up, deviation = vertical[:3], vertical[3:6], vertical[6]
+            residuals = (rotation @ up - up_in_camera) / deviation
+            jacobian = rotation @ np.cross(np.eye(3), up) / deviation
+            information[3:, 3:] += jacobian.T @ (jacobian / (1.0 + residuals[:, None] ** 2))
+    return information
+
+
+def odometry_covariance(camera_from_reference: NDArray[np.float64], weights: NDArray[np.float64]
+                        ) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) that errors of odometry between fused frames add to a pose.
+
+    Each frame is displaced against the reference frame, by a floor and by a share of the way
+    between the two. A fused pose is a mean over its frames, and frames that follow each other
+    share their displacement. So the deviations are averaged, not the variances: this is an upper
+    bound. A frame alone adds nothing.
+
+    Parameters
+    ----------
+    camera_from_reference : ndarray (F, 4, 4)
+    weights : ndarray (F,)
+        Weight of each frame in the pose: the number of its inliers.
+    """
+    if not weights.any():
+        return np.zeros((6, 6))
+    distances_m = np.linalg.norm(camera_from_reference[:, :3, 3], axis=1)
+    angles = Rotation.from_matrix(camera_from_reference[:, :3, :3]).magnitude()
+    others = (distances_m > 0.0) | (angles > 0.0)
+    deviations = np.stack([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * distances_m,
+                           _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angles]) * others
+    return np.diag(np.repeat((deviations @ weights / weights.sum()) ** 2, 3))
 
 
 def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
                       truth: NDArray[np.float64]) -> float:
-    """Return the squared error of a pose in its own covariance (NEES).
+    """Return the normalized estimation error squared (NEES) of a pose.
 
-    Over many poses whose covariances are true it has the chi-squared distribution of six degrees
-    of freedom (Bar-Shalom, Li and Kirubarajan 2001).
+    Where covariances are right, it follows the chi-squared distribution with six degrees of
+    freedom (Bar-Shalom, Li and Kirubarajan 2001).
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The last few of a search: refined, told apart, and each with what it explains."""
+"""The best hypotheses of a search: refined, distinct, each with its inliers and covariance."""
 
 import time
 from collections.abc import Sequence
@@ -17,19 +17,20 @@ from cliploc_ros.core.fit.covariance import (
     odometry_covariance,
     pose_covariance,
     refined_covariance,
+    vertical_information,
 )
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
-from cliploc_ros.core.search.frame_search import Searched
+from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.leaders import MAX_DISTINCT, same_place
 
-# Between so many a time limit is looked at.
+# Refinement checks the time limit after this many poses.
 _REFINED_AT_ONCE = 4
-# So often at most a leader of one frame is scored on one: all 32 of up to five frames, and eight
-# of each of ten, so that more frames take no longer.
+# The most times that a leader of one frame is scored on a frame: all 32 leaders of up to five
+# frames, eight leaders of each of ten frames. So ten frames take no longer than five.
 _SCORED = 800
 
 
@@ -43,22 +44,22 @@ class Match:
 
 
 class Finalist(NamedTuple):
-    """One of the best hypotheses at places that differ.
+    """One of the best hypotheses; no two finalists lie at the same place.
 
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map, of the reference frame.
+        camera_from_map of the reference frame.
     score : float
-        Sum of the IoUs of its inliers, in all frames.
+        Sum of the IoUs of its inliers in all frames.
     iteration : int
-        In which it was found, from 1.
+        Iteration that found it, from 1.
     frame : int
-        In whose search.
+        Frame whose search found it.
     sample : ndarray (s,) of int
-        The candidates that it was made from: three, or two where the vertical is known.
+        Its minimal sample: three candidates, or two where the vertical is known.
     information : ndarray (6, 6) or None
-        See refine_rig; None where it was not refined.
+        See refine_rig; None without refinement.
     """
 
     rotation: NDArray[np.float64]
@@ -75,21 +76,22 @@ class Finalist(NamedTuple):
         return invert_transform(make_transform(self.rotation, self.translation))
 
 
-def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: int,
+def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, count: int,
                    deadline: float = inf) -> list[Finalist]:
-    """Return the best of all frames' leaders, best first; what went to the same place is one.
+    """Return the best distinct poses among all frames' leaders, best first.
 
     Parameters
     ----------
-    frames : sequence of Searched
+    frames : sequence of SearchedFrame
     rig : Rig
-        Of these frames.
+        The same frames.
     refine : bool
-        Whether to refine them.
+        Whether to refine the poses.
     count : int
-        How many at most are refined.
+        The most poses to refine.
     deadline : float, optional
-        When to stop, of time.perf_counter [s]: what is left then, the worst, stays as found.
+        Time of time.perf_counter [s] at which refinement stops; the remaining, worst poses stay
+        as found.
     """
     found = [one for frame in range(len(frames))
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
@@ -98,7 +100,7 @@ def find_finalists(frames: Sequence[Searched], rig: Rig, refine: bool, count: in
     return _refined(found, rig, deadline)[:MAX_DISTINCT] if refine else found[:MAX_DISTINCT]
 
 
-def _leaders_of(frames: Sequence[Searched], rig: Rig, frame: int) -> list[Finalist]:
+def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[Finalist]:
     """Return the leaders of one frame, best first, as poses of the reference."""
     leaders = frames[frame].leaders
     camera = rig.cameras[frame]
@@ -110,7 +112,7 @@ def _leaders_of(frames: Sequence[Searched], rig: Rig, frame: int) -> list[Finali
 
 
 def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
-    """Return those that lead where all frames are asked, best first."""
+    """Return the best distinct poses by their scores in all frames, best first."""
     rotations, translations = _poses(found)
     scores = scores_of(rig, rotations, translations)
     rows = choose_distinct(scores, rotations, translations, count)
@@ -118,7 +120,7 @@ def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
 
 
 def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:
-    """Return them after refinement, best first, each place once."""
+    """Return the poses after refinement, best first, one of each place."""
     improved: list[Finalist] = []
     for some in batched(found, _REFINED_AT_ONCE):
         if improved and time.perf_counter() > deadline:
@@ -147,22 +149,22 @@ def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
             for first, last in pairwise(rig.starts.boxes)]
 
 
-def meetings_of(frames: Sequence[Searched], pose: Finalist,
+def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
                 matches: Sequence[Sequence[Match]]) -> int:
-    """Return how many of the samples tried hold nothing but a pose's inliers.
+    """Return how many of the samples tried hold only inliers of a pose.
 
     Parameters
     ----------
-    frames : sequence of Searched
+    frames : sequence of SearchedFrame
     pose : Finalist
     matches : sequence of sequence of Match
-        Its inliers in each frame.
+        Inliers of the pose in each frame.
     """
     return sum(_meetings_in(frame, len(pose.sample), found)
                for frame, found in zip(frames, matches, strict=True))
 
 
-def _meetings_in(frame: Searched, size: int, matches: Sequence[Match]) -> int:
+def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> int:
     scene, progress = frame.scene, frame.progress
     landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
     for match in matches:
@@ -174,24 +176,43 @@ def _meetings_in(frame: Searched, size: int, matches: Sequence[Match]) -> int:
     return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
 
 
-def covariance_of(frames: Sequence[Searched], rig: Rig, pose: Finalist,
+def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                   matches: Sequence[Sequence[Match]]) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose: of its refinement, or of its minimal sample.
 
-    Frames that show one object share the errors of its shape in the map: together they inform
-    like one view of each object. To that comes what odometry may be off by.
+    Frames share some errors, and shared errors do not average out. Boxes of one object share the
+    error of its shape in the map: together they count as one view of it. Verticals share the
+    error of the sensor and its mount: together they count as one vertical. The error of odometry
+    is added.
 
     Parameters
     ----------
-    frames : sequence of Searched
+    frames : sequence of SearchedFrame
     rig : Rig
-        Of these frames.
+        The same frames.
     pose : Finalist
     matches : sequence of sequence of Match
-        Its inliers in each frame.
+        Inliers of the pose in each frame.
     """
-    cameras = [make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras]
-    reference_from_map = invert_transform(pose.map_from_camera)
+    cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
+    counts = np.array([len(found) for found in matches], dtype=np.float64)
+    scatter, views = _scatter(frames, cameras, pose, matches)
+    if pose.information is None:
+        own = np.arange(len(frames)) == pose.frame
+        return _sample_covariance(frames, cameras, pose, scatter) + odometry_covariance(
+            cameras, own.astype(np.float64))
+    information = pose.information / views
+    known = int((rig.verticals[:, 6] > 0.0).sum())
+    if known > 0 and information.any():  # without enough boxes there is no information at all
+        verticals = vertical_information(cameras[:, :3, :3] @ pose.rotation, rig.verticals)
+        information += (1.0 / known - 1.0 / views) * verticals
+    return refined_covariance(information, scatter) + odometry_covariance(cameras, counts)
+
+
+def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,
+             matches: Sequence[Sequence[Match]]) -> tuple[float, float]:
+    """Return the scatter of the inliers' boxes, and the mean number of views of an object."""
+    reference_from_map = make_transform(pose.rotation, pose.translation)
     outlines, boxes = [], []
     for frame, camera, found in zip(frames, cameras, matches, strict=True):
         landmarks = [match.landmark for match in found]
@@ -201,10 +222,12 @@ def covariance_of(frames: Sequence[Searched], rig: Rig, pose: Finalist,
         boxes.append(frame.scene.box_ellipses[[match.detection for match in found]])
     seen = [row for found in matches for row in {match.landmark for match in found}]
     views = max(1.0, len(seen) / max(1, len(set(seen))))
-    scatter = box_scatter(np.concatenate(outlines), np.concatenate(boxes), views)
-    shared = odometry_covariance() if len(frames) > 1 else 0.0
-    if pose.information is not None:
-        return refined_covariance(pose.information / views, scatter) + shared
+    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views), views
+
+
+def _sample_covariance(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
+                       pose: Finalist, scatter: float) -> NDArray[np.float64]:
+    """Return the covariance of a pose that was not refined, from its minimal sample."""
     scene = frames[pose.frame].scene
     map_from_camera = pose.map_from_camera @ invert_transform(cameras[pose.frame])
     sampled = scene.pairs[pose.sample]
@@ -212,4 +235,4 @@ def covariance_of(frames: Sequence[Searched], rig: Rig, pose: Finalist,
                                  2.0 * scene.box_ellipses[sampled[:, 0], 2:], scatter,
                                  frames[pose.frame].vertical)
     lever = pose.map_from_camera[:3, 3] - map_from_camera[:3, 3]
-    return move_covariance(covariance, lever) + shared
+    return move_covariance(covariance, lever)

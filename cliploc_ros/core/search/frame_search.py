@@ -36,12 +36,14 @@ _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
 
 
-class Searched(NamedTuple):
-    """A frame, and what the search among its samples found.
+class SearchedFrame(NamedTuple):
+    """A frame and the result of the search among its samples.
 
     Parameters
     ----------
+    observation : Observation
     scene : Scene
+        Of the observation.
     vertical : ndarray (7,)
         See VERTICAL_UNKNOWN.
     leaders : Leaders
@@ -53,6 +55,7 @@ class Searched(NamedTuple):
         The samples tried; None for all samples of the first candidates, see progress.reach.
     """
 
+    observation: Observation
     scene: Scene
     vertical: NDArray[np.float64]
     leaders: Leaders
@@ -77,7 +80,7 @@ class Searched(NamedTuple):
 
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
-                 options: RelocalizerOptions, deadline: float) -> Searched:
+                 options: RelocalizerOptions, deadline: float) -> SearchedFrame:
     """Search one frame.
 
     Parameters
@@ -115,7 +118,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
         progress = progress._replace(
             coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
-    return Searched(scene, vertical, leaders, tilted, progress, samples)
+    return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples)
 
 
 def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:

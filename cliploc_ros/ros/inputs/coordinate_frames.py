@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the camera's frame to the robot's."""
+"""Transforms between coordinate frames: the camera's mount by parameter, the others by tf2."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -14,29 +14,50 @@ from rclpy.time import Time as RclTime
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
 
-# An image so much older than another tells that time jumped; tf2 keeps ten seconds.
-_JUMP_BACK_NS = 10_000_000_000
+if TYPE_CHECKING:
+    from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
 
 
-class FrameError(CliplocError):
-    """A transform that nobody gives."""
+class NoTransformError(CliplocError):
+    """A transform is missing; the message names it and the remedy."""
 
 
-class BaseFrame:
-    """Where the robot's base stands when its camera is somewhere.
+class CoordinateFrames:
+    """Knows how coordinate frames lie to each other at the stamp of an image.
 
-    tf2_ros is imported only when it is asked: a mount given as a parameter needs none.
+    tf2_ros is imported when the first transform is needed: a mount given as a parameter works
+    without it.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._buffer: Any = None
-        self._listener: Any = None
-        self._newest_ns = 0
+        self._buffer: TransformBuffer | None = None
+
+    def open(self) -> None:
+        """Listen to transforms, so that those of the first image are known.
+
+        Raises
+        ------
+        NoTransformError
+            tf2_ros is not installed.
+        """
+        self._opened()
+
+    def close(self) -> None:
+        """Stop listening, and forget all transforms."""
+        buffer, self._buffer = self._buffer, None
+        if buffer is not None:
+            buffer.close()
+
+    def forget(self) -> None:
+        """Forget all transforms but the static ones: time jumped."""
+        buffer = self._buffer
+        if buffer is not None:
+            buffer.clear()
 
     def camera_from_base(self, base_frame: str, mount: list[float], camera_frame: str,
                          stamp: Time, timeout_s: float) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of the frame to publish, seen from the camera.
+        """Return the pose (4, 4) of the coordinate frame to publish, seen from the camera.
 
         Parameters
         ----------
@@ -49,11 +70,11 @@ class BaseFrame:
         stamp : Time
             Of the image: the mount may move.
         timeout_s : float
-            How long tf2 may take [s].
+            How long to wait for tf2 [s].
 
         Raises
         ------
-        FrameError
+        NoTransformError
             tf2 is not installed or has no such transform.
         """
         if not base_frame:
@@ -65,50 +86,39 @@ class BaseFrame:
 
     def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float
                ) -> NDArray[np.float64]:
-        """Return target_from_source (4, 4) as tf2 has it at a time.
+        """Return target_from_source (4, 4) by tf2 at a stamp.
+
+        Parameters
+        ----------
+        target_frame, source_frame : str
+        stamp : Time
+        timeout_s : float
+            How long to wait for it [s].
 
         Raises
         ------
-        FrameError
+        NoTransformError
             tf2 is not installed or has no such transform in time.
         """
-        self.listen()
-        at = RclTime.from_msg(stamp)
-        if at.nanoseconds < self._newest_ns - _JUMP_BACK_NS:
-            # simulated time began anew; tf2 would refuse what comes now as too old
-            self._buffer.clear()
-            self._newest_ns = 0
-        self._newest_ns = max(at.nanoseconds, self._newest_ns)
+        buffer = self._opened()
         try:
-            found = self._buffer.lookup_transform(target_frame, source_frame, at,
-                                                  Duration(seconds=timeout_s)).transform
-        except Exception as error:  # tf2 raises many types, all of which mean: not now
-            raise FrameError(f"no transform from '{source_frame}' to '{target_frame}': {error}; "
-                             'publish it, or set base_from_camera') from error
+            found = buffer.lookup_transform(target_frame, source_frame, RclTime.from_msg(stamp),
+                                            Duration(seconds=timeout_s)).transform
+        except Exception as error:  # tf2 has a type for each cause
+            raise NoTransformError(
+                f"no transform from '{source_frame}' to '{target_frame}': {error}; publish it, or "
+                'set base_from_camera') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
-    def listen(self) -> None:
-        """Begin to hear of transforms, so that those of the first image are known.
-
-        Raises
-        ------
-        FrameError
-            tf2 is not installed.
-        """
-        if self._buffer is not None:
-            return
-        try:
-            from tf2_ros import Buffer, TransformListener
-        except ImportError as error:
-            raise FrameError('a transform is needed, but tf2_ros is not installed: install it, '
-                             'or set base_from_camera') from error
-        self._buffer = Buffer()
-        self._listener = TransformListener(self._buffer, self._node)
-
-    def forget(self) -> None:
-        """Hear of transforms no longer."""
-        if self._listener is not None:
-            self._listener.unregister()
-        self._buffer = self._listener = None
-        self._newest_ns = 0
+    def _opened(self) -> 'TransformBuffer':
+        """Return the buffer, which listens from now on."""
+        buffer = self._buffer
+        if buffer is None:
+            try:
+                from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
+            except ImportError as error:
+                raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
+                                       'install it, or set base_from_camera') from error
+            buffer = self._buffer = TransformBuffer(self._node)
+        return buffer

@@ -5,11 +5,12 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
@@ -21,21 +22,26 @@ from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 
-# What may wait for its counterparts: ten seconds of 30 Hz VGA images for a slow detector.
+#: A robot that is refused retries at once: discovering its publishers anew would cost it a tenth
+#: of a second.
+LINGER_S = 1.0
+_CHECK_PERIOD_S = 0.5
+# Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
+# detector.
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
-# A guess at what one detection holds in Python's memory.
+# A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
 
 
 class NoFrameError(CliplocError):
-    """No complete frame came in time; the message says what was missing."""
+    """No complete frame arrived in time; the message says what was missing."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The messages of one instant, and when the image arrived (monotonic clock) [s]."""
+    """The messages of one stamp, and when the image arrived (monotonic clock) [s]."""
 
     image: Image | CompressedImage
     camera_info: CameraInfo
@@ -44,108 +50,112 @@ class Frame:
 
 
 class FrameSource:
-    """Subscribes while somebody needs frames, and only then.
+    """Subscribes while a frame is wanted and a moment longer, and to nothing in between.
+
+    Images are expensive, and the detector rests while nobody subscribes to its detections.
 
     Parameters
     ----------
     node : Node
     transport : str
         'raw' or 'compressed'.
+    linger_s : float
+        How long the subscriptions outlive the last call of next_frame [s]; inf keeps them for
+        as long as the source is open.
     on_frame : callable
-        Called with each complete frame, in the executor's thread.
+        Called with each complete frame in the executor's thread.
     """
 
-    def __init__(self, node: Node, transport: str, on_frame: Callable[[Frame], None]) -> None:
+    def __init__(self, node: Node, transport: str, linger_s: float,
+                 on_frame: Callable[[Frame], None]) -> None:
         self._node = node
         self._image_type = Image if transport == 'raw' else CompressedImage
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
+        self._linger_s = linger_s
         self._on_frame = on_frame
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
         self._changed = threading.Condition()
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
-        self._listeners = 0
-        self._listening_since = 0.0
+        self._subscribed_at = 0.0
+        self._wanted_until = 0.0
         self._rates = Rates()
         self._newest: Frame | None = None
-        self._stopped = ''
+        self._closed = 'the node is not active'
+        # Simulated time may stand still.
+        node.create_timer(_CHECK_PERIOD_S, self._rest, MutuallyExclusiveCallbackGroup(),
+                          Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
     def image_topic(self) -> str:
-        """Return where images come from."""
+        """Return the resolved name of the image topic."""
         return self._resolved('image')
 
     def open(self) -> None:
-        """Listen until closed as often as opened."""
+        """Allow calls of next_frame."""
         with self._changed:
-            if self._listeners == 0:
-                self._listening_since = time.monotonic()
+            self._closed = ''
+            if self._linger_s == math.inf:
+                self._wanted_until = math.inf
                 self._subscribe()
-            self._listeners += 1
 
-    def close(self) -> None:
-        """End what one open began; with the last one the subscriptions end."""
+    def close(self, reason: str) -> None:
+        """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
         with self._changed:
-            self._listeners -= 1
-            if self._listeners == 0:
-                self._unsubscribe()
+            self._closed = reason
+            self._unsubscribe()
+            self._changed.notify_all()
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen for the length of a with statement."""
-        self.open()
-        try:
-            yield
-        finally:
-            self.close()
+    def forget(self) -> None:
+        """Drop the messages received so far."""
+        with self._changed:
+            self._pairing.clear()
+            self._newest = None
 
-    def wait_for_fresh(self, timeout_s: float) -> Frame:
-        """Return the first complete frame whose image arrives from now on.
+    def next_frame(self, after: float, deadline: float) -> Frame:
+        """Return the first complete frame whose image arrived after a moment.
 
         Parameters
         ----------
-        timeout_s : float
-            [s]
+        after, deadline : float
+            Of the monotonic clock [s].
 
         Raises
         ------
         NoFrameError
-            None came in time; the message says what was missing.
+            None arrived before the deadline; the message says what was missing.
         StoppedError
-            Somebody called stop; the message says why.
+            The source was closed; the message gives the reason.
         """
-        now = time.monotonic()
         with self._changed:
-            self._changed.wait_for(lambda: self._stopped or self._newest_since(now) is not None,
-                                   timeout_s)
-            if self._stopped:
-                raise StoppedError(self._stopped)
-            frame = self._newest_since(now)
+            if not self._closed:
+                self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
+                self._subscribe()
+            self._changed.wait_for(lambda: self._closed or self._newest_since(after) is not None,
+                                   max(0.0, deadline - time.monotonic()))
+            if self._closed:
+                raise StoppedError(self._closed)
+            self._wanted_until = time.monotonic() + self._linger_s
+            frame = self._newest_since(after)
             if frame is None:
-                raise NoFrameError(f'no fresh frame within {timeout_s:g} s: '
-                                   f'{self._why_none(now)}')
+                raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
+                                   f'{self._why_none(after)}')
             return frame
 
-    def stop(self, reason: str) -> None:
-        """Release for good everybody who waits, with a reason to give them."""
-        with self._changed:
-            self._stopped = reason
-            self._changed.notify_all()
-
     def examine(self, health: Health, stale_after_s: float) -> None:
-        """Say what is missing of the input, how often it comes, and what waits or was lost."""
+        """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
         with self._changed:
             for name in self._topics:
-                silent_s = now - max(self._heard_at.get(name, 0.0), self._listening_since)
+                silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = self._node.count_publishers(self._resolved(name)) == 0
-                if nobody or (self._listeners and silent_s > stale_after_s):
-                    # without intrinsics there is never a pose; images and detections may pause
-                    tell = health.fail if name == 'camera_info' else health.warn
-                    tell(self._silence(name) if nobody else
-                         f'no {name} on {self._resolved(name)} for {silent_s:.1f} s')
+                if nobody or (self._subscriptions and silent_s > stale_after_s):
+                    # Without intrinsics there is never a pose; images and detections may pause.
+                    report = health.fail if name == 'camera_info' else health.warn
+                    report(self._silence(name) if nobody else
+                           f'no {name} on {self._resolved(name)} for {silent_s:.1f} s')
             rates = self._rates.update(self._pairing.received)
             oldest = self._pairing.oldest('image')
             health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
@@ -158,7 +168,10 @@ class FrameSource:
         return newest if newest is not None and newest.received_at >= moment else None
 
     def _subscribe(self) -> None:
+        if len(self._subscriptions) == len(self._topics):
+            return
         self._unsubscribe()  # what a failed attempt left behind
+        self._subscribed_at = time.monotonic()
         for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
                                             ('detections', Detection2DArray, qos.DETECTIONS_IN)):
@@ -172,17 +185,23 @@ class FrameSource:
         self._pairing.clear()
         self._newest = None
 
+    def _rest(self) -> None:
+        """Unsubscribe once no frame has been wanted for a while."""
+        with self._changed:
+            if self._subscriptions and time.monotonic() > self._wanted_until:
+                self._unsubscribe()
+
     def _receiver(self, name: str) -> Callable[[Any], None]:
         def receive(msg: Any) -> None:
             self._take(name, msg)
         return receive
 
     def _take(self, name: str, msg: Any) -> None:
-        """Take one message in, and pass the frame on that it completes."""
+        """Take one message, and pass on the frame that it completes."""
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
         with self._changed:
-            if not self._listeners:
+            if not self._subscriptions:
                 return
             self._heard_at[name] = time.monotonic()
             complete = self._pairing.add(name, stamp_ns(msg.header.stamp),
@@ -197,23 +216,23 @@ class FrameSource:
         self._on_frame(frame)
 
     def _why_none(self, since: float) -> str:
-        """Say what was missing since a moment of the monotonic clock."""
+        """Return what was missing since a moment of the monotonic clock."""
         missing = [self._silence(name) for name in self._topics
                    if self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
         stamps = ', '.join(f'{self._resolved(name)} {stamp / 1e9:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
-        return (f'stamps never match (last seen: {stamps}): camera_info and detections must '
-                "carry their image's header; if detections are merely late, the detector is too "
-                'slow for timeout_s')
+        return (f'stamps never match (last: {stamps}): camera_info and detections must carry '
+                "their image's header; if detections are late, the detector is too slow for "
+                'timeout_s')
 
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
         if publishers:
-            return (f'no {name} on {topic}, though it has {publishers} publisher(s): is it '
-                    'sending, and is its QoS compatible?')
+            return (f'no {name} on {topic} from its {publishers} publisher(s): is it sending, and '
+                    'is its QoS compatible?')
         return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
 
     def _resolved(self, name: str) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The last seconds of odometry: where the robot was when an image was taken."""
+"""The last seconds of odometry: the robot's pose when an image was taken."""
 
 from bisect import bisect_left
 from typing import NamedTuple
@@ -11,17 +11,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.units import NS_PER_S
 
-_NS_PER_S = 1_000_000_000
 _UNIT_TOLERANCE = 0.01
-# No robot is so far from where it began; beyond, sums lose millimetres.
+# No robot drives this far from its start; beyond, sums lose millimetres.
 _FARTHEST_M = 1e7
-# Between two messages further apart nobody knows how the robot moved: wheels take 20 ms, visual
-# odometry 100.
-_MAX_GAP_NS = _NS_PER_S // 2
-# A message is not so late: the clock was set back.
-_MAX_LATE_NS = _NS_PER_S
-# A robot that seems faster did not move: its odometry was reset.
+# Poses further apart are not interpolated: wheels send every 20 ms, visual odometry every 100.
+_MAX_GAP_NS = NS_PER_S // 2
+# A message is never this late: time jumped back.
+_MAX_LATE_NS = NS_PER_S
+# A robot that seems faster than this did not move: its odometry was reset.
 _MAX_SPEED_M_S = 20.0
 _SLACK_M = 0.1
 _MAX_TURN_RAD_S = 10.0
@@ -29,7 +28,7 @@ _SLACK_RAD = 0.1
 
 
 class NoOdometryError(CliplocError):
-    """Odometry says nothing of that time; the message says why."""
+    """Odometry has no pose at that time; the message says why."""
 
 
 class _Pose(NamedTuple):
@@ -39,53 +38,53 @@ class _Pose(NamedTuple):
 
 
 class OdometryWindow:
-    """Stamped poses of odometry, in the order of their stamps, no more than some seconds of them.
+    """Poses of odometry over some seconds, in the order of their stamps.
 
     Parameters
     ----------
     length_s : float
-        Older poses than this before the newest are forgotten [s].
+        Poses that are older than the newest by more than this are dropped [s].
     max_poses : int
-        No more than so many are kept, whatever their stamps.
+        No more poses are kept, whatever their stamps.
     """
 
     def __init__(self, length_s: float, max_poses: int = 5000) -> None:
-        self._length_ns = round(length_s * _NS_PER_S)
+        self._length_ns = round(length_s * NS_PER_S)
         self._max_poses = max_poses
         self._poses: list[_Pose] = []
-        #: Of which run of odometry the poses are: those of two runs have nothing in common.
+        #: The number of the present run of odometry: poses of two runs are not related.
         self.run = 0
 
     def __len__(self) -> int:
-        """Return how many poses are kept."""
+        """Return the number of poses."""
         return len(self._poses)
 
     def clear(self) -> None:
-        """Forget all poses: those that come are of another run."""
+        """Forget all poses, and begin another run."""
         self._poses.clear()
         self.run += 1
 
     def is_ahead(self, stamp_ns: int) -> bool:
-        """Return whether an instant lies so little behind the newest pose that one may follow."""
+        """Return whether an instant is after all poses, but the next may cover it."""
         return bool(self._poses) and 0 < stamp_ns - self._poses[-1].stamp_ns <= _MAX_GAP_NS
 
     def spans(self, stamp_ns: int, slack_ns: int) -> bool:
-        """Return whether an instant lies among the poses, or so near them."""
+        """Return whether an instant is between the first and the last pose, or so near to them."""
         return bool(self._poses) and (self._poses[0].stamp_ns - slack_ns <= stamp_ns
                                       <= self._poses[-1].stamp_ns + slack_ns)
 
     def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
             ) -> bool:
-        """Take a pose in, in its place; return whether it is one.
+        """Take in a pose; return whether it is valid.
 
-        All poses before are forgotten where time or place jumps: the clock was set back, or
+        If time or place jumps, all former poses are forgotten: the clock was set back, or
         odometry was reset.
 
         Parameters
         ----------
         stamp_ns : int
         position : ndarray (3,)
-            Of the robot in the odometry's frame [m].
+            Of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
         """
         values = np.concatenate([position, quat_xyzw])
@@ -108,12 +107,12 @@ class OdometryWindow:
         return True
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64]:
-        """Return the robot in the odometry's frame (4, 4) at an instant between two messages.
+        """Return odom_from_robot (4, 4) at an instant, between two messages by interpolation.
 
         Raises
         ------
         NoOdometryError
-            The instant lies before or behind all poses, or in a gap between them.
+            The instant is before or after all poses, or in a gap between them.
         """
         row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         if row < len(self._poses) and self._poses[row].stamp_ns == stamp_ns:
@@ -122,16 +121,15 @@ class OdometryWindow:
         if not self._poses:
             raise NoOdometryError('no odometry yet')
         if row == len(self._poses):
-            late_s = (stamp_ns - self._poses[-1].stamp_ns) / _NS_PER_S
+            late_s = (stamp_ns - self._poses[-1].stamp_ns) / NS_PER_S
             raise NoOdometryError(f'the newest odometry is {late_s:.3f} s older than the image')
         if row == 0:
-            early_s = (self._poses[0].stamp_ns - stamp_ns) / _NS_PER_S
+            early_s = (self._poses[0].stamp_ns - stamp_ns) / NS_PER_S
             raise NoOdometryError(f'the oldest odometry is {early_s:.3f} s newer than the image')
         before, after = self._poses[row - 1], self._poses[row]
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _MAX_GAP_NS:
-            raise NoOdometryError(f'odometry paused for {gap_ns / _NS_PER_S:.3f} s about the '
-                                  'image')
+            raise NoOdometryError(f'odometry paused for {gap_ns / NS_PER_S:.3f} s about the image')
         share = (stamp_ns - before.stamp_ns) / gap_ns
         turns = Slerp([0.0, 1.0], Rotation.from_quat([before.quat_xyzw, after.quat_xyzw]))
         return make_transform(turns(share).as_matrix(),
@@ -139,11 +137,11 @@ class OdometryWindow:
 
 
 def _jumps(poses: list[_Pose], pose: _Pose) -> bool:
-    """Tell whether a pose is too far from the one before it to have been reached."""
+    """Return whether a robot cannot have moved from the newest pose to this one."""
     newest = poses[-1]
     if pose.stamp_ns <= newest.stamp_ns:
         return False
-    seconds = (pose.stamp_ns - newest.stamp_ns) / _NS_PER_S
+    seconds = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
     distance = float(np.linalg.norm(pose.position - newest.position))
     turned = 2.0 * np.arccos(min(1.0, abs(float(newest.quat_xyzw @ pose.quat_xyzw))))
     return bool(distance > _MAX_SPEED_M_S * seconds + _SLACK_M

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of several topics that belong together: those with exactly the same stamp."""
+"""Pairing of the messages of several topics by exactly equal stamps."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -8,17 +8,16 @@ from typing import Any
 
 
 class ExactPairing:
-    """Waits until every topic has a message of the same stamp. Memory is bounded.
+    """Collects messages until every topic has one of the same stamp. Memory is bounded.
 
-    Stamps are compared, never ordered: simulated time may jump back, and frames may come out of
-    order.
+    Stamps are compared for equality, not for order: frames may arrive out of order.
 
     Parameters
     ----------
     max_bytes : mapping of str to int
-        The topics, and how much of each may wait [bytes].
+        The topics, and how much memory the messages of each may hold [bytes].
     max_count : int
-        How many messages of each topic may wait.
+        How many messages of each topic are kept.
     """
 
     def __init__(self, max_bytes: Mapping[str, int], max_count: int) -> None:
@@ -32,14 +31,14 @@ class ExactPairing:
         self.last_stamp_ns: dict[str, int] = {}
 
     def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
-        """Take one message in; return the complete set by topic, if this completed one.
+        """Take in a message; return the set by topic that it completes, or None.
 
         Parameters
         ----------
         topic : str
         stamp_ns : int
         item : object
-            What comes back in the set.
+            Returned in the set.
         size : int
             Memory that the item holds [bytes].
         """
@@ -57,22 +56,22 @@ class ExactPairing:
             return None
         complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
         for name, other in self._waiting.items():
-            self.dropped[name] -= 1  # the completed one is none
-            # what came before the completed one is late for good
+            self.dropped[name] -= 1  # the loop below counts the completed one, too
+            # Older messages will not be completed any more.
             while stamp_ns in other:
                 self._forget(name, next(iter(other)))
         return complete
 
     def oldest(self, topic: str) -> Any:
-        """Return what waits longest of a topic; None if nothing does."""
+        """Return the oldest item of a topic that waits; None if there is none."""
         return next((item for item, _ in self._waiting[topic].values()), None)
 
     def waiting_bytes(self) -> int:
-        """Return how much memory the waiting messages hold [bytes]."""
+        """Return the memory that all waiting messages hold [bytes]."""
         return sum(self._bytes.values())
 
     def clear(self) -> None:
-        """Forget all that waits, and what was received and dropped."""
+        """Forget all waiting messages and all counts."""
         for waiting in self._waiting.values():
             waiting.clear()
         self._bytes = dict.fromkeys(self._bytes, 0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A subscription that is as reliable as what it listens to."""
+"""A subscription that is as reliable as its publishers."""
 
 import threading
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from cliploc_ros.ros.qos import overridable
 
 
 class AdaptiveSubscription:
-    """Listens reliably while every publisher of its topic offers that, else with best effort.
+    """Subscribes reliably while all publishers of the topic are reliable, else best effort.
 
-    A best-effort reader matches every camera, but loses large images even on one machine; a
-    reliable one never matches a best-effort camera. Publishers come and go, so the choice is
-    made anew with each.
+    A best-effort subscription matches every camera, but loses large images even on one machine. A
+    reliable one does not match a best-effort camera. The choice is made again when publishers
+    come or go.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ class AdaptiveSubscription:
     message_type : type
     topic : str
     callback : callable
-        Takes each message, one at a time but for the moment of such a change.
+        Takes each message, one at a time except during such a change.
     profile : QoSProfile
-        All but the reliability.
+        All policies except the reliability.
     """
 
     def __init__(self, node: Node, message_type: type, topic: str,
@@ -42,10 +42,11 @@ class AdaptiveSubscription:
         self._topic = node.resolve_topic_name(topic)
         self._callback = callback
         self._profile = profile
-        # What a user sets stays; else the parameter must not be declared, or it would stay too.
+        # A reliability set by the user stays. The parameter is not declared otherwise: a declared
+        # one would stay, too.
         self._overridden = node.has_parameter(
             f'qos_overrides.{self._topic}.subscription.reliability')
-        # Publishers come while others destroy, in another thread.
+        # Publishers come in one thread, destroy is called in another.
         self._lock = threading.RLock()
         self._subscription: Subscription | None = None
         with self._lock:
@@ -60,16 +61,16 @@ class AdaptiveSubscription:
                 self._subscription = None
 
     def _offered(self) -> ReliabilityPolicy:
-        """Return the most reliable policy that matches all publishers known now."""
+        """Return the most reliable policy that matches all present publishers."""
         offered = [info.qos_profile.reliability
                    for info in self._node.get_publishers_info_by_topic(self._topic)]
         reliable = bool(offered) and all(r == ReliabilityPolicy.RELIABLE for r in offered)
         return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
 
     def _create(self) -> Subscription:
-        # A group of its own: where an event of a subscription that was destroyed meanwhile is to
-        # be taken, rclpy takes the group for busy ever after. And a group keeps a dead reference
-        # to everything that ever was in it.
+        # A group of its own: if a subscription is destroyed before its event is taken, rclpy
+        # leaves the group busy for ever. Besides, a group keeps a reference to each of its former
+        # members.
         group = MutuallyExclusiveCallbackGroup()
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
                              durability=self._profile.durability, reliability=self._reliability)
@@ -81,7 +82,7 @@ class AdaptiveSubscription:
                 matched=self._adapt, incompatible_qos=self._adapt))
 
     def _adapt(self, _: Any) -> None:
-        """Listen anew if the publishers that are there now offer something else."""
+        """Subscribe again if the present publishers need another reliability."""
         with self._lock:
             offered = self._offered()
             if self._overridden or self._subscription is None or offered == self._reliability:

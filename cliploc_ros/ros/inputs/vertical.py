@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which way is up for the camera: by the robot's base, or by an IMU."""
 
-import math
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,18 +17,25 @@ from sensor_msgs.msg import Imu
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 
 SOURCES = ('none', 'base_frame', 'imu')
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDARD_GRAVITY = 9.80665
-# An accelerometer that measures something else than this much about gravity is being moved.
+# An acceleration further from gravity than this is one of a moving IMU (a guess) [m/s^2].
 _MAX_ACCELERATION = 0.5
+# An orientation that changes faster than this within the window below is of no use (a guess).
+_MIN_MEAN_LENGTH = 0.95
+# An orientation is refused where gravity contradicts it by more than this (a guess): a cheap
+# accelerometer at rest is off by up to 3 degrees, a wrong or missing orientation mostly by more.
+_MAX_CONTRADICTION_DEG = 5.0
 # Samples so near an image are averaged: vibration is faster, and robots turn slowly meanwhile.
 _WINDOW_NS = 100_000_000
 # A second of the fastest usual IMU.
 _MAX_SAMPLES = 1000
+# sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
+_NOT_MEASURED = -1.0
 
 
 class NoVerticalError(CliplocError):
@@ -38,90 +43,116 @@ class NoVerticalError(CliplocError):
 
 
 class Sample(NamedTuple):
-    """What an IMU said at one instant: up in its frame times m/s^2, or a unit vector."""
+    """What an IMU measured at one instant, in its own coordinate frame; at least one of both.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    up : ndarray (3,) or None
+        A unit vector, by the orientation.
+    acceleration : ndarray (3,) or None
+        [m/s^2]; at rest it points up (REP 145).
+    """
 
     stamp_ns: int
-    up: NDArray[np.float64]
-    is_acceleration: bool
+    up: NDArray[np.float64] | None
+    acceleration: NDArray[np.float64] | None
 
 
 def sample_from_msg(msg: Imu) -> Sample | None:
-    """Return what a message says of the vertical; None if it says nothing.
+    """Return what a message says about the vertical; None if it says nothing.
 
-    The orientation is taken where there is one: its filter knows how the robot moves. Else the
-    acceleration: at rest it points up (REP 145).
+    A field is missing if its covariance begins with -1, or if it has its default value: no
+    acceleration at all, or no rotation with a covariance of zeros. The latter may be a
+    measurement, but then the acceleration says the same.
     """
-    q, a = msg.orientation, msg.linear_acceleration
-    quat_xyzw = np.array([q.x, q.y, q.z, q.w])
-    # a covariance that begins with -1 says that the field is not measured (sensor_msgs/Imu)
-    if msg.orientation_covariance[0] != -1.0 and abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01:
-        up = Rotation.from_quat(quat_xyzw).inv().apply(_UP)
-        return Sample(stamp_ns(msg.header.stamp), up, False)
-    acceleration = np.array([a.x, a.y, a.z])
-    if msg.linear_acceleration_covariance[0] == -1.0 or not np.isfinite(acceleration).all():
+    up, acceleration = _up(msg), _acceleration(msg)
+    if up is None and acceleration is None:
         return None
-    return Sample(stamp_ns(msg.header.stamp), acceleration, True)
+    return Sample(stamp_ns(msg.header.stamp), up, acceleration)
+
+
+def _up(msg: Imu) -> NDArray[np.float64] | None:
+    """Return up by the orientation; None if that is missing."""
+    q, covariance = msg.orientation, msg.orientation_covariance
+    quat_xyzw = np.array([q.x, q.y, q.z, q.w])
+    is_default = np.array_equal(quat_xyzw, [0.0, 0.0, 0.0, 1.0]) and not np.any(covariance)
+    if (covariance[0] == _NOT_MEASURED or is_default
+            or not abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01):
+        return None
+    return np.asarray(Rotation.from_quat(quat_xyzw).inv().apply(_UP))
+
+
+def _acceleration(msg: Imu) -> NDArray[np.float64] | None:
+    """Return the acceleration; None if that is missing."""
+    a = msg.linear_acceleration
+    acceleration = np.array([a.x, a.y, a.z])
+    if (msg.linear_acceleration_covariance[0] == _NOT_MEASURED or not acceleration.any()
+            or not np.isfinite(acceleration).all()):
+        return None
+    return acceleration
 
 
 class VerticalSource:
-    """Knows the vertical in the camera's frame; listens to an IMU only while it is needed.
+    """Knows the vertical in the camera's coordinate frame.
+
+    An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
+    But many drivers leave the orientation at its default, or fill it wrongly. It has to agree
+    with the acceleration at rest, where the IMU measures both.
 
     Parameters
     ----------
     node : Node
-    base : BaseFrame
+    transforms : CoordinateFrames
         Knows how the camera and the IMU are mounted.
     """
 
-    def __init__(self, node: Node, base: BaseFrame) -> None:
+    def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
         self._node = node
-        self._base = base
+        self._transforms = transforms
         self._lock = threading.Lock()
         self._samples: deque[Sample] = deque(maxlen=_MAX_SAMPLES)
         self._imu_frame = ''
-        self._listeners = 0
+        self._newest_is_empty = False
         self._subscription: AdaptiveSubscription | None = None
 
-    @contextmanager
-    def listening(self, source: str) -> Iterator[None]:
-        """Listen to the IMU for the length of a with statement, where that is the source."""
-        if source != 'imu':
-            yield
-            return
+    def open(self, source: str) -> None:
+        """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
+        if source == 'imu' and self._subscription is None:
+            self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take, qos.IMU)
+
+    def close(self) -> None:
+        """Stop listening, and forget all samples."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all samples: time jumped."""
         with self._lock:
-            self._listeners += 1
-            if self._subscription is None:
-                self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take,
-                                                          qos.IMU)
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._listeners -= 1
-                if self._listeners == 0:
-                    self._subscription.destroy()
-                    self._subscription = None
-                    self._samples.clear()
+            self._samples.clear()
 
     def take(self, msg: Imu) -> None:
-        """Take a message of the IMU in."""
+        """Take in a message of the IMU."""
         sample = sample_from_msg(msg)
-        if sample is None:
-            return
         with self._lock:
+            self._newest_is_empty = sample is None
+            if sample is None:
+                return
             if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns:
-                self._samples.clear()  # time jumped back: what was before means nothing now
+                self._samples.clear()  # time jumped back
             self._samples.append(sample)
             self._imu_frame = msg.header.frame_id
 
     def up_in_camera(self, values: Mapping[str, Any], camera_from_base: NDArray[np.float64],
                      camera_frame: str, stamp: Time) -> NDArray[np.float64] | None:
-        """Return the vertical (3,), a unit vector in the camera's optical frame.
+        """Return the vertical (3,), a unit vector in the camera's optical coordinate frame.
 
         Parameters
         ----------
         values : mapping
-            Of the relocalizer's parameters.
+            The relocalizer's parameters.
         camera_from_base : ndarray (4, 4)
             How the camera is mounted.
         camera_frame : str
@@ -137,9 +168,9 @@ class VerticalSource:
         Raises
         ------
         NoVerticalError
-            The IMU said nothing at that time, or was being moved.
-        FrameError
-            Nobody says how the IMU is mounted.
+            The IMU measured nothing at that time, was moving, or contradicts itself.
+        NoTransformError
+            The IMU's mount is unknown.
         """
         if values['gravity'] == 'none':
             return None
@@ -149,26 +180,68 @@ class VerticalSource:
         if imu_frame == camera_frame:
             return up_in_imu
         camera_from_imu = camera_from_base if imu_frame == values['base_frame'] else \
-            self._base.camera_from_base(imu_frame, [], camera_frame, stamp,
-                                        values['tf_timeout_s'])
+            self._transforms.camera_from_base(imu_frame, [], camera_frame, stamp,
+                                              values['tf_timeout_s'])
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
     def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:
-        """Return the mean vertical about an instant, and the frame it is in."""
+        """Return the mean vertical about an instant, and the coordinate frame it is in."""
         with self._lock:
-            frame = self._imu_frame
-            near = [one for one in self._samples if abs(one.stamp_ns - at_ns) <= _WINDOW_NS]
-        if near and not frame:
-            raise NoVerticalError("the IMU's messages have no frame_id, so nobody can say how it "
-                                  'is mounted')
+            frame, samples = self._imu_frame, list(self._samples)
+            newest_is_empty = self._newest_is_empty
+        near = [one for one in samples if abs(one.stamp_ns - at_ns) <= _WINDOW_NS]
+        topic = self._node.resolve_topic_name('imu')
+        if not near and newest_is_empty:
+            raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: fill '
+                                  'at least one')
         if not near:
-            topic = self._node.resolve_topic_name('imu')
-            raise NoVerticalError(f'no usable message of {topic} is within '
-                                  f'{_WINDOW_NS // 1_000_000} ms of the image')
-        mean = np.mean([one.up for one in near], axis=0)
-        length = float(np.linalg.norm(mean))
-        expected = _STANDARD_GRAVITY if near[-1].is_acceleration else 1.0
-        if not math.isclose(length, expected, rel_tol=_MAX_ACCELERATION / _STANDARD_GRAVITY):
-            raise NoVerticalError(f'the IMU is being moved: it measures {length:.2f} where rest '
-                                  f'is {expected:.2f}')
-        return mean / length, frame
+            raise NoVerticalError(f'no message of {topic} is within {_WINDOW_NS // 1_000_000} ms '
+                                  'of the image')
+        if not frame:
+            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: fill it')
+        ups = [one.up for one in near if one.up is not None]
+        if not ups:
+            return _up_by_gravity([one.acceleration for one in near
+                                   if one.acceleration is not None]), frame
+        contradiction_deg = _contradiction_deg(samples)
+        if contradiction_deg > _MAX_CONTRADICTION_DEG:
+            raise NoVerticalError(
+                f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
+                f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
+                'orientation_covariance[0] to -1')
+        return _mean_up(ups), frame
+
+
+def _mean_up(ups: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the mean (3,) of unit vectors (n, 3)."""
+    mean = np.mean(ups, axis=0)
+    length = float(np.linalg.norm(mean))
+    if not length > _MIN_MEAN_LENGTH:
+        raise NoVerticalError('the IMU turns too fast: its orientations about the image differ')
+    return np.asarray(mean / length)
+
+
+def _up_by_gravity(accelerations: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return up (3,) by accelerations (n, 3)."""
+    mean = np.mean(accelerations, axis=0)
+    if not _is_gravity(mean):
+        raise NoVerticalError(f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, '
+                              f'at rest it measures {_STANDARD_GRAVITY:.2f}')
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
+    return bool(abs(np.linalg.norm(acceleration) - _STANDARD_GRAVITY) <= _MAX_ACCELERATION)
+
+
+def _contradiction_deg(samples: Sequence[Sample]) -> float:
+    """Return the median angle between up by orientation and by acceleration at rest [deg].
+
+    The median over all samples, not those about the image alone: a robot that starts or brakes
+    deflects its accelerometer for a moment. 0 where no sample measures both at rest.
+    """
+    cosines = [float(one.up @ one.acceleration) / float(np.linalg.norm(one.acceleration))
+               for one in samples if one.up is not None and one.acceleration is not None
+               and _is_gravity(one.acceleration)]
+    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0))))) \
+        if cosines else 0.0

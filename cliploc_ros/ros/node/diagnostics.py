@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node says of itself on /diagnostics: once a second, and with each result."""
+"""A node's health on /diagnostics: once a second, and with each result.
+
+diagnostic_updater does this on an installed ROS, but has no package on PyPI.
+"""
 
 import os
 import sys
@@ -18,15 +21,15 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 _PERIOD_S = 1.0
-# Over a shorter time a rate would jump about.
+# Over a shorter time a rate fluctuates.
 _MIN_RATE_PERIOD_S = 0.5
-# So many of the last results make means and percentiles.
+# Results that means and percentiles cover.
 _WINDOW = 200
 
 
 @dataclass
 class Health:
-    """What is wrong, each with its level, and figures for those who look closer.
+    """Problems, each with its level, and figures.
 
     Parameters
     ----------
@@ -39,11 +42,11 @@ class Health:
     values: dict[str, object] = field(default_factory=dict)
 
     def warn(self, problem: str) -> None:
-        """Add what may pass by itself."""
+        """Add a problem that may pass by itself."""
         self.problems.append((DiagnosticStatus.WARN, problem))
 
     def fail(self, problem: str) -> None:
-        """Add what somebody has to mend."""
+        """Add a problem that the user must fix."""
         self.problems.append((DiagnosticStatus.ERROR, problem))
 
     @property
@@ -53,13 +56,13 @@ class Health:
 
     @property
     def message(self) -> str:
-        """Return the problems in a line, the worst first; empty if there are none."""
+        """Return the problems in one line, the worst first; empty without any."""
         worst_first = sorted(self.problems, key=lambda problem: problem[0], reverse=True)
         return '; '.join(text for _, text in worst_first)
 
 
 class StageTimes:
-    """How long each stage of one result took [ms].
+    """How long each stage of one result took.
 
     Parameters
     ----------
@@ -72,7 +75,7 @@ class StageTimes:
         self._stages: dict[str, float] = {}
 
     def mark(self, stage: str) -> None:
-        """End a stage that began where the last one ended."""
+        """End a stage; it began where the previous one ended."""
         now = time.monotonic()
         self._stages[stage] = (now - self._start) * 1e3
         self._start = now
@@ -83,19 +86,19 @@ class StageTimes:
         return dict(self._stages)
 
     def __str__(self) -> str:
-        """Return the stages for people."""
+        """Return the stages in words."""
         return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in self._stages.items())
 
 
 class Stages:
-    """How long the stages of the work took lately; filled in one thread, read in another."""
+    """How long recent stages took; written in one thread, read in another."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._ms: dict[str, deque[float]] = {}
 
     def add(self, stages_ms: Mapping[str, float]) -> None:
-        """Take in the times of one result [ms], by stage."""
+        """Add the times of one result [ms], by stage."""
         with self._lock:
             for stage, ms in stages_ms.items():
                 self._ms.setdefault(stage, deque(maxlen=_WINDOW)).append(ms)
@@ -110,7 +113,7 @@ class Stages:
 
 
 class Rates:
-    """How often things that are counted happen."""
+    """Rates from counts."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
@@ -118,7 +121,7 @@ class Rates:
         self._rates: dict[str, float] = {}
 
     def update(self, counts: Mapping[str, int]) -> dict[str, float]:
-        """Return the rates since the last but one update [Hz]; counts may begin again at 0."""
+        """Return the rates since the update before last [Hz]; counts may restart at 0."""
         now = time.monotonic()
         period_s = now - self._at
         if period_s >= _MIN_RATE_PERIOD_S:
@@ -135,9 +138,9 @@ class Diagnostics:
     ----------
     node : Node
     health : callable
-        Says how the node is.
+        Returns the node's health.
     state : callable
-        Names the state it is in.
+        Returns the name of its lifecycle state.
     """
 
     def __init__(self, node: Node, health: Callable[[], Health], state: Callable[[], str]
@@ -151,7 +154,7 @@ class Diagnostics:
                           Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self) -> None:
-        """Say now how the node is."""
+        """Publish the health now."""
         with self._lock:
             state, health = self._state(), self._health()
         values = {'state': state, **health.values, 'memory [MiB]': f'{_resident_mib():.0f}',
@@ -172,7 +175,7 @@ def _resident_mib() -> float:
 
 
 def _gpu_memory() -> dict[str, object]:
-    """Return what PyTorch holds of the GPU; nothing where it is not used."""
+    """Return the GPU memory that PyTorch holds; nothing where it uses none."""
     torch = sys.modules.get('torch')
     cuda = getattr(torch, 'cuda', None)  # while it is being imported it has none
     if cuda is None or not cuda.is_initialized():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who executes the callbacks of a node, and in which thread."""
+"""The executor of a node: messages in one thread, services and timers in others."""
 
 import time
 import traceback
@@ -13,21 +13,20 @@ from rclpy.service import Service
 from rclpy.task import Task
 from rclpy.timer import Timer
 
-from cliploc_ros.ros.node.requests import MAX_REQUESTS
+from cliploc_ros.ros.node.callback_group import MAX_REQUESTS
 
-# For the requests that may wait, for transitions, parameters, timers and the rest. Threads are
-# made when they are first needed.
+# For requests that wait, transitions, parameters and timers. The pool creates threads on demand.
 _THREADS = MAX_REQUESTS + 8
-# A thread is free, but may have to wait for a core.
+# A thread is free, but may wait for a core.
 _BEGIN_S = 0.1
 
 
 class NodeExecutor(SingleThreadedExecutor):
-    """Takes messages in the thread that spins, services and timers in others, for they may wait.
+    """Takes messages in the thread that spins; services and timers may block, so others run them.
 
-    rclpy's MultiThreadedExecutor hands each message to another thread. Until that has taken it,
-    the message wakes the executor again and again, for a subscription with events is waited for
-    even while it is being served: that costs a whole core, and Python's lock is passed around.
+    rclpy's MultiThreadedExecutor passes each message to another thread. Until that thread takes
+    it, a subscription with events wakes the executor again and again, which costs a whole core
+    and contention for Python's lock.
     """
 
     def __init__(self) -> None:
@@ -35,7 +34,7 @@ class NodeExecutor(SingleThreadedExecutor):
         self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix='service')
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Execute one callback, or begin to; what it raises is logged, and ends nothing."""
+        """Execute one callback, or begin to. Its exceptions are logged and end nothing."""
         try:
             handler, entity, node = self.wait_for_ready_callbacks(timeout_sec)
         except TimeoutException:
@@ -44,7 +43,7 @@ class NodeExecutor(SingleThreadedExecutor):
             _run(handler, node)
             return
         self._pool.submit(_run, handler, node)
-        # rclpy hands out again what has not begun
+        # rclpy returns a handler again until it has begun
         late = time.monotonic() + _BEGIN_S
         while not (handler.executing() or handler.done()) and time.monotonic() < late:
             time.sleep(0.0)
@@ -56,10 +55,10 @@ def _run(handler: Task, node: Node) -> None:
 
 
 def log_failure(error: Exception | None, node: Node) -> None:
-    """Log what a callback raised, or rclpy before it.
+    """Log the exception of a callback, or of rclpy itself.
 
-    Not the InvalidHandle of what was destroyed while rclpy gathered what to wait for, or before
-    its event was taken; nor what rclpy stumbles over while the process ends.
+    InvalidHandle is left out: an entity may be destroyed while rclpy waits for it. So is
+    everything that rclpy raises while the process ends.
     """
     if error is not None and not isinstance(error, InvalidHandle) and node.context.ok():
         text = ''.join(traceback.format_exception(error))

@@ -1,12 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The life of a managed node: what is loaded, what is listened to, and who brings it up."""
+"""A managed node: what it loads, when it works, and who brings it up."""
 
 import logging
+import math
 import threading
 import time
 import traceback
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -18,44 +22,30 @@ from rclpy.node import Node
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
+from cliploc_ros.ros.node.bond import start_bond
+from cliploc_ros.ros.node.callback_group import BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
+from cliploc_ros.ros.node.log import RosLogHandler
 from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, Value
-from cliploc_ros.ros.node.requests import BoundedCallbackGroup
 from cliploc_ros.ros.node.worker import Worker
 
-# A transition may load weights for seconds; meanwhile the state can be asked for.
+# A transition may load weights for seconds; meanwhile clients can ask for the state.
 _MAX_TRANSITION_REQUESTS = 3
-# Between attempts of a node to bring itself up; the pause doubles from one to the next.
+# Between attempts of a node to bring itself up; the pause doubles each time.
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
+_PACKAGE_LOGGER = logging.getLogger('cliploc_ros')
 
 
 class NotActiveError(CliplocError):
-    """The node's state allows no work; the message names it, and why."""
-
-
-class RosLogHandler(logging.Handler):
-    """Passes what the package's modules without ROS log on to a node's logger."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(logging.INFO)
-        self._logger = node.get_logger()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Log one record at its level."""
-        if record.levelno >= logging.ERROR:
-            self._logger.error(record.getMessage())
-        elif record.levelno >= logging.WARNING:
-            self._logger.warning(record.getMessage())
-        else:
-            self._logger.info(record.getMessage())
+    """The node is not active; the message names its state and the remedy."""
 
 
 class ManagedNode(LifecycleNodeMixin, Node):
     """A lifecycle node whose networks run in a worker beside its executor.
 
-    It brings itself up, and tries again when that fails, until somebody else changes its state:
-    from then on that one is its manager. With autostart false it waits for one.
+    The node brings itself up, and retries when that fails, until a client changes its state:
+    from then on that client manages it. With autostart false it waits for a manager.
 
     Parameters
     ----------
@@ -72,80 +62,97 @@ class ManagedNode(LifecycleNodeMixin, Node):
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         LifecycleNodeMixin.__init__(
             self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
-        self.worker = Worker(self._report)
+        self._log_handler = RosLogHandler(self)
+        _PACKAGE_LOGGER.setLevel(logging.INFO)
+        _PACKAGE_LOGGER.addHandler(self._log_handler)
+        self.worker = Worker(self.report)
         self.settings = NodeParameters(self, table, check)
         self.active = False
-        package_logger = logging.getLogger('cliploc_ros')
-        package_logger.setLevel(logging.INFO)
-        package_logger.addHandler(RosLogHandler(self))
         self._transition = threading.Lock()
         self._failure = ''
+        self._bond: Any = None
         self._answer_impossible_transitions()
         self.stages = Stages()
         self.diagnostics = Diagnostics(self, self._health, lambda: self.state)
         self._self_managed: bool = self.settings['autostart']
+        self._starting = ThreadPoolExecutor(1, 'start')
+        self._start: Future[None] | None = None
+        self._start_lock = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
-        # simulated time may stand still
+        # Simulated time may stand still.
         self._starter = self.create_timer(0.0, self._start_by_itself,
                                           MutuallyExclusiveCallbackGroup(),
                                           Clock(clock_type=ClockType.STEADY_TIME))
 
-    # ---- what a node fills in -------------------------------------------------------------------
+    # ---- what a node implements -----------------------------------------------------------------
 
+    @abstractmethod
     def load(self) -> str:
-        """Load map and weights, in the worker's thread; return what was loaded, in a line."""
-        raise NotImplementedError
+        """Load map and weights in the worker's thread; return what was loaded, in one line."""
 
+    @abstractmethod
     def unload(self) -> None:
-        """Let go what load brought, in the worker's thread."""
+        """Drop what load brought, in the worker's thread."""
 
+    @abstractmethod
     def open(self) -> None:
-        """Listen, and begin to work; close undoes it, also where it was left halfway."""
+        """Begin to work. close undoes it, also where open failed halfway."""
 
+    @abstractmethod
     def close(self) -> None:
-        """Stop to listen, and let go whoever waits. The worker may still be busy."""
+        """Stop working, and release requests that wait. The worker may still be busy."""
 
+    @abstractmethod
     def examine(self, health: Health) -> None:
-        """Say how the active node is."""
+        """Report how the active node is."""
 
     def release(self) -> None:
-        """Let go whoever waits in this node: the process ends."""
+        """Release requests that wait: the process ends."""
 
     # ---- state ----------------------------------------------------------------------------------
 
     @property
     def state(self) -> str:
-        """Return the lifecycle state's name."""
+        """Return the name of the lifecycle state."""
         try:
-            with self._state_machine:  # rclpy does not see to it that it is there still
+            with self._state_machine:  # keeps rclpy from destroying it meanwhile
                 return str(self._state_machine.current_state[1])
         except InvalidHandle:
             return 'finalized'
 
-    def bring_up(self) -> None:
-        """Return when the node is active; one that manages itself is made so.
+    def bring_up(self, deadline: float = math.inf) -> None:
+        """Return once the node is active; configure and activate it if it manages itself.
+
+        Parameters
+        ----------
+        deadline : float
+            When to stop waiting (monotonic clock) [s]; loading goes on.
 
         Raises
         ------
         NotActiveError
-            It cannot be, or its manager does not want it to be.
+            It cannot be active, is still loading, or its manager does not want it to be.
         """
-        try:
-            with self._transition, self._state_machine:
-                if self._self_managed and self.state == 'unconfigured':
-                    self.trigger_configure()
-                if self._self_managed and self.state == 'inactive':
-                    self.trigger_activate()
-        except InvalidHandle as error:
-            raise StoppedError('the node is shutting down') from error
+        if self._self_managed and not self.active:
+            left_s = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
+            start = self._begin_start()
+            if not wait([start], left_s).done:
+                raise NotActiveError(f'the node is {self.state}: it is still loading; retry')
+            start.result()
         self.check_active()
 
     def check_active(self) -> None:
         """Raise NotActiveError unless the node is active."""
         if not self.active:
-            raise NotActiveError(
-                f'the node is {self.state}: ' + (self._failure or 'its manager has to configure '
-                                                 'and activate it'))
+            state = self.state
+            remedy = 'restart it' if state == 'finalized' else \
+                'its lifecycle manager must configure and activate it'
+            raise NotActiveError(f'the node is {state}: {self._failure or remedy}')
+
+    def report(self, traceback_text: str) -> None:
+        """Log a defect, throttled: one that repeats with every frame would fill the disk."""
+        if self.context.ok():  # rclpy cannot log at the end of the process
+            self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
 
     def _health(self) -> Health:
         health = Health()
@@ -156,8 +163,28 @@ class ManagedNode(LifecycleNodeMixin, Node):
             health.values |= self.stages.values()
         return health
 
+    def _begin_start(self) -> 'Future[None]':
+        """Return the start that is under way, or a new one."""
+        with self._start_lock:
+            if self._start is None or self._start.done():
+                try:
+                    self._start = self._starting.submit(self._configure_and_activate)
+                except RuntimeError as error:
+                    raise StoppedError('the node is shutting down') from error
+            return self._start
+
+    def _configure_and_activate(self) -> None:
+        try:
+            with self._transition, self._state_machine:
+                if self._self_managed and self.state == 'unconfigured':
+                    self.trigger_configure()
+                if self._self_managed and self.state == 'inactive':
+                    self.trigger_activate()
+        except InvalidHandle as error:
+            raise StoppedError('the node is shutting down') from error
+
     def _start_by_itself(self) -> None:
-        """Bring the node up if nobody else will, else try again later."""
+        """Bring the node up unless it has a manager; retry later where that fails."""
         try:
             if self._self_managed:
                 self.bring_up()
@@ -177,7 +204,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self._attempt(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> Outcome:
-        """Stop to work; what is loaded stays."""
+        """Stop working; what is loaded stays."""
         return self._attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> Outcome:
@@ -207,9 +234,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
             self.close()
             raise
         self.active = True
+        if not self._self_managed:
+            self._bond = start_bond(self)
 
     def _deactivate(self) -> None:
         self.active = False
+        if self._bond is not None:
+            self._bond.shutdown()
+            self._bond = None
         self.close()
 
     def _free(self) -> None:
@@ -222,46 +254,41 @@ class ManagedNode(LifecycleNodeMixin, Node):
         free_memory()
 
     def _attempt(self, step: Callable[[], None]) -> Outcome:
-        """Take a step; rclpy would swallow what it raises."""
+        """Take a step; rclpy would swallow its exceptions. A retry logs the same failure once."""
         try:
             step()
-        except StoppedError as error:
-            self._failure = str(error)
-            return Outcome.FAILURE
         except CliplocError as error:
-            self._failure = str(error)
-            self.get_logger().error(self._failure)
+            known, self._failure = self._failure, str(error)
+            if self._failure != known and not isinstance(error, StoppedError):
+                self.get_logger().error(self._failure)
             return Outcome.FAILURE
         except Exception as error:
             self._failure = f'internal error: {error} (the traceback is in the log)'
-            self._report(traceback.format_exc())
+            self.report(traceback.format_exc())
             return Outcome.ERROR
         self._failure = ''
         return Outcome.SUCCESS
 
     def _answer_impossible_transitions(self) -> None:
-        """Let the service say no where rclpy raises, and would leave its caller waiting."""
+        """Let the service refuse where rclpy raises and leaves its client without an answer."""
         service = next(service for service in self.services if service.srv_type is ChangeState)
         change = service.callback
 
         def answer(request: ChangeState.Request, response: ChangeState.Response
                    ) -> ChangeState.Response:
+            self._self_managed = False
             with self._transition, self._state_machine:
-                self._self_managed = False
                 try:
                     return change(request, response)
-                except Exception as error:  # rcl's own type; rcl has warned of it
+                except Exception as error:  # rcl's own type; rcl has logged it
                     self.get_logger().debug(str(error))
                     response.success = False
                     return response
         service.callback = answer
 
     def destroy_node(self) -> None:
-        """Say good-bye, which rclpy forgets for the services of the state machine."""
+        """Destroy the services of the state machine, which rclpy leaves behind, and the node."""
+        _PACKAGE_LOGGER.removeHandler(self._log_handler)
+        self._starting.shutdown(wait=False, cancel_futures=True)
         self._state_machine.destroy_when_not_in_use()
         super().destroy_node()
-
-    def _report(self, traceback_text: str) -> None:
-        """Log a defect; one that comes with every frame must not fill the disk."""
-        if self.context.ok():  # else rclpy stumbles over the end of the process
-            self.get_logger().error(traceback_text, throttle_duration_sec=1.0)

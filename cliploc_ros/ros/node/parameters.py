@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters declared once: each row of a table is declaration, validation and documentation."""
+"""Parameters declared once: each row of a table is declaration, validation and documentation.
+
+generate_parameter_library does the same at build time, but has no package outside of apt.
+"""
 
 import difflib
 import math
@@ -58,7 +61,7 @@ class ParameterRow:
 
     @property
     def allowed(self) -> str:
-        """Return what the parameter may be, for people."""
+        """Return the allowed values in words."""
         if self.choices:
             return ', '.join(self.choices)
         if isinstance(self.default, bool) or not isinstance(self.default, int | float):
@@ -71,7 +74,7 @@ class ParameterRow:
 
     @property
     def descriptor(self) -> ParameterDescriptor:
-        """Return what ROS's tools show of the parameter."""
+        """Return the descriptor that ROS's tools show."""
         unit = f' [{self.unit}]' if self.unit else ''
         descriptor = ParameterDescriptor(
             description=self.description + unit, additional_constraints=self.allowed,
@@ -85,7 +88,7 @@ class ParameterRow:
         return descriptor
 
     def validated(self, value: Any) -> Value:
-        """Return a value as the parameter's type, integers as floats where floats are meant.
+        """Return a value in the parameter's type; an integer becomes a float where that is meant.
 
         Raises
         ------
@@ -118,8 +121,8 @@ def _is_number_list(value: Any) -> bool:
 class NodeParameters:
     """The parameters of one node: declared from its table, validated at every change.
 
-    A bad value in a parameter file does not end the node: it is kept as a problem, which
-    snapshot() raises until the value is mended.
+    An invalid value in a parameter file does not end the node: snapshot() raises it until the
+    value is corrected.
 
     Parameters
     ----------
@@ -139,9 +142,7 @@ class NodeParameters:
         for row in self._rows.values():
             self._declare(row)
         self._report_unknown()
-        for problem in self._problems.values():
-            node.get_logger().error(f'parameter {problem}')
-        # Replaced as a whole, so that who reads them sees all of a change or nothing of it.
+        # Replaced as a whole: a reader sees all of a change or none of it.
         self._values: dict[str, Value] = {
             name: node.get_parameter(name).value for name in self._rows}
         node.add_on_set_parameters_callback(self._on_set)
@@ -166,7 +167,7 @@ class NodeParameters:
         return dict(values)
 
     def _declare(self, row: ParameterRow) -> None:
-        """Declare one parameter with the value given at start-up, else with its default."""
+        """Declare one parameter with its value from the command line or file, or its default."""
         value: Value = row.default
         if self._node.has_parameter(row.name):
             given = self._node.get_parameter(row.name).value
@@ -174,13 +175,13 @@ class NodeParameters:
             try:
                 value = row.validated(given)
             except OptionsError as error:
-                remedy = 'mend it and start again' if row.read_only else \
-                    f'mend it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
+                remedy = 'correct it and restart' if row.read_only else \
+                    f'correct it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
                 self._problems[row.name] = f'{error}; {remedy}'
         self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
 
     def _report_unknown(self) -> None:
-        """Warn of names that no row declares: most are typing mistakes."""
+        """Warn of parameters that no row declares: most are typing errors."""
         for name in self._node.get_parameters_by_prefix(''):
             if (name in self._rows or name in _FOREIGN_NAMES
                     or name.startswith(_FOREIGN_PREFIXES)):
@@ -190,32 +191,33 @@ class NodeParameters:
             self._node.get_logger().warning(f"unknown parameter '{name}' has no effect{hint}")
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Allow a change at run time only if all values are valid together."""
-        own = [parameter for parameter in parameters if parameter.name in self._rows]
+        """Allow a change if all values are valid together; another callback may refuse it."""
         try:
             for parameter in parameters:
                 if parameter.name.startswith('map.'):
                     raise OptionsError(f'{parameter.name}: the map is read at start-up')
-            changed = {parameter.name: self._rows[parameter.name].validated(parameter.value)
-                       for parameter in own}
-            remaining = {name: text for name, text in self._problems.items()
-                         if name not in changed}
-            if not remaining:
+            changed = self._validated(parameters)
+            if not self._problems.keys() - changed.keys():
                 self._check(self._values | changed)
         except OptionsError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self._problems = remaining
         return SetParametersResult(successful=True)
 
     def _take(self, parameters: list[Parameter]) -> None:
-        """Use a change that was allowed."""
-        self._values = self._values | {
-            parameter.name: self._rows[parameter.name].validated(parameter.value)
-            for parameter in parameters if parameter.name in self._rows}
+        """Use a change that every callback allowed."""
+        changed = self._validated(parameters)
+        self._values = self._values | changed
+        self._problems = {name: text for name, text in self._problems.items()
+                          if name not in changed}
+
+    def _validated(self, parameters: list[Parameter]) -> dict[str, Value]:
+        """Return the values of the parameters that the table declares, by name."""
+        return {parameter.name: self._rows[parameter.name].validated(parameter.value)
+                for parameter in parameters if parameter.name in self._rows}
 
 
 def markdown_table(table: Iterable[ParameterRow]) -> str:
-    """Return a table of parameters in Markdown, as it stands in the README."""
+    """Return a Markdown table of parameters."""
     lines = ['| parameter | default | unit | allowed | at run time | what it does |',
              '|---|---|---|---|---|---|']
     lines += [f'| `{row.name}` | `{_yaml_value(row.default)}` | {row.unit} | {row.allowed} | '

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The life of a node's process: the only caller of rclpy.init."""
+"""The main function of a node's process: the only caller of rclpy.init."""
 
 import atexit
 import ctypes
@@ -18,22 +18,22 @@ from cliploc_ros.ros.node.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _M_ARENA_MAX = -8  # malloc.h
-# For callbacks to end before their node does.
+# Time for callbacks to end before their node is destroyed.
 _GRACE_S = 1.0
 
 
 def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
     """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
-    # Two networks share a robot's cores, each in a process of its own: a thread of PyTorch that
-    # waits by spinning, as they do, slows the other one tenfold. Read when PyTorch is loaded.
+    # The networks of both nodes share a robot's cores. PyTorch's threads wait by spinning, which
+    # slows the other process tenfold. PyTorch reads this when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     _bound_arenas()
-    # Python would raise KeyboardInterrupt wherever it is, in the middle of a callback, too.
+    # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback.
     interrupted = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: interrupted.set())
     try:
         rclpy.init(args=sys.argv)
-    except Exception as error:  # rcl raises its own types for arguments and for missing folders
+    except Exception as error:  # rcl has its own types, for arguments and for missing folders
         sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
     executor = NodeExecutor()
     node = None
@@ -43,31 +43,31 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
         executor.add_node(node)
         while node.context.ok() and not interrupted.is_set():
             try:
-                # rclpy loses the wake-up of a shutdown now and then: look up twice a second.
+                # rclpy sometimes loses the wake-up of a shutdown: check twice a second.
                 executor.spin_once(timeout_sec=0.5)
             except Exception as error:
                 log_failure(error, node)
     except Exception:
         if rclpy.ok():
             raise
-        # a signal came while the node was made
+        # a signal arrived while the node was constructed
     finally:
         if node is not None:
             node.release()
             node.worker.stop()
-            # A callback that goes on in a destroyed node ends the process by a segmentation
-            # fault. rclpy's own shutdown means to wait for callbacks, and does not.
+            # A callback that runs on in a destroyed node causes a segmentation fault. rclpy's
+            # own shutdown should wait for callbacks, but does not.
             executor._work_tracker.wait(_GRACE_S)
-            # What rclpy was about to hand out holds on to everything that it waited for.
+            # The executor's pending handlers keep references to all entities it waited for.
             executor.shutdown(0.0)
-            # Others would take a node that does not say good-bye for alive, and wait for it.
+            # Without this, other nodes take it for alive for 20 s, and requests to it are lost.
             node.destroy_node()
         rclpy.try_shutdown()
     _leave()
 
 
 def _bound_arenas() -> None:
-    """Let the threads share their heaps: what each of twenty keeps for later adds up."""
+    """Let all threads share two heaps: free memory kept in twenty of them adds up."""
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:  # glibc
         mallopt(_M_ARENA_MAX, 2)
@@ -76,8 +76,8 @@ def _bound_arenas() -> None:
 def _leave() -> NoReturn:
     """End the process now.
 
-    A thread inside a network cannot be stopped, and Python would wait for it, and then take
-    seconds to take torch apart.
+    A thread inside a network cannot be stopped. Python would wait for it, and then need seconds
+    to unload torch.
     """
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

@@ -1,21 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Work beside the executor: the node answers while a network runs."""
+"""One thread for long work, so that the node keeps answering while a network runs."""
 
+import math
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from cliploc_ros.errors import CliplocError, InternalError, StoppedError
+from cliploc_ros.errors import CliplocError, InternalError, StoppedError, TimeUpError
 
 # How long a running network may delay the end of its process.
 _GRACE_S = 0.2
 
 
 class Worker:
-    """One thread that works off tasks, one at a time, and survives all of them.
+    """Runs tasks one at a time in a thread of its own, and survives all of them.
 
     Parameters
     ----------
@@ -30,7 +32,7 @@ class Worker:
         self._stopped: Future[None] = Future()
 
     def submit[T](self, task: Callable[[], T]) -> 'Future[T]':
-        """Queue a task; its result or CliplocError is in the future returned."""
+        """Queue a task; the returned future holds its result or its CliplocError."""
         try:
             future = self._pool.submit(self._guarded, task)
         except RuntimeError as error:
@@ -39,20 +41,32 @@ class Worker:
         future.add_done_callback(self._running.discard)
         return future
 
-    def run[T](self, task: Callable[[], T]) -> T:
-        """Return the result of a task, when its turn has come.
+    def run[T](self, task: Callable[[], T], deadline: float = math.inf) -> T:
+        """Return the result of a task when its turn has come.
+
+        Parameters
+        ----------
+        task : callable
+        deadline : float
+            When to stop waiting (monotonic clock) [s]. The task itself goes on.
 
         Raises
         ------
         CliplocError
-            What the task raised; StoppedError when the process ends first.
+            The task raised it; StoppedError when the process ends first.
+        TimeUpError
+            The deadline passed first.
         """
         future = self.submit(task)
         either: list[Future[Any]] = [future, self._stopped]
-        wait(either, return_when=FIRST_COMPLETED)
-        if not future.done() or future.cancelled():
+        left_s = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
+        wait(either, left_s, return_when=FIRST_COMPLETED)
+        if future.done() and not future.cancelled():
+            return future.result()
+        if self._stopped.done() or future.cancelled():
             raise StoppedError('the node is shutting down')
-        return future.result()
+        raise TimeUpError('localizing took longer than timeout_s: raise timeout_s, or choose '
+                          'smaller networks')
 
     def _guarded[T](self, task: Callable[[], T]) -> T:
         try:
@@ -65,7 +79,7 @@ class Worker:
                                 'is in the log)') from error
 
     def stop(self) -> None:
-        """Drop what waits, and give the running task a moment to end; nobody waits for it then."""
+        """Drop the queue and give the running task a moment to end."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         wait(list(self._running), _GRACE_S)
         if not self._stopped.done():
@@ -73,7 +87,7 @@ class Worker:
 
 
 class LatestOnly[T]:
-    """Hands items to a worker; while it is busy only the newest waits.
+    """Passes items to a worker; while the worker is busy, only the newest item waits.
 
     Parameters
     ----------
@@ -91,12 +105,12 @@ class LatestOnly[T]:
 
     @property
     def waiting(self) -> T | None:
-        """Return the item that waits."""
+        """Return the waiting item, if there is one."""
         with self._lock:
             return self._items[0] if self._items else None
 
     def offer(self, item: T) -> None:
-        """Give an item to be worked on, in place of one that still waits."""
+        """Queue an item in place of the one that still waits."""
         with self._lock:
             waiting = bool(self._items)
             self.dropped += waiting

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""An image with what was found in it: boxes, projected ellipsoids, labels, and the verdict."""
+"""The debug image: boxes, projected ellipsoids, labels and the verdict, drawn into an image."""
 
 from dataclasses import dataclass
 
@@ -19,33 +19,33 @@ _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
 _ACCEPTED, _REFUSED = (0, 158, 115), (213, 94, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LABEL_CHARS = 40
-# Text of this many pixels at most stands in a line.
+# The width of a character, at most [px].
 _CHAR_PX = 9
 
 
 @dataclass(frozen=True)
-class View:
+class SeenImage:
     """An image (h, w, 3) uint8, red first, and what was observed in it."""
 
     image_rgb: NDArray[np.uint8]
     observation: Observation
 
 
-def draw_view(view: View, found: Relocalization, landmark_map: LandmarkMap, verdict: str
-              ) -> NDArray[np.uint8]:
-    """Return the image with every usable box and, where it is matched, its landmark's outline.
+def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: LandmarkMap,
+                     verdict: str) -> NDArray[np.uint8]:
+    """Return the image with every usable box and the outlines of matched landmarks.
 
     Parameters
     ----------
-    view : View
+    seen : SeenImage
     found : Relocalization
-        Its matches are of the view's detections.
+        Its matches refer to the detections of the image.
     landmark_map : LandmarkMap
     verdict : str
-        Written above all.
+        Written at the top.
     """
-    canvas = np.ascontiguousarray(view.image_rgb).copy()
-    boxes = view.observation.detections.bboxes_xyxy
+    canvas = np.ascontiguousarray(seen.image_rgb).copy()
+    boxes = seen.observation.detections.bboxes_xyxy
     matched = {match.detection for match in found.matches}
     for row, box in enumerate(boxes):
         _draw_box(canvas, box, _BOX if row in matched else _UNMATCHED)
@@ -57,11 +57,11 @@ def draw_view(view: View, found: Relocalization, landmark_map: LandmarkMap, verd
                                           landmark_map.quats_xyzw[rows]))
         for match, outline in zip(found.matches, outlines, strict=True):
             if np.isfinite(outline).all():
-                points = view.observation.camera.project_normalized(outline_points(outline))
+                points = seen.observation.camera.project_normalized(outline_points(outline))
                 cv2.polylines(canvas, [_pixels(points).reshape(-1, 1, 2)], True, _ELLIPSE, 2,
                               cv2.LINE_AA)
             label = landmark_map.labels[match.landmark][:_LABEL_CHARS]
-            similarity = _similarity(view.observation, match.detection, match.landmark)
+            similarity = _similarity(seen.observation, match.detection, match.landmark)
             corner = _pixels(boxes[match.detection][:2])
             _write(canvas, f'{label} {similarity}IoU {match.iou:.2f}', corner - (0, 4), _BOX)
     for line, text in enumerate(_lines(verdict, canvas.shape[1] // _CHAR_PX)):
@@ -87,17 +87,17 @@ def _draw_box(canvas: NDArray[np.uint8], box: NDArray[np.float64], color: tuple[
 
 
 def _pixels(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return whole pixels, no farther away than OpenCV counts."""
+    """Return whole pixels, within the range that OpenCV can draw."""
     return np.clip(np.rint(points), -30_000, 30_000).astype(np.int32)
 
 
 def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
            color: tuple[int, int, int]) -> None:
-    """Write a line with a shadow, inside of the image."""
+    """Write a line with a shadow, inside the image."""
     height, width = canvas.shape[:2]
     place = (int(np.clip(at[0], 0, max(0, width - 10))), int(np.clip(at[1], 12, height)))
-    text = text.encode('ascii', 'replace').decode()  # OpenCV draws no others
-    # equally thick: OpenCV 5 writes thicker text wider
+    text = text.encode('ascii', 'replace').decode()  # OpenCV has no other characters
+    # As thick as the text: OpenCV 5 writes thicker text wider.
     shadow = (place[0] + 1, place[1] + 1)
     cv2.putText(canvas, text, shadow, _FONT, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     cv2.putText(canvas, text, place, _FONT, 0.45, color, 1, cv2.LINE_AA)

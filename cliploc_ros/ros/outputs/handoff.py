@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Telling a running localizer where the robot is: AMCL, or whoever else takes `initialpose`."""
+"""Handing an accepted pose over to a running localizer: AMCL, or another with `initialpose`."""
 
 import math
 import threading
+import time
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
@@ -12,26 +13,36 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.time import Time
 from std_srvs.srv import Empty
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
 # degree. AMCL draws its particles from x, y and yaw; without any scatter they would all be one.
 _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
-# How long odometry that somebody publishes may let wait: discovery takes its time, too.
+# Odometry of a robot at rest may be this old (a guess): slow sources send at 1 Hz.
+_MAX_ODOM_AGE_S = 2.0
+# How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
+# How long to wait for a subscriber of initialpose; discovery of a running one takes less.
+_SUBSCRIBER_PATIENCE_S = 2.0
 # AMCL updates with its next scan; two calls before that count as one. Scans come at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
-_UPDATE_PATIENCE_S = 1.0
+_UPDATE_PATIENCE_S = 2.0
 
 
 class HandOffError(CliplocError):
-    """The localizer was not told; the message says why."""
+    """The localizer did not get the pose; the message says why."""
+
+
+class NoLocalizerError(HandOffError):
+    """Nobody subscribes `initialpose`: another pose would not help."""
 
 
 class HandOff:
@@ -41,71 +52,141 @@ class HandOff:
     ----------
     node : Node
     odometry : OdometrySource
-        Tells whether the robot moves, while somebody listens to it.
+        Knows whether the robot moves; has to be listening.
     """
 
     def __init__(self, node: Node, odometry: OdometrySource) -> None:
         self._node = node
         self._odometry = odometry
-        self._publisher = node.create_publisher(PoseWithCovarianceStamped, 'initialpose',
-                                                qos.POSE)
+        self._changed = threading.Condition()
+        self._stopped = threading.Event()
+        self._jumped_at = -math.inf
+        self._publisher = node.create_publisher(
+            PoseWithCovarianceStamped, 'initialpose', qos.POSE,
+            event_callbacks=PublisherEventCallbacks(matched=lambda _: self._wake()))
         self._updater = node.create_client(Empty, 'request_nomotion_update',
                                            callback_group=ReentrantCallbackGroup())
-        self._stopped = threading.Event()
 
     def open(self) -> None:
-        """Be ready to hand over."""
+        """Allow hand-overs."""
         self._stopped.clear()
 
     def stop(self) -> None:
-        """Let go a hand-off that is under way."""
+        """End the hand-over under way: the node is deactivated."""
         self._stopped.set()
+        self._wake()
 
-    def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any]) -> None:
+    def forget(self) -> None:
+        """Withhold the pose of the hand-over under way: time jumped."""
+        self._jumped_at = time.monotonic()
+
+    def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
+                  deadline: float, received_at: float) -> None:
         """Publish a pose on `initialpose`, and return when the localizer had time to settle.
 
         Parameters
         ----------
         pose : PoseWithCovarianceStamped
-            Accepted, in the map's frame, with the image's stamp.
+            Accepted, in the map's coordinate frame, with the image's stamp.
         values : mapping
-            Of the relocalizer's parameters.
+            The relocalizer's parameters.
+        deadline : float
+            When to return at the latest (monotonic clock) [s]. A hand-over that need not wait is
+            made after it, too.
+        received_at : float
+            When the image arrived (monotonic clock) [s].
 
         Raises
         ------
         HandOffError
-            The robot moves, or nobody can tell; nothing was published.
+            The robot moves or may do so; nothing was published.
+        NoLocalizerError
+            Nobody subscribes `initialpose`; nothing was published.
+        TimeJumpError
+            Time has jumped back since; nothing was published.
         """
         if not values['base_frame']:
             self._node.get_logger().warning(
-                "initialpose carries the camera's pose, for base_frame is empty: set it to what "
-                'AMCL calls base_frame_id, where AMCL listens', once=True)
-        self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'])
+                "initialpose carries the camera's pose: base_frame is empty; for AMCL set it to "
+                "AMCL's base_frame_id", once=True)
+        if values['require_localizer']:
+            self._wait_for_localizer(deadline)
+        self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
+        if self._jumped_at >= received_at:
+            raise TimeJumpError('time jumped back before the hand-over: the pose is from before')
+        if self._stopped.is_set():
+            raise HandOffError('the node was deactivated during the hand-over')
         self._publisher.publish(usable_pose(pose, self._node.get_clock().now()))
-        for _ in range(values['nomotion_updates']):
-            if not self._updater.service_is_ready() or self._stopped.wait(_UPDATE_PERIOD_S):
-                return
-            answered = threading.Event()
-            self._updater.call_async(Empty.Request()).add_done_callback(
-                lambda _, done=answered: done.set())
-            answered.wait(_UPDATE_PATIENCE_S)
+        self._settle(values['nomotion_updates'], deadline)
 
-    def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float) -> None:
-        """Raise unless odometry says that the robot rests; without odometry it is believed to."""
-        odometry = self._odometry.recent(_ODOM_PATIENCE_S)
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _wait_for_localizer(self, deadline: float) -> None:
+        """Raise unless somebody subscribes `initialpose`, or soon does."""
+        def subscribed() -> bool:
+            return bool(self._publisher.get_subscription_count())
+        with self._changed:
+            self._changed.wait_for(lambda: subscribed() or self._stopped.is_set(),
+                                   min(_SUBSCRIBER_PATIENCE_S, _left_s(deadline)))
+        if not subscribed():
+            raise NoLocalizerError(f'nobody subscribes {self._publisher.topic_name}: start the '
+                                   'localizer (AMCL), or set require_localizer: false')
+
+    def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
+        """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""
+        odometry = self._odometry.recent(_MAX_ODOM_AGE_S,
+                                         min(_ODOM_PATIENCE_S, _left_s(deadline)))
         if odometry is None:
             if not self._odometry.is_published:
                 self._node.get_logger().warning(
-                    f'nobody publishes {self._odometry.topic}: the robot is taken to stand',
+                    f'nobody publishes {self._odometry.topic}: the robot is taken to rest',
                     once=True)
                 return
-            raise HandOffError(f'{self._odometry.topic} has a publisher that says nothing, so the '
-                               'robot may be moving: initialpose is withheld')
+            raise HandOffError(f'{self._odometry.topic} has a publisher but no messages: the '
+                               'robot may be moving')
+        left_s = _left_s(deadline)
+        by_poses = self._odometry.speeds_by_poses(left_s)
+        if by_poses is None and left_s < MOMENT_PATIENCE_S:
+            raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
+                               'left to see whether the robot moves: ask again')
         # np.maximum passes NaN on, which no limit allows
-        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), self._odometry.speeds_by_poses())
+        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), by_poses or (0.0, 0.0))
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
-                               'rad/s: initialpose is withheld, ask again when it stands')
+                               f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')
+
+    def _settle(self, updates: int, deadline: float) -> None:
+        """Have AMCL take in some scans though the robot rests, as far as time allows.
+
+        The pose is delivered: what fails here is not worth an error.
+        """
+        for _ in range(updates):
+            if (not self._updater.service_is_ready() or _left_s(deadline) < _UPDATE_PERIOD_S
+                    or self._stopped.wait(_UPDATE_PERIOD_S)):
+                return
+            if not self._update(min(_UPDATE_PATIENCE_S, _left_s(deadline))):
+                return
+
+    def _update(self, timeout_s: float) -> bool:
+        """Ask AMCL for one update; return whether it answers."""
+        answered = threading.Event()
+        future = self._updater.call_async(Empty.Request())
+        future.add_done_callback(lambda _: answered.set())
+        if answered.wait(timeout_s):
+            return True
+        self._updater.remove_pending_request(future)
+        self._node.get_logger().warning(
+            f'{self._updater.service_name} did not answer within {timeout_s:.1f} s: the '
+            'localizer has the pose, but may not settle while the robot rests',
+            throttle_duration_sec=5.0)
+        return False
+
+
+def _left_s(deadline: float) -> float:
+    """Return how long it is until a moment of the monotonic clock, at least 0 [s]."""
+    return max(0.0, deadline - time.monotonic())
 
 
 def speeds(odometry: Odometry) -> tuple[float, float]:
@@ -115,10 +196,10 @@ def speeds(odometry: Odometry) -> tuple[float, float]:
 
 
 def usable_pose(pose: PoseWithCovarianceStamped, now: Time) -> PoseWithCovarianceStamped:
-    """Return a pose as AMCL can use it.
+    """Return a pose that AMCL can use.
 
-    Its stamp is not in the future, which AMCL has no odometry for, and no variance is so small
-    that all particles would be the same. AMCL reads elements 0, 1, 6, 7 and 35 of the covariance.
+    Its stamp is not in the future, for which AMCL has no odometry, and no variance is so small
+    that all particles coincide. AMCL reads elements 0, 1, 6, 7 and 35 of the covariance.
 
     Parameters
     ----------

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """map -> odom of REP 105: for a robot without another localizer that broadcasts it."""
 
+import math
+import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,90 +18,107 @@ from rclpy.timer import Timer
 from std_msgs.msg import Header
 
 from cliploc_ros.ros.conversions import pose_to_msg
-from cliploc_ros.ros.inputs.coordinate_frames import BaseFrame, FrameError
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 
-# Between broadcasts. Each is dated until the next one, so that who asks about now need not wait.
+# Between broadcasts. Each is dated ahead to the next one, so that a lookup at now need not wait.
 _PERIOD_S = 0.1
 
 
-class OdomFrame:
-    """Broadcasts where odometry began: odom -> base, which others broadcast, drifts from there.
+class MapToOdom:
+    """Broadcasts the transform from odometry's coordinate frame to the map.
+
+    Odometry broadcasts odom -> base, and drifts from where it began.
 
     Parameters
     ----------
     node : Node
-    base : BaseFrame
+    transforms : CoordinateFrames
         Knows where the robot was by odometry.
     """
 
-    def __init__(self, node: Node, base: BaseFrame) -> None:
+    def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
         self._node = node
-        self._base = base
+        self._transforms = transforms
         self._broadcaster: Any = None
         self._timer: Timer | None = None
+        # Set in the worker's thread, dropped in the thread that takes /clock.
+        self._lock = threading.Lock()
         self._transform: TransformStamped | None = None
+        self._jumped_at = -math.inf
 
     def open(self) -> None:
-        """Begin to broadcast, as soon as there is a pose.
+        """Broadcast from now on, as soon as there is a pose.
 
         Raises
         ------
-        FrameError
+        NoTransformError
             tf2_ros is not installed.
         """
         try:
             from tf2_ros import TransformBroadcaster
         except ImportError as error:
-            raise FrameError('publish_tf is set, but tf2_ros is not installed') from error
+            raise NoTransformError('publish_tf is true, but tf2_ros is not installed: install it, '
+                                   'or set publish_tf: false') from error
         if self._broadcaster is None:
             self._broadcaster = TransformBroadcaster(self._node)
         self._timer = self._node.create_timer(_PERIOD_S, self._broadcast, clock=Clock(
             clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
-        """Broadcast no longer, and forget the pose."""
+        """Stop broadcasting, and drop the transform."""
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
-        self._timer = self._transform = None
+        self._timer = None
+        self.forget()
 
-    def update(self, header: Header, map_from_base: NDArray[np.float64],
-               values: Mapping[str, Any]) -> None:
-        """Take in where the robot was; does nothing while closed.
+    def forget(self) -> None:
+        """Drop the transform until the next accepted pose: time jumped."""
+        with self._lock:
+            self._transform, self._jumped_at = None, time.monotonic()
+
+    def update(self, header: Header, map_from_base: NDArray[np.float64], values: Mapping[str, Any],
+               received_at: float) -> None:
+        """Take in where the robot was; does nothing while closed, or if time has jumped since.
 
         Parameters
         ----------
         header : Header
-            Stamp of the image, frame of the map.
+            Stamp of the image, coordinate frame of the map.
         map_from_base : ndarray (4, 4)
         values : mapping
-            Of the relocalizer's parameters.
+            The relocalizer's parameters.
+        received_at : float
+            When the image arrived (monotonic clock) [s].
 
         Raises
         ------
-        FrameError
-            Nobody says where the robot was by odometry; the former transform stays.
+        NoTransformError
+            The robot's place by odometry is unknown; the former transform stays.
         """
         if self._timer is None:
             return
-        base_from_odom = self._base.lookup(values['base_frame'], values['odom_frame'],
-                                           header.stamp, values['tf_timeout_s'])
-        self._transform = transform_msg(header, values['odom_frame'],
-                                        map_from_base @ base_from_odom)
+        base_from_odom = self._transforms.lookup(values['base_frame'], values['odom_frame'],
+                                                 header.stamp, values['tf_timeout_s'])
+        transform = transform_msg(header, values['odom_frame'], map_from_base @ base_from_odom)
+        with self._lock:
+            if received_at > self._jumped_at:
+                self._transform = transform
 
     def _broadcast(self) -> None:
-        transform = self._transform
-        if transform is None:
-            return
-        until = (self._node.get_clock().now() + Duration(seconds=_PERIOD_S)).to_msg()
-        if transform.header.stamp == until:
-            return  # simulated time stands still; tf2 warns of a stamp that comes twice
-        transform.header.stamp = until
-        self._broadcaster.sendTransform(transform)
+        with self._lock:
+            transform = self._transform
+            if transform is None:
+                return
+            until = (self._node.get_clock().now() + Duration(seconds=_PERIOD_S)).to_msg()
+            if transform.header.stamp == until:
+                return  # simulated time stands still; tf2 warns of a stamp that comes twice
+            transform.header.stamp = until
+            self._broadcaster.sendTransform(transform)
 
 
 def transform_msg(header: Header, child_frame: str, parent_from_child: NDArray[np.float64]
                   ) -> TransformStamped:
-    """Return a transform (4, 4) from a child frame to the header's as a message."""
+    """Return a transform (4, 4) from a child coordinate frame to the header's as a message."""
     pose = pose_to_msg(parent_from_child)
     msg = TransformStamped(header=Header(stamp=header.stamp, frame_id=header.frame_id),
                            child_frame_id=child_frame)

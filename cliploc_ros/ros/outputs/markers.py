@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What RViz shows: landmarks as ellipsoids with their labels, matches as lines."""
+"""Markers for RViz: landmarks as ellipsoids with their labels, matches as lines."""
 
 import colorsys
 import zlib
@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 
-#: The most landmarks that are shown: RViz draws no more at a pleasant rate.
+#: The most landmarks that are shown: with more, RViz draws slowly.
 MAX_SHOWN = 5000
 _TEXT_HEIGHT_M = 0.08
 _LINE_WIDTH_M = 0.01
@@ -45,18 +45,18 @@ def landmark_markers(landmark_map: LandmarkMap) -> MarkerArray:
 
 
 def no_markers() -> MarkerArray:
-    """Return what takes all markers away."""
+    """Return a message that removes all markers."""
     return MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
 
 
 def match_markers(header: Header, camera_position: NDArray[np.float64],
                   centers: Sequence[NDArray[np.float64]], accepted: bool) -> MarkerArray:
-    """Return lines from a camera to the landmarks that it saw.
+    """Return lines from a camera to the landmarks matched.
 
     Parameters
     ----------
     header : Header
-        Stamp of the image, frame of the map.
+        Stamp of the image, coordinate frame of the map.
     camera_position : ndarray (3,)
         [m].
     centers : sequence of ndarray (3,)
@@ -75,7 +75,7 @@ def match_markers(header: Header, camera_position: NDArray[np.float64],
 
 
 def class_color(class_id: str) -> ColorRGBA:
-    """Return the colour of a class: always the same, and others for most others."""
+    """Return the colour of a class: always the same, and mostly a different one for each class."""
     hue = zlib.crc32(class_id.encode()) / 2**32
     r, g, b = colorsys.hsv_to_rgb(hue, 0.7, 0.95)
     return ColorRGBA(r=r, g=g, b=b, a=0.6)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer's pictures, each made only while somebody looks."""
+"""What the relocalizer shows in RViz, each topic only while it has subscribers."""
 
 import array
 import threading
@@ -18,7 +18,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg
-from cliploc_ros.ros.outputs.debug_image import View, draw_view
+from cliploc_ros.ros.outputs.debug_image import SeenImage, draw_debug_image
 from cliploc_ros.ros.outputs.markers import landmark_markers, match_markers, no_markers
 
 
@@ -31,7 +31,7 @@ class Visualization:
     """
 
     def __init__(self, node: Node) -> None:
-        # looked at in one thread, loaded in another
+        # Subscribers match in one thread, a map is loaded in another.
         self._lock = threading.Lock()
         self._map: LandmarkMap | None = None
         self._shown: LandmarkMap | None = None
@@ -43,8 +43,8 @@ class Visualization:
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self._show_map()))
 
     @property
-    def wants_view(self) -> bool:
-        """Return whether somebody looks at the debug image."""
+    def wants_debug_image(self) -> bool:
+        """Return whether the debug image has subscribers."""
         return bool(self._debug_image.get_subscription_count() > 0)
 
     def set_map(self, landmark_map: LandmarkMap | None) -> None:
@@ -55,16 +55,16 @@ class Visualization:
 
     def show(self, header: Header, landmark_map: LandmarkMap, found: Relocalization,
              camera_from_base: NDArray[np.float64]) -> None:
-        """Show which landmarks were seen, and the poses that they speak for.
+        """Show the matched landmarks and the best hypotheses.
 
         Parameters
         ----------
         header : Header
-            Stamp of the image, frame of the map.
+            Stamp of the image, coordinate frame of the map.
         landmark_map : LandmarkMap
         found : Relocalization
         camera_from_base : ndarray (4, 4)
-            How the camera is mounted on what the hypotheses are shown of.
+            The pose of the published coordinate frame, seen from the camera.
         """
         if self._hypotheses.get_subscription_count() > 0:
             self._hypotheses.publish(pose_array_msg(header, [
@@ -77,24 +77,24 @@ class Visualization:
             header, position, [landmark_map.centers[match.landmark] for match in found.matches],
             found.accepted))
 
-    def show_view(self, header: Header, view: View, landmark_map: LandmarkMap,
-                  found: Relocalization, verdict: str) -> None:
-        """Show the image with what was found in it.
+    def show_debug_image(self, header: Header, seen: SeenImage, landmark_map: LandmarkMap,
+                         found: Relocalization, verdict: str) -> None:
+        """Publish the image with what was found in it.
 
         Parameters
         ----------
         header : Header
             Of the image.
-        view : View
+        seen : SeenImage
         landmark_map : LandmarkMap
         found : Relocalization
         verdict : str
         """
         self._debug_image.publish(image_to_msg(
-            draw_view(view, found, landmark_map, verdict), header))
+            draw_debug_image(seen, found, landmark_map, verdict), header))
 
     def _show_map(self) -> None:
-        """Publish the map if somebody looks who has not seen it; the publisher keeps it."""
+        """Publish the map if it is new and somebody subscribes; it is kept for later ones."""
         with self._lock:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Localizing frame after frame of one moving camera: what the relocalizer node does.
+
+A session fuses each frame with the last few that odometry links to it, and accepts a pose only
+where the successive looks agree.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.units import NS_PER_S
+
+# A camera that moved less sees the same again: its new frame replaces the one before.
+_MOVED_M = 0.05
+_MOVED_DEG = 3.0
+
+
+class KeptFrame(NamedTuple):
+    """A searched frame, and the odom_from_camera (4, 4) of the first frame that it replaced.
+
+    A camera that creeps moves away from this anchor in the end.
+    """
+
+    searched: SearchedFrame
+    anchor: NDArray[np.float64]
+
+
+class Session:
+    """Localizes with each frame and those before it.
+
+    Parameters
+    ----------
+    relocalizer : Relocalizer
+    """
+
+    def __init__(self, relocalizer: Relocalizer) -> None:
+        self._relocalizer = relocalizer
+        self._frames: list[KeptFrame] = []
+        self._looks = Looks()
+        self._run = -1
+        self._stamp_ns = 0
+
+    def localize(self, observation: Observation, run: int = 0, limit: int = 1,
+                 length_s: float = 0.0) -> Relocalization:
+        """Localize with a frame and, where odometry places it, with those before it.
+
+        Odometry links all frames of one run. A new run or a stamp before the last one forgets
+        frames and looks. Looks persist while the run lasts, whatever `length_s`.
+
+        Parameters
+        ----------
+        observation : Observation
+            Without odom_from_camera it is localized alone, and the session does not change.
+        run : int
+            Number of the run of odometry.
+        limit : int
+            The most frames to fuse, this one included.
+        length_s : float
+            Older frames are dropped [s].
+
+        Raises
+        ------
+        OptionsError
+            See Relocalizer.relocalize. The session drops this frame.
+        """
+        if observation.odom_from_camera is None:
+            return self._relocalizer.relocalize([observation])
+        if run != self._run or observation.stamp_ns < self._stamp_ns:
+            self._frames, self._looks = [], Looks()
+        self._run, self._stamp_ns = run, observation.stamp_ns
+        earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
+        budget = self._relocalizer.begin(len(earlier) + 1)
+        newest = KeptFrame(self._relocalizer.search(observation, budget.search_end()), anchor)
+        frames = [*earlier, newest]
+        found = self._relocalizer.locate([one.searched for one in frames], budget, self._looks)
+        self._frames = frames
+        if found.map_from_camera is not None:
+            self._looks = self._looks.with_look(observation, found.map_from_camera)
+        return found
+
+
+def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit: int,
+                   length_s: float) -> tuple[list[KeptFrame], NDArray[np.float64]]:
+    """Return the frames to fuse a new one with, oldest first, and the anchor of the new one.
+
+    Of too many frames those remain that are furthest apart, so a camera that turns is localized
+    by all that it saw on its way.
+    """
+    first_ns = observation.stamp_ns - round(length_s * NS_PER_S)
+    # a frame without detections has nothing to fuse
+    earlier = [one for one in frames if len(one.searched.observation.detections)
+               and first_ns <= one.searched.observation.stamp_ns < observation.stamp_ns]
+    anchor = observation.odom_from_camera
+    assert anchor is not None
+    if earlier and max(_steps(earlier[-1].anchor, anchor)) <= 1.0:
+        anchor = earlier.pop().anchor
+    while len(earlier) >= limit:
+        del earlier[_least_useful([*(one.anchor for one in earlier), anchor])]
+    return earlier, anchor
+
+
+def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
+    """Return how far a camera drove and turned, in the steps that make a frame a new one."""
+    distance_m, angle_deg = pose_error(before, after)
+    return distance_m / _MOVED_M, angle_deg / _MOVED_DEG
+
+
+def _least_useful(anchors: Sequence[NDArray[np.float64]]) -> int:
+    """Return the frame that is nearest to those before and after it; neither end if possible."""
+    ways = [sum(_steps(anchors[row - 1], anchors[row]) + _steps(anchors[row], anchors[row + 1]))
+            for row in range(1, len(anchors) - 1)]
+    return 1 + int(np.argmin(ways)) if ways else 0

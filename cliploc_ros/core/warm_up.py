@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A tiny problem that calls every compiled kernel once."""
+
+import numpy as np
+
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.search.compatibility import compatible_pairs
+from cliploc_ros.core.search.leaders import Leaders, same_place
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
+from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.strategies import (
+    search_exhaustively,
+    search_progressively,
+    search_samples,
+)
+
+
+def call_every_kernel() -> None:
+    """Call every kernel that a relocalization needs, with three boxes and three landmarks."""
+    rng = np.random.default_rng(0)
+    bboxes = np.array([[100, 100, 150, 160], [300, 120, 360, 150], [200, 300, 260, 390]],
+                      dtype=np.float64)
+    pairs = np.array([[0, 0], [1, 1], [2, 2]], dtype=np.int64)
+    centers = np.array([[0.0, 0, 5], [1, 0, 6], [0, 1, 5]])
+    shapes = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (3, 1))
+    scene = make_scene(Camera(640, 480, 500.0, 500.0, 320.0, 240.0).normalize_bboxes(bboxes),
+                       centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
+    list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
+    list(search_exhaustively(scene, Leaders.none_yet()))
+    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
+    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+    scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
+    choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+    refine_rig(rig, np.eye(3), np.zeros(3))
+    same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    project_ellipsoids(np.eye(4), centers, shapes)

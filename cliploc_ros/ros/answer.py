@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The answer to a request, or to one frame in continuous mode."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+
+class Verdict(StrEnum):
+    """What became of a request."""
+
+    #: The pose is accepted and, for a request, delivered.
+    ACCEPTED = 'accepted'
+    #: No pose is certain enough.
+    REFUSED = 'refused'
+    #: A pose is accepted but was not delivered: the robot moves, or nobody takes it.
+    WITHHELD = 'withheld'
+    #: There was nothing to decide on: no frame, a bad message, a node that is not active.
+    FAILED = 'failed'
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A verdict, its reason and, where it is accepted, the pose.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    detail : str
+        The pose in words, or the reason for having none, in one line.
+    pose : PoseWithCovarianceStamped or None
+        None unless accepted.
+    received_at : float
+        When the image arrived (monotonic clock) [s]; -inf without one.
+    is_linked : bool
+        Whether odometry links the frame with those before and after it.
+    """
+
+    verdict: Verdict
+    detail: str
+    pose: PoseWithCovarianceStamped | None = None
+    received_at: float = -math.inf
+    is_linked: bool = False
+
+    @property
+    def message(self) -> str:
+        """Return the verdict and its reason in one line."""
+        if self.verdict is Verdict.FAILED:
+            return self.detail
+        return f'{self.verdict}: {self.detail}'

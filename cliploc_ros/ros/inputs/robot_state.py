@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the robot knows besides its image: the camera's mount, the vertical and odometry."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+
+_LOG_PERIOD_S = 5.0
+# Time for a publisher of odometry that has just been discovered to deliver its first message.
+_DISCOVERY_S = 1.0
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where odometry had the camera.
+
+    Parameters
+    ----------
+    odom_from_camera : ndarray (4, 4)
+    run : int
+        Places of one run share their odometry frame.
+    """
+
+    odom_from_camera: NDArray[np.float64]
+    run: int
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """The robot at the stamp of one image.
+
+    Parameters
+    ----------
+    camera_from_base : ndarray (4, 4)
+        The mount; identity where the camera's own pose is wanted.
+    up_in_camera : ndarray (3,) or None
+        The vertical, a unit vector in the camera's optical frame; None where it is not known.
+    place : CameraPlace or None
+        None where odometry does not cover the image.
+    """
+
+    camera_from_base: NDArray[np.float64]
+    up_in_camera: NDArray[np.float64] | None = None
+    place: CameraPlace | None = None
+
+
+class RobotStateSource:
+    """Gathers the mount, the vertical and odometry while the node is active.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    """
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._node = node
+        self.transforms = CoordinateFrames(node)
+        self.odometry = OdometrySource(node)
+        self._vertical = VerticalSource(node, self.transforms)
+        self._unmounted = ''
+
+    def open(self) -> None:
+        """Subscribe to what the parameters ask for."""
+        values = self._node.settings
+        if values['publish_tf'] or (values['base_frame'] and not any(values['base_from_camera'])):
+            # in the worker, for importing tf2 takes a while
+            self._node.worker.run(self.transforms.open)
+        self._vertical.open(values['gravity'])
+        self.odometry.open()
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self.odometry.close()
+        self._vertical.close()
+        self._node.worker.submit(self.transforms.close)  # after a search that may be under way
+
+    def forget(self) -> None:
+        """Forget what was heard: time jumped."""
+        self.transforms.forget()
+        self._vertical.forget()
+        self.odometry.forget()
+
+    def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
+        """Return whether odometry can link the frame that follows an image.
+
+        Parameters
+        ----------
+        stamp : Time
+            Of the image.
+        deadline : float
+            When to stop waiting for odometry that has just begun (monotonic clock) [s].
+        """
+        patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
+        return (self._node.settings['fuse_frames'] > 1
+                and self.odometry.covers_soon(stamp, patience_s))
+
+    def at(self, image: Header, values: Mapping[str, Any]) -> RobotState:
+        """Return the robot's state at the stamp of an image.
+
+        Without a vertical, or without odometry, the search does without.
+
+        Parameters
+        ----------
+        image : Header
+            Of the image.
+        values : mapping
+            The relocalizer's parameters.
+
+        Raises
+        ------
+        NoTransformError
+            The mount is not known.
+        """
+        camera_from_base = self.transforms.camera_from_base(
+            values['base_frame'], values['base_from_camera'], image.frame_id, image.stamp,
+            values['tf_timeout_s'])
+        return RobotState(camera_from_base, self._up(image, values, camera_from_base),
+                          self._place(image, values, camera_from_base))
+
+    def _up(self, image: Header, values: Mapping[str, Any],
+            camera_from_base: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        try:
+            return self._vertical.up_in_camera(values, camera_from_base, image.frame_id,
+                                               image.stamp)
+        except (NoVerticalError, NoTransformError) as error:
+            self._warn(f'localizing without the vertical: {error}')
+            return None
+
+    def _place(self, image: Header, values: Mapping[str, Any],
+               camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
+        if values['fuse_frames'] == 1:
+            return None
+        try:
+            body = self.odometry.pose_at(image.stamp)
+            if body.body_frame == image.frame_id:
+                return CameraPlace(body.odom_from_body, body.run)
+            camera_from_body = camera_from_base if body.body_frame == values['base_frame'] \
+                else self._camera_from_body(image, body.body_frame, values['tf_timeout_s'])
+        except NoOdometryError as error:
+            self._node.get_logger().debug(f'one frame alone: {error}')
+            return None
+        except NoTransformError as error:
+            self._warn(f'one frame alone: {error}')
+            return None
+        return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run)
+
+    def _camera_from_body(self, image: Header, body_frame: str, timeout_s: float
+                          ) -> NDArray[np.float64]:
+        """Ask tf2; do not wait again for what it did not know the last time."""
+        known = self._unmounted != body_frame
+        self._unmounted = body_frame
+        camera_from_body = self.transforms.lookup(image.frame_id, body_frame, image.stamp,
+                                            timeout_s if known else 0.0)
+        self._unmounted = ''
+        return camera_from_body
+
+    def _warn(self, text: str) -> None:
+        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)

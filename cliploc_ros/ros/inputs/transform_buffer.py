@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The part that needs tf2_ros to be imported: tf2's buffer, made safe against time jumps."""
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.node import Node
+from tf2_ros import Buffer, TransformListener
+
+from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.time_jumps import StampOrder
+
+
+class TransformBuffer(Buffer):
+    """Listens to `/tf` and `/tf_static`; clears itself where the stamps of a transform go back.
+
+    tf2 itself refuses transforms that are ten seconds older than the newest one, and interpolates
+    between those from before and after a shorter jump. Jazzy's Buffer clears itself only where it
+    is given a node, and its first releases raise TypeError there. Besides, transforms from before
+    the jump may arrive after the clock's. clear() keeps static transforms.
+
+    Parameters
+    ----------
+    node : Node
+    """
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self._stamps = StampOrder()
+        self._listener = TransformListener(self, node)
+
+    def set_transform(self, transform: TransformStamped, authority: str) -> None:
+        """Take in a transform, and forget the others if time jumped back."""
+        if self._stamps.goes_back(transform.child_frame_id, stamp_ns(transform.header.stamp)):
+            super().clear()
+        super().set_transform(transform, authority)
+
+    def clear(self) -> None:
+        """Forget all transforms but the static ones."""
+        self._stamps.clear()
+        super().clear()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._listener.unregister()

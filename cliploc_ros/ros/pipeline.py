@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From one frame to its answer: robot state, localizer, acceptance, outputs."""
+
+from functools import partial
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_msgs.msg import Header
+
+from cliploc_ros.core.geometry.transforms import move_covariance
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.conversions import pose_with_covariance_msg
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.localizer import Localized, Localizer, load_localizer
+from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
+from cliploc_ros.ros.outputs.visualization import Visualization
+
+_LOG_PERIOD_S = 5.0
+
+
+class Pipeline:
+    """Localizes with one frame at a time and publishes the result.
+
+    All methods but open and close run in the node's worker, one after another.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    robot : RobotStateSource
+    jumps : TimeJumps
+    """
+
+    def __init__(self, node: ManagedNode, robot: RobotStateSource, jumps: TimeJumps) -> None:
+        self._node = node
+        self._jumps = jumps
+        self._robot = robot
+        self.localizer: Localizer | None = None
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
+        self._map_to_odom = MapToOdom(node, robot.transforms)
+        self._visualization = Visualization(node)
+
+    def load(self) -> str:
+        """Load map and network; return what was loaded, in one line."""
+        return self._use(load_localizer(self._node, self._node.settings.snapshot()))
+
+    def reload_map(self) -> str:
+        """Read the map again; return what was loaded, in one line."""
+        if self.localizer is None:
+            raise NotActiveError(f'the node is {self._node.state}')
+        return self._use(self.localizer.reloaded(self._node, self._node.settings.snapshot()))
+
+    def unload(self) -> None:
+        """Drop map and network."""
+        self.localizer = None
+        self._visualization.set_map(None)
+
+    def open(self) -> None:
+        """Begin to broadcast map -> odom where that is asked for."""
+        if self._node.settings['publish_tf']:
+            self._map_to_odom.open()
+
+    def close(self) -> None:
+        """Stop broadcasting."""
+        self._map_to_odom.close()
+
+    def forget(self) -> None:
+        """Drop map -> odom until the next accepted pose: time jumped."""
+        self._map_to_odom.forget()
+
+    def localize(self, frame: Frame) -> Answer:
+        """Localize with one frame and publish what was found.
+
+        Raises
+        ------
+        TimeJumpError
+            Time jumped back since the frame arrived; nothing was published.
+        CliplocError
+            Names what to fix in the frame or in the parameters.
+        """
+        values = self._node.settings.snapshot()
+        self._node.check_active()
+        localizer = self.localizer
+        assert localizer is not None  # an active node has one
+        image = frame.image.header
+        self._jumps.check(image.stamp, frame.received_at)
+        state = self._robot.at(image, values)
+        localized = localizer.localize(frame, values, state)
+        self._node.stages.add(localized.times.ms)
+        self._node.check_active()
+        self._jumps.check(image.stamp, frame.received_at)
+        header = Header(stamp=image.stamp, frame_id=localizer.map_frame)
+        answer = self._answer(header, localized, state, frame.received_at)
+        self._show(image, header, localizer, localized, state, answer)
+        return answer
+
+    def _use(self, localizer: Localizer) -> str:
+        self.localizer = localizer
+        self._visualization.set_map(localizer.landmark_map)
+        return localizer.description
+
+    def _answer(self, header: Header, localized: Localized, state: RobotState,
+                received_at: float) -> Answer:
+        """Publish an accepted pose; return the verdict in words."""
+        found, is_linked = localized.found, state.place is not None
+        summary = f'[{_summary(found)}; {localized.times}]'
+        if not found.accepted:
+            return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at,
+                          is_linked)
+        assert found.covariance is not None and found.map_from_camera is not None
+        map_from_base = found.map_from_camera @ state.camera_from_base
+        pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
+            found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
+        self._pose.publish(pose)
+        try:
+            self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
+                                     received_at)
+        except NoTransformError as error:
+            self._node.get_logger().warning(f'publish_tf: {error}',
+                                            throttle_duration_sec=_LOG_PERIOD_S)
+        x, y, z = map_from_base[:3, 3]
+        return Answer(Verdict.ACCEPTED, f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
+                                        f'{summary}', pose, received_at, is_linked)
+
+    def _show(self, image: Header, header: Header, localizer: Localizer, localized: Localized,
+              state: RobotState, answer: Answer) -> None:
+        """Publish hypotheses and matches, and queue the debug image behind the answer."""
+        self._visualization.show(header, localizer.landmark_map, localized.found,
+                                 state.camera_from_base)
+        if self._visualization.wants_debug_image:
+            self._node.worker.submit(partial(
+                self._visualization.show_debug_image, image, localized.seen,
+                localizer.landmark_map, localized.found, answer.message))
+
+
+def _summary(found: Relocalization) -> str:
+    return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
+            f'{len(found.matches)} inliers, {found.tried} hypotheses, '
+            f'{100 * found.coverage:.3g} % of the search')

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A wake-up request: look at fresh frames until a pose is accepted or the time is up."""
+
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from cliploc_ros.errors import CliplocError, TimeUpError
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
+
+# Every frame that odometry does not link is another chance of a false accept.
+_MAX_UNLINKED = 3
+# An earlier request ends at its own deadline, shortly before those that wait for it.
+_GRACE_S = 0.2
+
+
+class _Look(NamedTuple):
+    """The answer from one frame, and whether the next one can change it."""
+
+    answer: Answer
+    may_go_on: bool
+
+
+class Requests:
+    """Answers requests one at a time.
+
+    A request that had to wait shares the previous answer if the image of that answer arrived
+    after the request: clients that ask together cost one search and reset the localizer once.
+    Otherwise it looks at fresh frames itself.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    frames : FrameSource
+    robot : RobotStateSource
+    jumps : TimeJumps
+    localize : callable
+        Takes a frame and returns its Answer; called in the worker's thread.
+    handoff : HandOff
+    """
+
+    def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
+                 jumps: TimeJumps, localize: Callable[[Frame], Answer], handoff: HandOff
+                 ) -> None:
+        self._node = node
+        self._frames = frames
+        self._robot = robot
+        self._jumps = jumps
+        self._localize = localize
+        self._handoff = handoff
+        self._turn = threading.Lock()
+        self._previous = Answer(Verdict.FAILED, 'no request yet')
+
+    def answer(self) -> Answer:
+        """Return the answer to a request that arrives now, within timeout_s."""
+        arrived_at = time.monotonic()
+        deadline = arrived_at + self._node.settings['timeout_s']
+        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
+            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
+        try:
+            if self._previous.received_at <= arrived_at:
+                self._previous = self._guarded(arrived_at, deadline)
+            return self._previous
+        finally:
+            self._turn.release()
+
+    def _guarded(self, arrived_at: float, deadline: float) -> Answer:
+        """Return an answer whatever happens, and log it in one line."""
+        try:
+            # A map or weights that were missing may be there now.
+            self._node.bring_up(deadline)
+            answer = self._look_until(deadline, arrived_at)
+        except CliplocError as error:
+            answer = Answer(Verdict.FAILED, str(error))
+        except Exception as error:
+            self._node.report(traceback.format_exc())
+            answer = Answer(Verdict.FAILED,
+                            f'internal error: {error} (the traceback is in the log)')
+        self._node.get_logger().info(answer.message)
+        return answer
+
+    def _look_until(self, deadline: float, arrived_at: float) -> Answer:
+        """Look at one frame after another while another frame can change the answer."""
+        look, looks = self._look_past_jumps(arrived_at, deadline), 1
+        unlinked = int(not look.answer.is_linked)
+        while look.may_go_on and unlinked < _MAX_UNLINKED:
+            try:
+                look = self._look_past_jumps(time.monotonic(), deadline)
+            except (NoFrameError, TimeUpError, TimeJumpError):
+                break
+            looks += 1
+            unlinked += not look.answer.is_linked
+        if looks == 1:
+            return look.answer
+        return replace(look.answer, detail=f'{look.answer.detail} [{looks} frames in '
+                                           f'{time.monotonic() - arrived_at:.1f} s]')
+
+    def _look(self, after: float, deadline: float) -> _Look:
+        """Localize with the next frame and hand an accepted pose to the localizer."""
+        frame = self._frames.next_frame(after, deadline)
+        answer = self._node.worker.run(lambda: self._localize(frame), deadline)
+        may_go_on = answer.pose is None
+        if answer.pose is not None:
+            try:
+                self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
+                                        answer.received_at)
+            except HandOffError as error:
+                answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                                 detail=f'{error} ({answer.message})')
+                may_go_on = not isinstance(error, NoLocalizerError)
+        return _Look(answer, may_go_on
+                     and self._robot.is_linked_soon(frame.image.header.stamp, deadline))
+
+    def _look_past_jumps(self, after: float, deadline: float) -> _Look:
+        """Look at the next frame, and again after each jump in time until the deadline."""
+        jump: CliplocError | None = None
+        while True:
+            try:
+                return self._look(after, deadline)
+            except NoFrameError as error:
+                raise jump or error from error
+            except (TimeJumpError, NoTransformError) as error:
+                # right after a jump, transforms may be missing
+                if isinstance(error, NoTransformError) and not self._jumps.is_settling:
+                    raise
+                jump, after = error, time.monotonic()

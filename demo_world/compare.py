@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's table in the demo's world: ``python -m demo_world.compare --out DIR``.
+
+Scores the small networks on the walk they were never trained on, records what they say of it
+once, and runs the paper's ten methods on that.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from cliploc_ros.command import run_command
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.frames import tum_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.demo.truth import TrueFrame, read_frames
+from cliploc_ros.evaluation.evaluation import Evaluation
+from cliploc_ros.evaluation.methods import parse_methods
+from cliploc_ros.evaluation.output import make_folder
+from cliploc_ros.evaluation.recording import record_queries
+from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions, import_ultralytics
+from demo_world import train_detector
+
+
+def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Queries:
+    """Run the shipped detector and CLIP on the images of a world, against a map."""
+    detector = YoloDetector(YoloOptions(model=str(ASSETS / 'yolo.pt')))
+    clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
+                       pretrained=str(ASSETS / 'clip.safetensors'))
+    observer = Observer(*load_encoder(clip, landmark_map.labels))
+    frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
+    return record_queries(frames, landmark_map, detector, observer,
+                          partial(tqdm, total=frames.count, desc='recording', unit='image',
+                                  disable=None))
+
+
+def score_detector(sequence: Path) -> float:
+    """Return the mAP50 of the shipped detector on a world's images."""
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_score_') as name:
+        data = train_detector.write_dataset({'train': [sequence], 'val': [sequence]},
+                                            Path(name) / 'data')
+        model = import_ultralytics().YOLO(ASSETS / 'yolo.pt')
+        return float(train_detector.score(model, data, Path(name)).box.map50)
+
+
+def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
+               landmark_ids: Sequence[str]) -> tuple[float, float, int]:
+    """Return how often a detected object's own label is the most similar, and of the top 3.
+
+    Detections that overlap a true box by more than half, of objects in the map, are counted;
+    their number comes third.
+    """
+    ranks = []
+    for frame, true_frame in zip(frames, truth, strict=True):
+        for box in true_frame.boxes:
+            overlaps = _overlaps(box.bbox_xyxy, frame.bboxes_xyxy)
+            if box.object_id in landmark_ids and overlaps.max(initial=0.0) > 0.5:
+                similarities = frame.similarities[int(np.argmax(overlaps))]
+                own = similarities[landmark_ids.index(box.object_id)]
+                ranks.append(int((similarities > own).sum()))
+    counted, number = np.array(ranks), max(len(ranks), 1)
+    return int((counted < 1).sum()) / number, int((counted < 3).sum()) / number, len(ranks)
+
+
+def _overlaps(bbox: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the IoU (n,) of a box (4,) with others (n, 4)."""
+    def area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.clip(boxes[..., 2:] - boxes[..., :2], 0, None).prod(-1))
+
+    shared = area(np.concatenate([np.maximum(bbox[:2], others[:, :2]),
+                                  np.minimum(bbox[2:], others[:, 2:])], axis=1))
+    return np.asarray(shared / (area(bbox) + area(others) - shared))
+
+
+def run(arguments: list[str]) -> int:
+    """Score the networks, record, compare."""
+    parser = argparse.ArgumentParser(prog='compare', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')
+    parser.add_argument('--trials', type=int, default=5, help='with other seeds (%(default)s)')
+    parser.add_argument('--iterations', type=int, default=500, help="the paper's %(default)s")
+    parser.add_argument('--budget', type=float, default=2.0, metavar='S',
+                        help='a search is cut short after so long [s] (%(default)s); some '
+                        'exhaustive ones are')
+    parser.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)))
+    options = parser.parse_args(arguments)
+    make_folder(options.out)
+    landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_compare_') as cache:
+        queries = record(ASSETS / 'sequence', landmark_map, Path(cache))
+    save_queries(options.out / 'queries.npz', queries)
+    first, third, count = score_clip(tuple(queries), list(read_frames(ASSETS / 'sequence')),
+                                     landmark_map.landmark_ids)
+    print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
+          f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
+    paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
+    Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
+            workers=options.workers).compare(
+        parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
+        frames=queries.frames)
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

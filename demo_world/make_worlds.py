@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Makes worlds to train on: ``python -m demo_world.make_worlds DIR --count 100``."""
+
+import argparse
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from demo_world.recording import record, write_true_map
+from demo_world.renderer import Light, Renderer
+from demo_world.room import make_room
+from demo_world.trajectories import CAMERA, draw_views
+
+
+def make_world(folder: Path, seed: int, frames: int) -> None:
+    """Make one world with views from anywhere in it, and write it as a TUM folder.
+
+    A world that is already whole there is left as it is.
+    """
+    if (folder / 'map.yaml').exists():  # written last
+        return
+    rng = np.random.default_rng(seed)
+    room = make_room(seed)
+    renderer = Renderer(room, CAMERA, Light.draw(rng))
+    record(folder, room, renderer, draw_views(room, frames, rng), seed=seed)
+    write_true_map(folder / 'map.yaml', room)
+
+
+def main() -> None:
+    """Make worlds, several at once, each from its own seed."""
+    parser = argparse.ArgumentParser(prog='make_worlds', description=__doc__)
+    parser.add_argument('folder', type=Path, metavar='DIR')
+    parser.add_argument('--count', type=int, default=90, help='number of worlds (%(default)s)')
+    parser.add_argument('--frames', type=int, default=10, help='images of each (%(default)s)')
+    parser.add_argument('--seed', type=int, default=1000, help='of the first (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=multiprocessing.cpu_count(),
+                        help='worlds made at once (%(default)s)')
+    options = parser.parse_args()
+    # VTK's contexts do not survive a fork.
+    context = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
+        made = [pool.submit(make_world, options.folder / f'world_{number:03d}',
+                            options.seed + number, options.frames)
+                for number in range(options.count)]
+        for world in tqdm(as_completed(made), total=options.count, unit='world'):
+            world.result()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the cameras of the synthetic world stand and look."""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from cliploc_ros.core.geometry.camera import Camera
+from demo_world.room import LENGTH_M, WIDTH_M, Room
+
+#: Pixel centres have whole coordinates, as everywhere in the package.
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob')
+
+
+def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],
+            roll: float = 0.0) -> npt.NDArray[np.float64]:
+    """Return map_from_camera (4, 4), optical axes, of a camera [m] that looks at a point [m]."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    transform = np.eye(4)
+    transform[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
+    transform[:3, 1] = -np.sin(roll) * right + np.cos(roll) * down
+    transform[:3, 2], transform[:3, 3] = forward, eye
+    return transform
+
+
+def draw_views(room: Room, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Draw poses that look at objects from anywhere in the room; (count, 4, 4)."""
+    views: list[npt.NDArray[np.float64]] = []
+    while len(views) < count:
+        target = np.array(room.objects[int(rng.integers(len(room.objects)))].slot.position)
+        eye = np.array([rng.uniform(0.7, LENGTH_M - 0.7), rng.uniform(0.7, WIDTH_M - 0.7),
+                        rng.uniform(0.8, 1.8)])
+        if 0.9 < np.linalg.norm(target - eye) < 3.6:
+            target = target + rng.normal(0, 0.15, 3)
+            views.append(look_at(eye, target, rng.normal(0, 0.05)))
+    return np.array(views)
+
+
+def walk(count: int, way_points: npt.ArrayLike, targets: npt.ArrayLike) -> \
+        npt.NDArray[np.float64]:
+    """Walk smoothly past points and look at others meanwhile; (count, 4, 4).
+
+    Parameters
+    ----------
+    count : int
+        Number of poses, spread evenly over the walk.
+    way_points, targets : (n, 3) array_like
+        Where the camera passes, and where it looks then [m].
+    """
+    way_points = np.asarray(way_points, dtype=float)
+    knots = np.linspace(0, 1, len(way_points))
+    eyes = CubicSpline(knots, way_points)(np.linspace(0, 1, count))
+    gazes = CubicSpline(knots, np.asarray(targets, dtype=float))(np.linspace(0, 1, count))
+    rolls = 0.03 * np.sin(np.arange(count))
+    return np.array([look_at(*pose) for pose in zip(eyes, gazes, rolls, strict=True)])
+
+
+def mapping_walk(count: int) -> npt.NDArray[np.float64]:
+    """Return the walk on which the map is made: slowly round the middle, looking outwards."""
+    turn = np.linspace(0, 2 * np.pi, 13)
+    eyes = np.c_[3.0 + 0.9 * np.cos(turn), 2.5 + 0.6 * np.sin(turn), np.full(13, 1.45)]
+    gazes = np.c_[3.0 + 3.2 * np.cos(turn), 2.5 + 2.6 * np.sin(turn),
+                  0.95 + 0.25 * np.sin(3 * turn)]
+    return walk(count, eyes, gazes)
+
+
+def query_walk(count: int) -> npt.NDArray[np.float64]:
+    """Return the walk on which the robot wakes up: lower, tilted, past a nearly empty wall."""
+    eyes = [(4.2, 3.6, 1.3), (3.6, 3.6, 1.35), (3.0, 3.0, 1.2), (2.8, 2.2, 1.1), (3.2, 2.0, 1.3),
+            (3.0, 2.2, 1.25), (2.8, 1.8, 1.3), (2.6, 1.6, 1.3), (2.6, 1.5, 1.3), (2.4, 1.8, 1.3),
+            (2.6, 2.0, 1.3), (3.0, 2.6, 1.3), (3.2, 3.2, 1.25)]
+    gazes = [(4.0, 0.2, 0.9), (2.5, 0.2, 1.0), (1.5, 0.2, 1.0), (0.9, 0.2, 1.0), (0.2, 2.2, 1.0),
+             (0.2, 3.2, 1.0), (1.4, 4.6, 0.9), (2.8, 4.6, 0.8), (4.2, 4.6, 0.8), (5.7, 3.2, 0.8),
+             (5.8, 1.6, 1.3), (4.9, 0.3, 0.8), (3.3, 0.2, 0.9)]
+    return walk(count, eyes, gazes)

@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Handing a pose over: real subscribers, odometry and services that answer, or never do."""
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from std_srvs.srv import Empty
+
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
+
+VALUES = {'base_frame': 'base_link', 'max_speed_m_s': 0.1, 'max_turn_rad_s': 0.2,
+          'nomotion_updates': 10, 'require_localizer': True}
+
+
+def make_pose():
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id, pose.header.stamp = 'map', Time(sec=100)
+    return pose
+
+
+class Localizer:
+    """Stands for AMCL: hears initial poses, and answers update requests while it may."""
+
+    def __init__(self, node):
+        self.node = node
+        self.poses, self.updates = [], []
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+        self._group = ReentrantCallbackGroup()
+
+    def subscribe(self):
+        self.node.create_subscription(PoseWithCovarianceStamped, 'initialpose',
+                                      self.poses.append, 10)
+
+    def serve(self):
+        def update(_, response):
+            self.updates.append(time.monotonic())
+            self.may_answer.wait()
+            return response
+        self.node.create_service(Empty, 'request_nomotion_update', update,
+                                 callback_group=self._group)
+
+
+class Robot:
+    """A relocalizer's hand-over and a localizer, all of whose callbacks are executed."""
+
+    def __init__(self, make_node, wait):
+        self.node, self.wait = make_node('relocalizer'), wait
+        self.localizer = Localizer(make_node('amcl'))
+        self.odometry = OdometrySource(self.node)
+        self.handoff = HandOff(self.node, self.odometry)
+
+    def hand_over(self, timeout_s=10.0, **changes):
+        """Hand a pose over; return how long it took [s]."""
+        start = time.monotonic()
+        self.handoff.hand_over(make_pose(), VALUES | changes, start + timeout_s, start)
+        return time.monotonic() - start
+
+    def meet(self):
+        """Wait until the relocalizer knows the localizer."""
+        self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
+
+    def meet_service(self):
+        self.wait(self.handoff._updater.service_is_ready, 'the service')
+
+
+@pytest.fixture
+def robot(context, make_node, wait):
+    robot = Robot(make_node, wait)
+    executor = MultiThreadedExecutor(4, context=context)
+    for node in (robot.node, robot.localizer.node):
+        executor.add_node(node)
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
+    yield robot
+    robot.localizer.may_answer.set()
+    executor.shutdown()
+    spinning.join()
+
+
+def test_a_localizer_that_is_there_gets_the_pose(robot):
+    robot.localizer.subscribe()
+    robot.meet()
+    assert robot.hand_over() < 1.0
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    assert robot.localizer.poses[0].header == make_pose().header
+
+
+@pytest.mark.clock
+def test_without_a_localizer_the_pose_is_withheld(robot):
+    start = time.monotonic()
+    with pytest.raises(NoLocalizerError, match=r'^nobody subscribes /initialpose: start the '
+                       r'localizer \(AMCL\), or set require_localizer: false$'):
+        robot.hand_over()
+    assert 1.0 < time.monotonic() - start < 5.0
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.hand_over()
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    assert len(robot.localizer.poses) == 1, 'the one that was withheld is not delivered late'
+
+
+def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
+    starting = threading.Timer(0.3, robot.localizer.subscribe)
+    starting.start()
+    assert robot.hand_over() > 0.2
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    starting.join()
+
+
+def test_a_robot_without_a_localizer_need_not_wait_for_one(robot):
+    assert robot.hand_over(require_localizer=False) < 1.0
+
+
+@pytest.mark.clock
+@pytest.mark.parametrize('timeout_s', [0.3, 0.0, -1.0])
+def test_no_wait_goes_beyond_the_deadline(robot, timeout_s):
+    start = time.monotonic()
+    with pytest.raises(HandOffError, match='nobody subscribes'):
+        robot.hand_over(timeout_s)
+    assert time.monotonic() - start < max(timeout_s, 0.0) + 0.5
+
+
+def test_a_localizer_that_is_known_gets_a_pose_after_the_deadline(robot):
+    robot.localizer.subscribe()
+    robot.localizer.serve()
+    robot.meet()
+    robot.meet_service()
+    assert robot.hand_over(-1.0) < 0.5
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    assert not robot.localizer.updates
+
+
+def test_updates_come_no_faster_than_scans(robot):
+    robot.localizer.subscribe()
+    robot.localizer.serve()
+    robot.meet()
+    robot.meet_service()
+    assert 2.0 < robot.hand_over() < 6.0
+    assert len(robot.localizer.updates) == VALUES['nomotion_updates']
+
+
+def test_updates_end_with_the_deadline_and_the_pose_is_delivered(robot):
+    robot.localizer.subscribe()
+    robot.localizer.serve()
+    robot.meet()
+    robot.meet_service()
+    assert robot.hand_over(1.0) < 1.5
+    assert 0 < len(robot.localizer.updates) < 6
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize(('timeout_s', 'longest_s'), [(10.0, 4.0), (0.5, 1.0)])
+def test_a_service_that_never_answers_costs_little_and_leaves_nothing(robot, timeout_s,
+                                                                         longest_s):
+    robot.localizer.subscribe()
+    robot.localizer.may_answer.clear()
+    robot.localizer.serve()
+    robot.meet()
+    robot.meet_service()
+    for number in range(1, 4):
+        assert robot.hand_over(timeout_s) < longest_s
+        robot.wait(lambda n=number: len(robot.localizer.poses) == n, 'the pose')
+    assert not robot.handoff._updater._pending_requests, 'their futures are freed'
+    robot.localizer.may_answer.set()
+    assert robot.hand_over(nomotion_updates=1) < 2.0, 'late answers do no harm'
+
+
+@pytest.fixture
+def wheels(robot, make_node):
+    """A publisher of odometry that has said nothing yet; the robot listens to it."""
+    wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
+    robot.odometry.open()
+    robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
+               'the wheels to be heard')
+    yield wheels
+    robot.odometry.close()
+
+
+def rest(wheels):
+    """Publish half a second of odometry of a robot at rest."""
+    for tick in range(6):
+        odometry = Odometry()
+        odometry.header.stamp = Time(nanosec=tick * 10**8)
+        odometry.pose.pose.orientation.w = 1.0
+        wheels.publish(odometry)
+
+
+@pytest.mark.clock
+def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
+    robot.localizer.subscribe()
+    robot.meet()
+    start = time.monotonic()
+    with pytest.raises(HandOffError, match='the robot may be moving'):
+        robot.hand_over(0.3)
+    assert time.monotonic() - start < 0.8
+    assert not robot.localizer.poses
+
+
+def test_after_the_deadline_odometry_of_late_will_do(robot, wheels):
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.wait(lambda: robot.odometry.speeds_by_poses(0.0) is not None, 'odometry',
+               lambda: rest(wheels))
+    assert robot.hand_over(-1.0) < 0.5
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+def test_without_time_to_see_it_rest_a_robot_is_not_taken_to_rest(robot, wheels):
+    """One message of odometry, whose twist many leave empty: it may be moving."""
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.wait(lambda: robot.odometry.recent(2.0, 0.1), 'odometry',
+               lambda: wheels.publish(Odometry()))
+    start = time.monotonic()
+    with pytest.raises(HandOffError, match='too little time'):
+        robot.hand_over(0.3)
+    assert time.monotonic() - start < 0.8
+    assert not robot.localizer.poses
+
+
+def test_a_jump_between_search_and_hand_over_withholds_the_pose(robot):
+    robot.localizer.subscribe()
+    robot.meet()
+    received_at = time.monotonic()
+    robot.handoff.forget()
+    with pytest.raises(TimeJumpError):
+        robot.handoff.hand_over(make_pose(), VALUES, received_at + 10.0, received_at)
+    assert not robot.localizer.poses
+
+
+def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
+    """The hand-over waits for odometry when time jumps."""
+    robot.localizer.subscribe()
+    robot.meet()
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(robot.hand_over)
+        robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
+        robot.handoff.forget()
+        rest(wheels)
+        with pytest.raises(TimeJumpError, match='time jumped back before'):
+            handing_over.result()
+        assert not robot.localizer.poses
+        handing_over = pool.submit(robot.hand_over)
+        robot.wait(handing_over.done, 'the next hand-over', lambda: rest(wheels))
+        assert handing_over.exception() is None
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+def test_a_hand_over_ends_with_the_node(robot):
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(robot.hand_over)
+        robot.wait(handing_over.running, 'the hand-over')
+        start = time.monotonic()
+        robot.handoff.stop()
+        with pytest.raises(HandOffError):
+            handing_over.result()
+    assert time.monotonic() - start < 1.0

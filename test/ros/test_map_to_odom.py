@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""map -> odom, and transforms before and after a jump; most of it with the real tf2_ros."""
+
+import time
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Header
+
+from cliploc_ros.core.geometry.transforms import transform_from_pose
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.outputs.map_to_odom import MapToOdom, transform_msg
+from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
+
+VALUES = {row.name: row.default for row in RELOCALIZER} | {
+    'publish_tf': True, 'base_frame': 'base_link', 'tf_timeout_s': 5.0}
+QUARTER_LEFT = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+MAP_FROM_BASE = transform_from_pose(np.array([5.0, 5.0, 0.0]), np.array(QUARTER_LEFT))
+
+
+def stamp(seconds):
+    return Time(sec=int(seconds), nanosec=round((seconds % 1) * 1e9))
+
+
+STAMP = stamp(100.0)
+
+
+def moving(seconds, x_m, parent='odom', child='base_link'):
+    """A transform of a robot that is x_m ahead, and turned to the left."""
+    return transform_msg(Header(frame_id=parent, stamp=stamp(seconds)), child,
+                         transform_from_pose(np.array([x_m, 0.0, 0.0]), np.array(QUARTER_LEFT)))
+
+
+def test_a_transform_in_numbers():
+    header = Header(frame_id='map', stamp=STAMP)
+    msg = transform_msg(header, 'odom', transform_from_pose(np.array([1.0, 2.0, 3.0]),
+                                                            np.array(QUARTER_LEFT)))
+    t, q = msg.transform.translation, msg.transform.rotation
+    assert (msg.header, msg.child_frame_id, (t.x, t.y, t.z)) == (header, 'odom', (1.0, 2.0, 3.0))
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], QUARTER_LEFT)
+
+
+def test_a_robot_is_needed():
+    assert relocalizer_options(VALUES)
+    with pytest.raises(OptionsError, match='publish_tf: needs the parameter base_frame'):
+        relocalizer_options(VALUES | {'base_frame': ''})
+
+
+def test_closed_it_does_nothing(make_node):
+    node = make_node()
+    frame = MapToOdom(node, CoordinateFrames(node))
+    frame.update(Header(frame_id='map', stamp=STAMP), np.eye(4), VALUES, time.monotonic())
+    frame.forget()
+    frame.close()
+
+
+class Robot:
+    """A node with transforms and map -> odom, and what broadcasts and hears /tf."""
+
+    def __init__(self, make_node, spin_until):
+        from tf2_msgs.msg import TFMessage
+        from tf2_ros import StaticTransformBroadcaster, TransformBroadcaster
+        self.node, self.world = make_node(), make_node('world')
+        self.transforms = CoordinateFrames(self.node)
+        self.map_to_odom = MapToOdom(self.node, self.transforms)
+        self.broadcaster = TransformBroadcaster(self.world)
+        self.static_broadcaster = StaticTransformBroadcaster(self.world)
+        self.heard = []
+        self.world.create_subscription(TFMessage, '/tf', lambda msg: self.heard.extend(
+            one for one in msg.transforms if one.header.frame_id == 'map'), 10)
+        self._spin_until = spin_until
+        self.transforms.open()
+
+    def spin_until(self, condition, what, work=lambda: None):
+        self._spin_until([self.node, self.world], condition, what, work)
+
+    def place(self, seconds, source='base_link'):
+        """Return how far ahead the robot was, as tf2 has it; None if it has nothing."""
+        try:
+            return self.transforms.lookup('odom', source, stamp(seconds), 0.0)[0, 3]
+        except NoTransformError:
+            return None
+
+    def tell(self, seconds, x_m):
+        """Broadcast where the robot was until that is known."""
+        self.spin_until(lambda: self.place(seconds) == x_m, f'{x_m} m at {seconds} s',
+                        lambda: self.broadcaster.sendTransform(moving(seconds, x_m)))
+
+
+@pytest.fixture
+def robot(make_node, spin_until):
+    robot = Robot(make_node, spin_until)
+    yield robot
+    robot.map_to_odom.close()
+    robot.transforms.close()
+
+
+@pytest.mark.needs('tf2_ros')
+def test_odom_is_tied_to_the_map(robot):
+    robot.map_to_odom.open()
+    robot.tell(100.0, 1.0)
+    robot.map_to_odom.update(Header(frame_id='map', stamp=STAMP), MAP_FROM_BASE, VALUES,
+                             time.monotonic())
+    robot.spin_until(lambda: robot.heard, 'map -> odom')
+    t = robot.heard[0].transform.translation
+    # the same heading in both, so that odom lies a metre behind, along its own x
+    np.testing.assert_allclose([t.x, t.y, t.z], [4.0, 5.0, 0.0], atol=1e-9)
+    assert robot.heard[0].child_frame_id == 'odom'
+
+
+@pytest.mark.needs('tf2_ros')
+def test_a_jump_ends_the_broadcast_until_the_next_pose(robot):
+    robot.map_to_odom.open()
+    robot.tell(100.0, 1.0)
+    received_at = time.monotonic()
+    header = Header(frame_id='map', stamp=STAMP)
+    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    robot.spin_until(lambda: robot.heard, 'map -> odom')
+    robot.map_to_odom.forget()
+    # an image from before whose search ends after the jump
+    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
+    robot.heard.clear()
+    end = time.monotonic() + 0.5  # five periods
+    robot.spin_until(lambda: time.monotonic() > end, 'silence')
+    assert not robot.heard
+    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, time.monotonic())
+    robot.spin_until(lambda: robot.heard, 'map -> odom again')
+
+
+@pytest.mark.needs('tf2_ros')
+@pytest.mark.parametrize('restart_s', [95.0, 2.0])
+def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
+    robot.static_broadcaster.sendTransform(moving(0.0, 7.0, child='shelf'))
+    robot.spin_until(lambda: robot.place(0.0, 'shelf') == 7.0, 'the static transform')
+    for seconds, x_m in ((99.0, 1.0), (100.0, 2.0)):
+        robot.tell(seconds, x_m)
+    robot.transforms.forget()
+    assert robot.place(99.5) is None and robot.place(100.0) is None
+    assert robot.place(0.0, 'shelf') == 7.0, 'nobody says it again'
+    # one from before that arrives late
+    robot.tell(100.02, 3.0)
+    for seconds, x_m in ((restart_s, 11.0), (restart_s + 1.0, 12.0)):
+        robot.tell(seconds, x_m)
+    assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
+    assert robot.place(restart_s + 2.0) is None, 'not interpolated to one from before'
+
+
+@pytest.mark.needs('tf2_ros')
+@pytest.mark.parametrize('restart_s', [95.0, 2.0])
+def test_a_bag_that_loops_without_a_clock_is_noticed(robot, restart_s):
+    for seconds, x_m in ((99.0, 1.0), (100.0, 2.0), (restart_s, 11.0), (restart_s + 1.0, 12.0)):
+        robot.tell(seconds, x_m)
+    assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
+    assert robot.place(99.5) is None

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Requests in a real node with a real frame source; the localizer is the test's own function."""
+
+import logging
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.errors import MapError
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.inputs.frame_source import FrameSource
+from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.outputs.handoff import HandOff
+from cliploc_ros.ros.parameter_tables import RELOCALIZER
+from cliploc_ros.ros.requests import Requests
+
+
+class Answering(ManagedNode):
+    """A managed node whose map is what `loads` returns and whose frames `localize` answers."""
+
+    def __init__(self):
+        super().__init__('answering', RELOCALIZER, lambda values: None)
+        self.loads = lambda: 'nothing'
+        self.localize = lambda frame: Answer(Verdict.REFUSED, 'nothing known',
+                                             received_at=frame.received_at)
+        self.robot = RobotStateSource(self)
+        self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
+        self.requests = Requests(self, self.frames, self.robot, TimeJumps(self, lambda: None),
+                                 lambda frame: self.localize(frame),
+                                 HandOff(self, self.robot.odometry))
+
+    def load(self):
+        return self.loads()
+
+    def unload(self):
+        pass
+
+    def open(self):
+        self.frames.open()
+
+    def close(self):
+        self.frames.close('the node was deactivated')
+
+    def examine(self, health):
+        pass
+
+
+class Camera:
+    """Publishes the three messages of a frame, each time with a new stamp."""
+
+    def __init__(self, node):
+        self.publishers = [node.create_publisher(kind, topic, 10) for kind, topic in (
+            (CameraInfo, 'camera_info'), (Detection2DArray, 'detections'), (Image, 'image'))]
+        self.number = 0
+
+    def shoot(self):
+        self.number += 1
+        header = Header(stamp=Time(sec=self.number))
+        for publisher in self.publishers:
+            publisher.publish(publisher.msg_type(header=header))
+
+
+@pytest.fixture
+def node():
+    """A node of the default context, as ManagedNode makes it, spun in a thread of its own."""
+    if not rclpy.ok():
+        rclpy.init()
+    made = Answering()
+    executor = SingleThreadedExecutor()
+    executor.add_node(made)
+    stopped = threading.Event()
+
+    def spin():
+        while not stopped.is_set():
+            executor.spin_once(timeout_sec=0.02)
+    thread = threading.Thread(target=spin)
+    thread.start()
+    yield made
+    stopped.set()
+    thread.join()
+    executor.shutdown()
+    made.worker.stop()
+    made.destroy_node()
+
+
+@pytest.fixture
+def camera(node):
+    made = rclpy.create_node('camera')
+    yield Camera(made)
+    made.destroy_node()
+
+
+@pytest.fixture
+def clients():
+    with ThreadPoolExecutor(8) as pool:
+        yield pool
+
+
+def shoot_until(camera, wait, *futures):
+    def work():
+        camera.shoot()
+        time.sleep(0.02)
+    wait(lambda: all(future.done() for future in futures), 'the answers', work)
+
+
+def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
+    """The second request arrives while the first one's image is searched."""
+    searched, go_on = [], threading.Event()
+
+    def localize(frame):
+        searched.append(frame)
+        go_on.wait(10.0)
+        return Answer(Verdict.REFUSED, f'image {len(searched)}', received_at=frame.received_at)
+    node.localize = localize
+    first = clients.submit(node.requests.answer)
+    wait(lambda: searched, 'the first search', lambda: (camera.shoot(), time.sleep(0.02)))
+    arrived_at = time.monotonic()
+    second, third = clients.submit(node.requests.answer), clients.submit(node.requests.answer)
+    wait(lambda: time.monotonic() > arrived_at + 0.1, 'both to wait')
+    go_on.set()
+    shoot_until(camera, wait, first, second, third)
+    assert first.result().received_at < arrived_at <= second.result().received_at
+    # whoever waits together shares an answer
+    assert third.result() is second.result() and len(searched) == 2
+
+
+def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, clients, wait):
+    node.settings._values = node.settings._values | {'timeout_s': 0.6}
+    release = threading.Event()
+    node.localize = lambda frame: release.wait(10.0)
+    start = time.monotonic()
+    request = clients.submit(node.requests.answer)
+    shoot_until(camera, wait, request)
+    took_s = time.monotonic() - start
+    release.set()
+    assert request.result().verdict is Verdict.FAILED
+    assert 'longer than timeout_s' in request.result().message
+    assert took_s < 1.0
+
+
+def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
+    node.settings._values = node.settings._values | {'timeout_s': 0.3}
+    start = time.monotonic()
+    requests = [clients.submit(node.requests.answer) for _ in range(4)]
+    wait(lambda: all(request.done() for request in requests), 'the answers')
+    assert time.monotonic() - start < 0.9, 'they wait side by side'
+    assert all('nobody publishes /image' in request.result().message for request in requests)
+
+
+def test_an_answer_keeps_to_the_time_out_while_the_map_loads(node, clients, wait):
+    node.settings._values = node.settings._values | {'timeout_s': 0.3}
+    release = threading.Event()
+    wait(lambda: node.active, 'the node to be active')
+    node.loads = lambda: str(release.wait(10.0))
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    start = time.monotonic()
+    answer = node.requests.answer()
+    took_s = time.monotonic() - start
+    release.set()
+    assert 'still loading; retry' in answer.message and took_s < 0.9
+    wait(lambda: node.active, 'the node to be active')
+
+
+def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wait):
+    def fail():
+        raise MapError('office.yaml: No such file')
+    wait(lambda: node.active, 'the node to be active')
+    node.loads = fail
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    for _ in range(3):
+        assert 'office.yaml: No such file' in node.requests.answer().message
+    assert sum('[ERROR]' in line and 'office.yaml' in line
+               for line in capfd.readouterr().err.splitlines()) == 1
+    node.loads = lambda: 'a map'
+    node.settings._values = node.settings._values | {'timeout_s': 0.2}
+    assert 'no fresh frame' in node.requests.answer().message
+
+
+def test_a_finalized_node_asks_to_be_restarted(node, wait):
+    wait(lambda: node.active, 'the node to be active')
+    node.trigger_shutdown()
+    assert node.requests.answer().message == 'the node is finalized: restart it'
+
+
+def test_a_destroyed_node_leaves_no_log_handler(node):
+    handlers = logging.getLogger('cliploc_ros').handlers
+    before = len(handlers)
+    other = Answering()
+    assert len(handlers) == before + 1
+    other.worker.stop()
+    other.destroy_node()
+    assert len(handlers) == before

@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A clock that goes back: a real /clock, and nodes in simulated time."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, Imu
+from std_msgs.msg import Header
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
+from cliploc_ros.ros.inputs.frame_source import FrameSource
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.time_jumps import StampOrder, TimeJumpError, TimeJumps
+from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+
+S = 1_000_000_000
+
+
+def stamp(seconds):
+    return Time(sec=int(seconds), nanosec=round((seconds % 1) * S))
+
+
+class Simulation:
+    """A node in simulated time, and what publishes /clock."""
+
+    def __init__(self, make_node, spin_until):
+        self.node = make_node(parameter_overrides=[Parameter('use_sim_time', value=True)])
+        self.world = make_node('world')
+        self._clock = self.world.create_publisher(Clock, '/clock', 10)
+        self._spin_until = spin_until
+
+    def spin_until(self, condition, what, work=lambda: None):
+        self._spin_until([self.node, self.world], condition, what, work)
+
+    def set_time(self, *moments):
+        """Publish each time [s] until the node's clock shows it."""
+        for seconds in moments:
+            message = Clock(clock=stamp(seconds))
+            self.spin_until(lambda m=message: self.node.get_clock().now().to_msg() == m.clock,
+                            f'{seconds} s', lambda m=message: self._clock.publish(m))
+
+
+@pytest.fixture
+def simulation(make_node, spin_until):
+    return Simulation(make_node, spin_until)
+
+
+@pytest.fixture
+def jumps(simulation):
+    """Watch the simulation's clock; its attribute forgot counts."""
+    forgot = []
+    jumps = TimeJumps(simulation.node, lambda: forgot.append(simulation.node.get_clock().now()))
+    jumps.forgot = forgot
+    yield jumps
+    jumps.close()
+
+
+def is_refused(jumps, stamp_s, received_at):
+    try:
+        jumps.check(stamp(stamp_s), received_at)
+    except TimeJumpError:
+        return True
+    return False
+
+
+def test_time_that_goes_on_is_no_jump(simulation, jumps):
+    start = time.monotonic()
+    simulation.set_time(5.0, 5.1, 6.0, 600.0)
+    assert not jumps.forgot and not jumps.is_settling
+    for stamp_s in (0.0, 5.0, 1e6):
+        assert not is_refused(jumps, stamp_s, start)
+
+
+@pytest.mark.parametrize(('before_s', 'after_s'), [(100.0, 95.0), (600.0, 2.0), (10.0, 9.9)])
+def test_a_jump_back_is_seen_once(simulation, jumps, before_s, after_s):
+    simulation.set_time(before_s, after_s, after_s + 0.01, after_s + 1.0)
+    assert [one.nanoseconds for one in jumps.forgot] == [round(after_s * S)]
+    assert jumps.is_settling
+
+
+def test_each_jump_of_a_bag_that_loops_is_seen(simulation, jumps):
+    simulation.set_time(*3 * [100.0, 101.0])
+    assert len(jumps.forgot) == 2
+
+
+def test_messages_from_before_a_jump_are_refused(simulation, jumps):
+    simulation.set_time(100.0)
+    before = time.monotonic()
+    simulation.set_time(95.0)
+    after = time.monotonic()
+    with pytest.raises(TimeJumpError, match=r'time jumped back by 5\.000 s'):
+        jumps.check(stamp(99.9), before)
+    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before'
+    assert is_refused(jumps, 99.9, after), 'it waited in the middleware'
+    assert not is_refused(jumps, 95.0, after) and not is_refused(jumps, 94.9, after)
+    assert is_refused(jumps, 99.9, after + 60.0), 'so it did for long'
+    simulation.set_time(99.9)
+    assert not is_refused(jumps, 99.9, after), 'time went on'
+
+
+def test_the_last_of_two_jumps_counts(simulation, jumps):
+    simulation.set_time(100.0, 50.0)
+    between = time.monotonic()
+    simulation.set_time(20.0)
+    assert is_refused(jumps, 50.0, between)
+    assert not is_refused(jumps, 20.0, time.monotonic())
+
+
+def test_a_node_that_leaves_or_enters_simulated_time_forgets(simulation, jumps):
+    simulation.set_time(5.0)
+    for number, simulated in enumerate((False, True), 1):
+        before = time.monotonic()
+        simulation.node.set_parameters([Parameter('use_sim_time', value=simulated)])
+        assert len(jumps.forgot) == number
+        with pytest.raises(TimeJumpError, match='use_sim_time changed'):
+            jumps.check(stamp(5.0), before)
+        assert not is_refused(jumps, 5.0, time.monotonic())
+    assert is_refused(jumps, 9.0, time.monotonic())
+
+
+def test_closed_it_watches_no_longer(simulation, jumps):
+    jumps.close()
+    simulation.set_time(5.0, 2.0)
+    assert not jumps.forgot
+
+
+def test_a_jump_is_over_after_some_seconds(simulation, jumps, wait):
+    simulation.set_time(5.0, 2.0)
+    assert jumps.is_settling
+    wait(lambda: not jumps.is_settling, 'transforms to be there again')
+
+
+VALUES = {'base_frame': 'base_link', 'tf_timeout_s': 0.0, 'gravity': 'imu'}
+
+
+class Inputs:
+    """Everything that the relocalizer listens to, and a robot that publishes it."""
+
+    def __init__(self, simulation):
+        node = simulation.node
+        transforms = CoordinateFrames(node)
+        self.odometry = OdometrySource(node)
+        self.vertical = VerticalSource(node, transforms)
+        self.complete = []
+        self.frames = FrameSource(node, 'raw', math.inf, self.complete.append)
+        self._publishers = {message_type: simulation.world.create_publisher(
+            message_type, topic, 10) for message_type, topic in (
+                (Odometry, 'odom'), (Imu, 'imu'), (Image, 'image'), (CameraInfo, 'camera_info'),
+                (Detection2DArray, 'detections'))}
+
+    def open(self):
+        self.vertical.open('imu')
+        self.odometry.open()
+        self.frames.open()
+
+    def close(self):
+        self.frames.close('the test is over')
+        self.odometry.close()
+        self.vertical.close()
+
+    def forget(self):
+        for part in (self.odometry, self.vertical, self.frames):
+            part.forget()
+
+    def publish(self, stamp_s, *message_types):
+        for message_type in message_types:
+            message = message_type(header=Header(stamp=stamp(stamp_s), frame_id='base_link'))
+            if message_type is Odometry:
+                message.child_frame_id = 'base_link'
+                message.pose.pose.position.x = 0.1 * stamp_s
+            if message_type is Imu:
+                message.linear_acceleration.z = 9.81
+            self._publishers[message_type].publish(message)
+
+    def pair(self, simulation, stamp_s, *message_types):
+        """Publish parts of a frame until they wait for the others."""
+        heard = self.frames._pairing.last_stamp_ns
+        names = {Image: 'image', CameraInfo: 'camera_info', Detection2DArray: 'detections'}
+        for one in message_types:
+            simulation.spin_until(lambda n=names[one]: heard.get(n) == round(stamp_s * S),
+                                  names[one], lambda t=one: self.publish(stamp_s, t))
+
+    def run(self, stamp_s):
+        """Return which run of odometry covers a time."""
+        return self.odometry.pose_at(stamp(stamp_s)).run
+
+    def up(self, stamp_s):
+        return self.vertical.up_in_camera(VALUES, np.eye(4), 'camera', stamp(stamp_s))
+
+    def is_known(self, stamp_s):
+        try:
+            return self.run(stamp_s) is not None and self.up(stamp_s) is not None
+        except (NoOdometryError, NoVerticalError):
+            return False
+
+
+@pytest.mark.parametrize('restart_s', [95.0, 99.9, 2.0])
+def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
+    inputs = Inputs(simulation)
+    jumps = TimeJumps(simulation.node, inputs.forget)
+    inputs.open()
+    simulation.set_time(100.0)
+    simulation.spin_until(lambda: inputs.is_known(100.0), 'odometry and vertical',
+                          lambda: inputs.publish(100.0, Odometry, Imu))
+    run = inputs.run(100.0)
+    # The boxes of an image that was lost: the same stamp comes again.
+    inputs.pair(simulation, restart_s, Detection2DArray, CameraInfo)
+    inputs.pair(simulation, 98.0, Detection2DArray, CameraInfo)  # no copies are on their way now
+    simulation.set_time(restart_s)
+    assert not inputs.is_known(100.0)
+    inputs.pair(simulation, restart_s, Image)
+    assert not inputs.complete, 'an image of now with boxes from before'
+    simulation.spin_until(lambda: inputs.is_known(restart_s), 'odometry and vertical',
+                          lambda: inputs.publish(restart_s, Odometry, Imu))
+    assert inputs.run(restart_s) != run, 'frames across the jump are not fused'
+    inputs.close()
+    jumps.close()
+
+
+def order_of(*stamps_s, order=None, stream='camera'):
+    order = order or StampOrder()
+    return [order.goes_back(stream, round(one * S)) for one in stamps_s]
+
+
+@pytest.mark.parametrize(('stamps_s', 'expected'), [
+    ((1.0, 2.0, 2.0, 50.0), [False] * 4),
+    ((10.0, 9.5, 10.1), [False] * 3),  # two publishers
+    ((10.0, 8.9, 9.0, 10.2), [False, True, False, False]),
+    ((600.0, 2.0, 1.5, 600.0, 2.0), [False, True, False, False, True])])
+def test_stamps_of_a_stream_that_go_back(stamps_s, expected):
+    assert order_of(*stamps_s) == expected
+
+
+def test_streams_have_stamps_of_their_own_until_one_jumps():
+    order = StampOrder()
+    assert order_of(100.0, order=order, stream='odom') == [False]
+    assert order_of(5.0, 6.0, order=order, stream='arm') == [False, False]
+    assert order_of(50.0, order=order, stream='odom') == [True]
+    # All are forgotten by one: the other is not taken for another jump.
+    assert order_of(1.0, order=order, stream='arm') == [False]
+    order.clear()
+    assert order_of(1.0, order=order, stream='odom') == [False]

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layout of the package: imports point downwards, modules and functions stay short."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+ROOT = 'cliploc_ros'
+MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffix('.__init__'):
+           path for path in sorted((PROJECT / ROOT).rglob('*.py'))}
+SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
+           *sorted((PROJECT / 'demo_world').glob('*.py'))]
+
+# Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
+# and of lower layers, but none of another prefix in the same layer.
+LAYERS = (
+    ('errors', 'units'),
+    ('core.compiled', 'core.parameter_file', 'core.time_budget'),
+    ('core.geometry',),
+    ('core.index',),
+    ('core.observation', 'core.landmark_map', 'core.options'),
+    ('core.association',),
+    ('core.search',),
+    ('core.fit',),
+    ('core.acceptance',),
+    ('core',),
+    ('mapping',),
+    ('messages', 'command'),
+    ('models', 'datasets'),
+    ('evaluation',),
+    ('benchmark',),
+    ('ros.qos', 'ros.conversions'),
+    ('ros.node',),
+    ('ros.inputs',),
+    ('ros.outputs', 'ros.replay'),
+    ('ros',),
+    ('nodes',),
+    ('demo',),
+    ('cli',),
+)
+RANKS = {f'{ROOT}.{prefix}': rank for rank, prefixes in enumerate(LAYERS) for prefix in prefixes}
+MAX_MODULE_LINES = 400
+MAX_FUNCTION_LINES = 60
+MAX_PARAMETERS = 10
+#: Takes four vectors as scalars, which the compiler keeps in registers.
+MANY_PARAMETERS = {'_upright_rotation'}
+
+
+def prefix_of(module: str) -> str:
+    """Return the longest prefix in LAYERS that a module belongs to."""
+    prefix = module
+    while prefix not in RANKS:
+        prefix, dot, _ = prefix.rpartition('.')
+        assert dot, f'{module} is in no layer: add it to LAYERS'
+    return prefix
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Return the modules of the package that a file imports, inside functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f'{path}:{node.lineno}: import relative to the package'
+            submodules = {f'{node.module}.{alias.name}' for alias in node.names}
+            found |= submodules & MODULES.keys() or {node.module}
+    return {name for name in found if name.startswith(f'{ROOT}.')}
+
+
+def test_imports_point_downwards():
+    upward = []
+    for module in sorted(MODULES.keys() - {ROOT}):
+        here = prefix_of(module)
+        for imported in sorted(imported_modules(MODULES[module])):
+            there = prefix_of(imported)
+            if there != here and RANKS[there] >= RANKS[here]:
+                upward.append(f'{module} ({here}) imports {imported} ({there})')
+    assert not upward, '\n' + '\n'.join(upward)
+
+
+def test_importing_the_package_imports_no_library():
+    code = (f'import sys; before = set(sys.modules); import {ROOT}\n'
+            "print(sorted({'rclpy', 'torch', 'numpy'} & (set(sys.modules) - before)))")
+    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=True,
+                          capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == '[]'
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PROJECT)))
+def test_modules_and_functions_are_short(path):
+    source = path.read_text()
+    assert len(source.splitlines()) <= MAX_MODULE_LINES
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            length = node.end_lineno - node.lineno + 1
+            assert length <= MAX_FUNCTION_LINES, f'{node.name} has {length} lines'
+
+
+@pytest.mark.parametrize('path', MODULES.values(), ids=lambda path: str(path.relative_to(PROJECT)))
+def test_functions_have_few_parameters(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
+            assert count <= MAX_PARAMETERS or node.name in MANY_PARAMETERS, (
+                f'{node.name} has {count} parameters')
