@@ -73,8 +73,8 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     cuts1, cuts2 = abs(e1) < 1.0, abs(e2) < 1.0
     if not (cuts1 or cuts2):
         return _nested_or_apart(h, k, a, b, ellipse_area)
-    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. If both
-    # lines coincide (the outlines touch twice), one looks to each side.
+    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. If
+    # both lines coincide (the outlines touch twice), one looks to each side.
     along = r * r - s * s
     side1, side2 = e1 - e2 * along, e2 - e1 * along
     sign1 = 1.0 if not cuts2 or side1 <= 0.0 else -1.0

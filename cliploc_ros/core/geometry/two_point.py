@@ -3,8 +3,8 @@
 """The pose of a camera from two points, where the vertical is known.
 
 The vertical leaves a rotation about itself and a translation unknown. In coordinate frames whose
-third axis is up, camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw) (X2 - X1)``, with depths
-d along the bearings b. The third row and the length do not depend on the yaw:
+third axis is up, camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw) (X2 - X1)``, with
+depths d along the bearings b. The third row and the length do not depend on the yaw:
 
     d2 b2z - d1 b1z = Dz   and   |d2 b2 - d1 b1|^2 = |D|^2.
 

@@ -97,7 +97,7 @@ Similarities = NDArray[np.float32] | CropSimilarities
 
 def nearest_landmarks(similarities: Similarities, k: int
                       ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k landmarks (n, k) most similar to each crop, best first, and similarities (n, k).
+    """Return the k landmarks (n, k) most similar to each crop, best first, and their similarities.
 
     Equal similarities keep the map's order.
 
@@ -196,9 +196,9 @@ def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
 
 def sampled_similarities(similarities: Similarities, crops: NDArray[np.int64], most: int
                          ) -> NDArray[np.float32]:
-    """Return the similarities (m, s) of crops (m,) and every n-th landmark, at most `most`.
+    """Return the similarities (m, s) of crops (m,) and landmarks spread evenly over the map.
 
-    A map of at most `most` landmarks is not thinned; of larger ones, at least half of `most` remain.
+    These are all landmarks of a map that has at most `most`; otherwise half of `most` at least.
     """
     step = -(-similarities.shape[1] // most)
     if not isinstance(similarities, CropSimilarities):

@@ -15,8 +15,8 @@ from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.compiled import compiled
 
 # Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
-# boxes of the recorded TUM frames, 99.8 % lie between .67 and 2.5; their map was fitted to the same
-# recording. Boxes are larger than the ellipsoid, or cut by the border.
+# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
+# boxes are larger than the ellipsoid, or cut by the border.
 NEAREST, FARTHEST = 0.55, 2.5
 
 
