@@ -47,8 +47,6 @@ RANKS = {f'{ROOT}.{prefix}': rank for rank, prefixes in enumerate(LAYERS) for pr
 MAX_MODULE_LINES = 400
 MAX_FUNCTION_LINES = 60
 MAX_PARAMETERS = 10
-#: Takes four vectors as scalars, which the compiler keeps in registers.
-MANY_PARAMETERS = {'_upright_rotation'}
 
 
 def prefix_of(module: str) -> str:
@@ -107,5 +105,4 @@ def test_functions_have_few_parameters(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
-            assert count <= MAX_PARAMETERS or node.name in MANY_PARAMETERS, (
-                f'{node.name} has {count} parameters')
+            assert count <= MAX_PARAMETERS, f'{node.name} has {count} parameters'
