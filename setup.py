@@ -38,7 +38,7 @@ setup(
         ],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
-        'test': ['hypothesis', 'pytest'],
+        'test': ['hypothesis', 'pytest', 'pytest-xdist'],
     },
     zip_safe=False,
     maintainer='the cliploc_ros authors',

@@ -24,8 +24,11 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
-from cliploc_ros.mapping.triangulation import triangulate
-from cliploc_ros.mapping.views import Views, make_views, map_from_cameras
+from cliploc_ros.mapping.triangulation import SUPPORT_IOU, triangulate
+from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_out
+
+# Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
+_WINDOW_S, _OVERLAP_S = 90.0, 30.0
 
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
@@ -101,9 +104,9 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
     """Return the landmarks that the views show, for the poses that they have."""
     landmarks = no_landmarks()
     for number in range(options.discovery_rounds):
-        tell('finding landmarks', number / options.discovery_rounds)
         free = associate(views, landmarks, options.association_iou) < 0
-        landmarks = join_landmarks(landmarks, _discover(views, free, options, rng))
+        landmarks = join_landmarks(landmarks, _discover(views, free, options, rng,
+                                                        tell))
         tell('fitting landmarks', number / options.discovery_rounds)
         landmarks = _settle(views, landmarks, options)
     evidence = gather_evidence(views, landmarks,
@@ -136,11 +139,35 @@ def _refine(given: Views, views: Views, draft: _Draft, options: MappingOptions
 
 
 def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
-              rng: np.random.Generator) -> Landmarks:
-    """Return landmarks that explain the free boxes, class by class."""
-    return join_landmarks(*(
-        triangulate(views, np.nonzero(free & (views.classes == number))[0], options, rng)
-        for number in np.unique(views.classes[free])))
+              rng: np.random.Generator, tell: Progress) -> Landmarks:
+    """Return landmarks that explain the free boxes, class by class and minute by minute.
+
+    What a window of time has found explains boxes of the next one, so that the work grows with
+    the length of the recording only.
+    """
+    free = free & thin_out(views, options.frames_per_viewpoint)[views.frames]
+    found = [no_landmarks()]
+    for first, last in _windows(views.stamps_s):
+        tell('finding landmarks', first / len(views.stamps_s))
+        window = views.between(first, last)
+        left = free[views.offsets[first]:views.offsets[last]].copy()
+        left &= associate(window, found[-1], SUPPORT_IOU) < 0
+        found.append(join_landmarks(*(
+            triangulate(window, np.nonzero(left & (window.classes == number))[0], options, rng)
+            for number in np.unique(window.classes[left]))))
+    return join_landmarks(*found)
+
+
+def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return the first frame of each window of time, and the one after its last."""
+    windows, begin_s = [], stamps_s[0]
+    while True:
+        first, last = np.searchsorted(stamps_s, [begin_s, begin_s + _WINDOW_S])
+        if last > first:
+            windows.append((int(first), int(last)))
+        if last == len(stamps_s):
+            return windows
+        begin_s = stamps_s[last] - _OVERLAP_S
 
 
 def _settle(views: Views, landmarks: Landmarks, options: MappingOptions) -> Landmarks:

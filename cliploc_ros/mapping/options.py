@@ -43,6 +43,8 @@ class MappingOptions:
         An edge this near to the image border is open: the object may extend beyond it [px].
     pairs_per_box : int
         Hypotheses that each box is the seed of.
+    frames_per_viewpoint : int
+        At most so many frames of a viewpoint are searched for new landmarks.
     min_viewpoints : int
         A landmark needs support from so many viewpoints.
     discovery_rounds, settling_rounds : int
@@ -83,6 +85,7 @@ class MappingOptions:
     edge_sigma_share: float = 0.04
     border_px: float = 3.0
     pairs_per_box: int = 3
+    frames_per_viewpoint: int = 8
     min_viewpoints: int = 3
     discovery_rounds: int = 2
     settling_rounds: int = 3

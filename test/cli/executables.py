@@ -27,7 +27,7 @@ from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.rosbag import RELIABLE_QOS, BagWriter
 
 PROJECT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0  # a limit for hangs alone, on a machine under load
 SIZE = (64, 48)
 START_NS = 1_700_000_000_123_456_789
 MS = 1_000_000

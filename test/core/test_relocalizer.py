@@ -142,7 +142,7 @@ def test_k_larger_than_the_map_is_refused(room):
 
 @pytest.mark.parametrize('change', [
     {'matching': 'magic'}, {'algorithm': 'luck'},
-    {'algorithm': 'b-prosac', 'matching': 'class'}, {'k': -1}, {'iterations': 0},
+    {'algorithm': 'b-prosac', 'matching': 'class'}, {'k': 0}, {'iterations': 0},
     {'iou_threshold': 1.5}, {'iou_threshold': float('nan')}, {'time_budget_s': -1.0},
     {'min_inliers': 2}, {'min_confidence': -1.0}])
 def test_impossible_options_are_named(change):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError
 from cliploc_ros.ros.node.worker import LatestOnly, Worker
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture
