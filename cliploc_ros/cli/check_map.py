@@ -70,7 +70,7 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
                        help='spacing of the camera positions, larger in large maps (%(default)s)')
     group.add_argument('--positions', type=_positive_int, default=150, metavar='N',
                        help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=_positive_int, default=8, metavar='N',
+    group.add_argument('--headings', type=_positive_int, default=12, metavar='N',
                        help='directions at each position (%(default)s)')
     group.add_argument('--camera-height', type=float, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')

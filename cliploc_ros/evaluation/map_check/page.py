@@ -99,17 +99,22 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
 
 def _verdicts(trials: Sequence[Trial]) -> str:
     counts = count_verdicts(trials)
-    return (f'{counts["accepted"]} of {len(trials)} accepted ({share(tuple(trials), "accepted"):.0%}'
-            f'), {counts["refused"]} refused, {counts["misled"]} misled')
+    accepted = share(trials, 'accepted')
+    return (f'{counts["accepted"]} of {len(trials)} accepted ({accepted:.0%}), '
+            f'{counts["refused"]} refused, {counts["misled"]} misled')
 
 
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     head = ('landmark', 'class', '#frames', '#seen [%]', '#baseline [deg]', '#deviation [cm]',
-            '#median IoU', '#thinness', 'overlaps (normalized distance)', 'faults')
+            '#offset [cm]', '#median IoU', '#thinness', 'overlaps (normalized distance)', 'faults')
     rows = ''.join(_landmark_row(one) for one in landmarks[:_MOST_LANDMARKS])
     rest = len(landmarks) - _MOST_LANDMARKS
     more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
-    return f'<div class="scroll"><table>{_head(head)}{rows}</table></div>{more}'
+    return (f'<div class="scroll"><table>{_head(head)}{rows}</table></div>{more}'
+            '<p class="note">frames: with the landmark, of those that should show it. seen: '
+            'their share. baseline: greatest angle between two views. deviation: of the centre '
+            'on its worst axis. offset: from the centre to where its boxes put it. thinness: '
+            'least by greatest semi-axis.</p>')
 
 
 def _landmark_row(one: LandmarkCheck) -> str:
@@ -119,8 +124,8 @@ def _landmark_row(one: LandmarkCheck) -> str:
     support = '' if one.support is None else (
         str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
     numbers = [support, _number(one.seen_ratio, 100.0, 0), _number(one.baseline_deg, 1.0, 0),
-               _number(one.position_sigma_m, 100.0, 1), _number(one.median_iou, 1.0, 2),
-               _number(one.thinness, 1.0, 2)]
+               _number(one.position_sigma_m, 100.0, 1), _number(one.offset_m, 100.0, 1),
+               _number(one.median_iou, 1.0, 2), _number(one.thinness, 1.0, 2)]
     faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
     return '<tr>' + ''.join([*texts, *(_cell(text, 'number') for text in numbers),
                              _cell(overlaps), _cell(faults)]) + '</tr>'

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -35,21 +35,24 @@ from cliploc_ros.mapping.checking.report import CheckReport, GridCheck
 _DPI = 110
 _MARGIN_M = 0.4
 _LARGEST_IN = 9.0
-_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FFFFFF', '#56B4E9', '#003E6B'])
+_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B'])
+_UNSEEN = '#DDDDDD'
 _MOST_NAMES = 45
 _MOST_LOOK_ALIKES = 6
 
 
-def draw_pictures(landmark_map: LandmarkMap, report: CheckReport) -> Iterator[tuple[str, str, bytes]]:
+def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
+                  ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
     bounds = _bounds(landmark_map, report)
     yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
-           'the more headings a right pose is accepted in. The recording passed near the '
-           'outlined cells. Ticks point where the camera looked when a wrong pose was accepted.',
+           'the more of the headings with at least three detectable landmarks give an accepted, '
+           'right pose. Ticks point where the camera looked when a wrong pose was accepted.',
            _png(_grid_figure(landmark_map, report, bounds)))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
-               'frames of that time. Times are those of the longest runs of refused frames.',
+               'frames of that time. The dot is the camera, the wedge where it looks. Times '
+               'are those of the longest runs of refused frames.',
                _png(_frames_figure(landmark_map, report, bounds)))
         yield ('time', 'The same frames over time: how many landmarks of the map the detector '
                'found, and the verdict.', _png(_time_figure(report.recording.trials)))
@@ -102,7 +105,8 @@ def _draw_outlines(axes: Axes, landmark_map: LandmarkMap, face: str | Sequence[s
                                     strict=True):
         outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
         axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=color,
-                               edgecolor=edge, linewidth=0.7, alpha=alpha, zorder=3))
+                               edgecolor=edge, linewidth=0.7, alpha=alpha, zorder=3,
+                               path_effects=EDGED if color == 'none' else None))
 
 
 def _name(axes: Axes, xy: NDArray[np.float64], text: str, color: str = INK) -> None:
@@ -121,12 +125,13 @@ def _grid_figure(landmark_map: LandmarkMap, report: CheckReport, bounds: NDArray
     height = grid.positions[0, 2] if len(grid.positions) else 0.0
     figure, axes = _map_figure(landmark_map, bounds,
                                f'Expected relocalization, camera {height:.2f} m high')
-    for position, near, accepted in zip(grid.positions, grid.is_near, grid.accepted,
-                                        strict=True):
+    for position, near, accepted, useful in zip(grid.positions, grid.is_near, grid.accepted,
+                                                grid.useful, strict=True):
         corner = position[:2] - grid.spacing_m / 2
-        axes.add_patch(Rectangle((corner[0], corner[1]), grid.spacing_m, grid.spacing_m,
-                                 facecolor=_HEAT(accepted / grid.headings), linewidth=0.0,
-                                 zorder=1))
+        is_dark = useful == 0 and accepted == 0
+        axes.add_patch(Rectangle(
+            (corner[0], corner[1]), grid.spacing_m, grid.spacing_m, linewidth=0.0, zorder=1,
+            facecolor=_UNSEEN if is_dark else _HEAT(min(1.0, accepted / max(1, useful)))))
         if near and report.recording is not None:
             inset = 0.06 * grid.spacing_m
             axes.add_patch(Rectangle(
@@ -136,18 +141,19 @@ def _grid_figure(landmark_map: LandmarkMap, report: CheckReport, bounds: NDArray
     _draw_outlines(axes, landmark_map, 'none', alpha=0.9)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color='#444444', marker='o', markerfacecolor='none', linestyle='none',
-               label='landmark')]
+               label='landmark'),
+        Patch(facecolor=_UNSEEN, label='fewer than 3 landmarks in every view')]
     if report.recording is not None:
         path = report.recording.path_xyz
         axes.plot(path[:, 0], path[:, 1], color=INK, linewidth=1.0, zorder=4,
-                  linestyle=(0, (4, 2)))
+                  linestyle=(0, (4, 2)), path_effects=EDGED)
         handles += [Line2D([], [], color=INK, linewidth=1.0, linestyle=(0, (4, 2)),
                            label='path of the recording'),
                     Patch(facecolor='white', edgecolor='#555555', label='near the recording')]
     handles += _draw_misled(axes, grid)
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), _HEAT), ax=axes, shrink=0.7,
                           pad=0.02)
-    bar.set_label(f'headings in which a right pose is accepted [% of {grid.headings}]')
+    bar.set_label('right pose accepted [% of the headings that show 3 or more landmarks]')
     _add_legend(figure, handles)
     return figure
 
@@ -185,23 +191,25 @@ def _frames_figure(landmark_map: LandmarkMap, report: CheckReport, bounds: NDArr
     handles: list[Line2D | Patch] = []
     for verdict, color in VERDICT_COLORS.items():
         count = sum(one.verdict == verdict for one in trials)
-        handles.append(Patch(facecolor=color if verdict != 'refused' else 'none', edgecolor=color,
-                             linewidth=1.5, label=f'{verdict} ({count})'))
+        handles.append(Line2D([], [], color=color, label=f'{verdict} ({count})', markersize=5,
+                              marker='s' if verdict == 'refused' else 'o'))
     _add_legend(figure, [*handles, Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5,
                                          label='landmark')])
     return figure
 
 
 def _draw_frustum(axes: Axes, trial: Trial, size: float) -> None:
-    """Draw a triangle with its tip at the camera, open where the camera looks."""
+    """Draw a dot at the camera and a wedge to where it looks."""
     ahead = trial.forward[:2]
     side = np.array([-ahead[1], ahead[0]]) * 0.5
     tip = trial.position[:2]
     color = VERDICT_COLORS[trial.verdict]
     axes.add_patch(Polygon(
         [tip, tip + size * (ahead + side), tip + size * (ahead - side)], closed=True,
-        facecolor='none' if trial.verdict == 'refused' else color, edgecolor=color,
-        linewidth=1.3, alpha=0.9, zorder=6 if trial.verdict == 'misled' else 5))
+        facecolor=to_rgba(color, 0.0 if trial.verdict == 'refused' else 0.3), edgecolor=color,
+        linewidth=1.0, zorder=5))
+    axes.plot(tip[0], tip[1], marker='s' if trial.verdict == 'refused' else 'o', color=color,
+              markersize=4, zorder=6)
 
 
 def _time_figure(trials: Sequence[Trial]) -> Figure:

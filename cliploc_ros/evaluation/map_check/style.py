@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures and the page of a check share: colours of Okabe and Ito, which the
-colour-blind can distinguish, and words.
+"""What the pictures and the page of a check share.
+
+The colours are those of Okabe and Ito, which the colour-blind can distinguish.
 """
 
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck

@@ -20,8 +20,8 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 def give_advice(report: CheckReport) -> list[str]:
     """Return what to do, one sentence or two each."""
-    advice = [*_on_misled(report), *_on_duplicates(report), *_on_landmarks(report),
-              *_on_corrections(report), *_on_look_alikes(report), *_on_spans(report),
+    advice = [*_on_look_alikes(report), *_on_duplicates(report), *_on_misled(report),
+              *_on_corrections(report), *_on_landmarks(report), *_on_spans(report),
               *_on_grid(report.grid)]
     return advice or ['nothing to do: the map reaches all thresholds that were checked']
 
@@ -96,9 +96,9 @@ def _on_spans(report: CheckReport) -> Iterator[str]:
 def _on_grid(grid: GridCheck) -> Iterator[str]:
     for rows in _dead_areas(grid)[:_MOST_OF_A_KIND]:
         low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
-        yield (f'no heading is accepted at {len(rows)} positions near the recording with x '
+        yield (f'no heading is accepted at {len(rows)} positions near the recording, x '
                f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: at most '
-               f'{_landmarks(round(grid.visible[rows].max()))} can be detected in one view; map '
+               f'{_landmarks(int(grid.visible[rows].max()))} can be expected in one view; map '
                'more objects that can be seen from there')
 
 

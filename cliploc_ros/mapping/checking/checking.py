@@ -44,10 +44,7 @@ from cliploc_ros.mapping.checking.report import (
     find_failures,
 )
 from cliploc_ros.mapping.checking.systematic import find_corrections
-from cliploc_ros.mapping.evidence import group_boxes
-from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.input_checks import check_input
-from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views, make_views
 
@@ -112,8 +109,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map, rng)),
         grid=GridCheck(grid.positions, grid.is_near, (verdicts == 'accepted').sum(axis=1),
                        (verdicts == 'misled').sum(axis=1),
-                       visible.reshape(-1, options.headings).max(axis=1), options.headings,
-                       grid.spacing_m, tuple(trials)),
+                       visible.reshape(-1, options.headings), grid.spacing_m, tuple(trials)),
         recording=recording,
         queries=tuple(try_observations(landmark_map, queries, options,
                                        lambda share: tell('relocalizing queries', share))),
@@ -147,19 +143,8 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         as_given=box_quality(judge_boxes(views, witness.landmarks)),
         held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
         trials=tuple(trials), simulated=tuple(simulated),
-        corrections=tuple(find_corrections(detections, views, _fitted(views, witness),
-                                           witness.shown)),
+        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=model.edge_scale)
-
-
-def _fitted(views: Views, witness: Witness) -> Landmarks:
-    """Return the landmarks fitted to the boxes that show them."""
-    centers, bases = witness.landmarks.centers.copy(), witness.landmarks.bases.copy()
-    for number, rows in enumerate(group_boxes(witness.shown, len(centers))):
-        if len(rows):
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
-            centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, witness.landmarks.classes)
 
 
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:

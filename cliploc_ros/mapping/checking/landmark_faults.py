@@ -13,20 +13,24 @@ from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence, group_boxes
+from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks, landmarks_of_map
 from cliploc_ros.mapping.merging import normalized_distance
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
 
 # Landmarks nearer than this are reported, see normalized_distance. Those of one class are one
-# object, unless frames show both at once. A guess: build_map merges below 0.8 if the boxes agree.
-_OVERLAP_DISTANCE = 0.5
+# object, unless they are farther apart than the second distance and frames show both at once.
+# Guesses: build_map merges below 0.8 if the boxes agree.
+_OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
 _MAX_SHARED_VIEWS = 0.15
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
 # A landmark that so many frames should show and none does is missing.
 _MIN_EXPECTED = 10
 _REACH = 1.2
+# A landmark that its boxes put farther away than all of these is in the wrong place. Guesses.
+_MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
 
 
 class Overlap(NamedTuple):
@@ -39,7 +43,7 @@ class Overlap(NamedTuple):
     distance : float
         Normalized, about 1 if they touch.
     is_duplicate : bool
-        They are of one class and no frames show both.
+        They are of one class, and no frames tell them apart.
     """
 
     first: int
@@ -65,6 +69,8 @@ class LandmarkCheck:
         Greatest angle between two directions from which it was seen [deg].
     position_sigma_m : float
         Standard deviation of its centre on the worst axis [m].
+    offset_m : float
+        From its centre to where its boxes put it [m].
     median_iou : float
         Of its boxes.
     thinness : float
@@ -86,6 +92,7 @@ class LandmarkCheck:
     seen_ratio: float | None
     baseline_deg: float | None
     position_sigma_m: float | None
+    offset_m: float | None
     median_iou: float | None
     thinness: float
     overlaps: tuple[tuple[str, float], ...]
@@ -105,12 +112,15 @@ class Witness(NamedTuple):
     evidence : Evidence
     expected : ndarray (L,) of int
         Frames that should show each landmark, those without a box included.
+    fitted : Landmarks
+        The landmarks fitted to the boxes that show them.
     """
 
     landmarks: Landmarks
     shown: NDArray[np.int64]
     evidence: Evidence
     expected: NDArray[np.int64]
+    fitted: Landmarks
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
@@ -123,7 +133,16 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     reach = _median_reach(views, landmarks, shown)
     for row in np.nonzero(evidence.support == 0)[0]:
         expected[row] = count_expected(views, landmarks.centers[row], landmarks.bases[row], reach)
-    return Witness(landmarks, shown, evidence, expected)
+    return Witness(landmarks, shown, evidence, expected, _fitted(views, landmarks, shown))
+
+
+def _fitted(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landmarks:
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    for number, rows in enumerate(group_boxes(shown, len(centers))):
+        if len(rows):
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            centers[number], bases[number] = fit.center, fit.basis
+    return Landmarks(centers, bases, landmarks.classes)
 
 
 def _median_reach(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
@@ -151,9 +170,10 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
                 continue
             distance = normalized_distance(landmarks, first, second)
             if distance < _OVERLAP_DISTANCE:
-                same = landmarks.classes[first] == landmarks.classes[second]
-                found.append(Overlap(first, second, distance, bool(
-                    same and not _seen_together(witness, views, first, second))))
+                is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
+                    distance < _SAME_PLACE_DISTANCE
+                    or not _seen_together(witness, views, first, second))
+                found.append(Overlap(first, second, distance, bool(is_duplicate)))
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
 
 
@@ -210,7 +230,8 @@ def _check(landmark_map: LandmarkMap, row: int, witness: Witness | None,
         ids[row], landmark_map.labels[row], landmark_map.class_ids[row],
         (float(center[0]), float(center[1]), float(center[2])), *numbers, thinness,
         tuple((ids[other], overlap.distance) for other, overlap in partners),
-        tuple(text for _, text in faults), sum(weight for weight, _ in faults))
+        tuple(text for _, text in faults),
+        faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0)
 
 
 class _Numbers(NamedTuple):
@@ -221,6 +242,7 @@ class _Numbers(NamedTuple):
     seen_ratio: float | None
     baseline_deg: float | None
     position_sigma_m: float | None
+    offset_m: float | None
     median_iou: float | None
 
     @staticmethod
@@ -228,14 +250,15 @@ class _Numbers(NamedTuple):
         if witness is None:
             given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
             return _Numbers(given.support, None, given.seen_ratio, given.baseline_deg,
-                            given.position_sigma, None)
+                            given.position_sigma, None, None)
         evidence, support = witness.evidence, int(witness.evidence.support[row])
         expected = int(witness.expected[row])
         if support == 0:
-            return _Numbers(0, expected, 0.0 if expected else None, None, None, None)
+            return _Numbers(0, expected, 0.0 if expected else None, None, None, None, None)
+        offset = witness.fitted.centers[row] - witness.landmarks.centers[row]
         return _Numbers(support, expected, float(evidence.seen_ratio[row]),
                         float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
-                        float(evidence.median_iou[row]))
+                        float(np.linalg.norm(offset)), float(evidence.median_iou[row]))
 
 
 def _support_faults(numbers: _Numbers, size_m: float, options: MappingOptions
@@ -261,9 +284,14 @@ def _support_faults(numbers: _Numbers, size_m: float, options: MappingOptions
     if baseline is not None and baseline < options.min_baseline_deg:
         faults.append((0.7, f'was seen from one side: {baseline:.0f} degrees; record it from '
                             'another side'))
+    if (offset := numbers.offset_m) is not None and offset > max(
+            _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (numbers.position_sigma_m
+                                                                    or 0.0)):
+        faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: moved, '
+                            'or badly fitted; map it again'))
     limit = max(options.max_position_sigma_m, options.max_position_sigma_share * size_m)
     sigma = numbers.position_sigma_m
     if sigma is not None and sigma > limit:
-        faults.append((0.8, f'has an uncertain position: {sigma * 100:.0f} cm; record it from '
+        faults.append((0.7, f'has an uncertain position: {sigma * 100:.0f} cm; record it from '
                             'more sides'))
     return faults

@@ -53,7 +53,7 @@ class CheckOptions:
     frames: int = 100
     spacing_m: float = 0.5
     max_positions: int = 150
-    headings: int = 8
+    headings: int = 12
     camera_height_m: float | None = None
     use_vertical: bool = False
     wrong_m: float = 1.0

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a check: figures, verdict and advice."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from cliploc_ros.mapping.checking.systematic import Correction
 
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
+#: A pose needs so many landmarks.
+LANDMARKS_FOR_A_POSE = 3
 
 
 @dataclass(frozen=True)
@@ -86,9 +89,8 @@ class GridCheck:
         The recording passed near; without a recording, all.
     accepted, misled : ndarray (P,) of int
         Headings of each position in which a right, and a wrong pose is accepted.
-    visible : ndarray (P,)
-        The most landmarks that are detected in one view, on average.
-    headings : int
+    visible : ndarray (P, H)
+        How many landmarks the detector finds on average, by heading.
     spacing_m : float
     trials : tuple of Trial
         Heading by heading of each position.
@@ -99,9 +101,18 @@ class GridCheck:
     accepted: NDArray[np.int64]
     misled: NDArray[np.int64]
     visible: NDArray[np.float64]
-    headings: int
     spacing_m: float
     trials: tuple[Trial, ...]
+
+    @property
+    def headings(self) -> int:
+        """Return the number of headings at each position."""
+        return self.visible.shape[1]
+
+    @property
+    def useful(self) -> NDArray[np.int64]:
+        """Return the number of headings (P,) that show enough landmarks for a pose."""
+        return np.asarray((self.visible >= LANDMARKS_FOR_A_POSE).sum(axis=1))
 
     @property
     def accepted_positions(self) -> float:
@@ -214,7 +225,7 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
     return failures
 
 
-def share(trials: list[Trial] | tuple[Trial, ...], verdict: str) -> float:
+def share(trials: Sequence[Trial], verdict: str) -> float:
     """Return the share of the trials with a verdict; 0 of none."""
     return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
 
@@ -225,7 +236,7 @@ def _grid_dict(grid: GridCheck) -> dict[str, Any]:
         'accepted_positions_near_recording': grid.accepted_positions,
         'verdicts': count_verdicts(grid.trials),
         'positions': [{'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
-                       'misled': int(misled), 'expected_detections': round(float(visible), 2)}
+                       'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
                       for row, near, accepted, misled, visible in zip(
                           grid.positions.round(3).tolist(), grid.is_near, grid.accepted,
                           grid.misled, grid.visible, strict=True)],
