@@ -158,10 +158,12 @@ def _corrections(recording: RecordingCheck) -> str:
         return '<p>Too few boxes to tell.</p>'
     rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
              f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
-             'significant' if one.is_significant else '') for one in recording.corrections]
+             f'{one.explained:.1%}', 'significant' if one.is_significant else '')
+            for one in recording.corrections]
     return ('<p>The correction that fits the edges of the boxes best, each cause on its own. A '
             'turned mount and a shifted principal point look much the same.</p>'
-            + _table(('cause', 'what', '#correction', '#deviation', '#effect [px]', ''), rows))
+            + _table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
+                       '#cost that the cause explains', ''), rows))
 
 
 def _picture(name: str, caption: str, png: bytes) -> str:

@@ -47,7 +47,8 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
     bounds = _bounds(landmark_map, report)
     yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
            'the more of the headings with at least three detectable landmarks give an accepted, '
-           'right pose. Ticks point where the camera looked when a wrong pose was accepted.',
+           'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
+           'Positions inside of a landmark are left out.',
            _png(_grid_figure(landmark_map, report, bounds)))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '

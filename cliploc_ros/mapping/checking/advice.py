@@ -56,12 +56,17 @@ def _on_landmarks(report: CheckReport) -> Iterator[str]:
 def _on_corrections(report: CheckReport) -> Iterator[str]:
     found = [one for one in (report.recording.corrections if report.recording else ())
              if one.is_significant]
+    if not found:
+        return
     what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
             'stamps': 'check the clock and the delay of the images'}
-    for one in sorted(found, key=lambda one: -one.effect_px)[:_MOST_OF_A_KIND]:
-        yield (f'{what[one.cause]}: {one.name} seems off by {one.value:+.2f} {one.unit} '
-               f'(standard deviation {one.deviation:.2f}); another systematic error may look '
-               'like it')
+    cause = max(found, key=lambda one: one.explained).cause
+    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
+               f'{one.deviation:.2f})'
+               for one in sorted(found, key=lambda one: -one.effect_px) if one.cause == cause]
+    others = sorted({one.cause for one in found} - {cause})
+    rivals = f'; an error of the {" or the ".join(others)} would look similar' if others else ''
+    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{rivals}'
 
 
 def _on_look_alikes(report: CheckReport) -> Iterator[str]:

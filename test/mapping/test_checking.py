@@ -1,0 +1,331 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the check of a map finds, on a simulated walk whose landmarks are known."""
+
+import json
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walk import CAMERA, make_table, see, walk_around
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.evaluation.map_check.output import DATA, PAGE, write_report
+from cliploc_ros.mapping.checking.checking import check_map
+from cliploc_ros.mapping.checking.cross_validation import make_folds
+from cliploc_ros.mapping.checking.detector_model import measure_detector
+from cliploc_ros.mapping.checking.grid import make_grid
+from cliploc_ros.mapping.checking.label_model import LabelModel
+from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
+from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+from cliploc_ros.mapping.checking.systematic import find_corrections
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.views import make_views
+
+NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
+TABLE = replace(make_table(), labels=NOUNS)
+QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=12, max_positions=9,
+                     headings=4, spacing_m=2.0)
+MAPPING = MappingOptions()
+
+
+def joined(first: LandmarkMap, second: LandmarkMap) -> LandmarkMap:
+    """Both maps in one; the second one's ids get a mark."""
+    return replace(
+        first, landmark_ids=first.landmark_ids + tuple(f'{one}_b' for one in second.landmark_ids),
+        labels=first.labels + second.labels, class_ids=first.class_ids + second.class_ids,
+        centers=np.concatenate([first.centers, second.centers]),
+        semi_axes=np.concatenate([first.semi_axes, second.semi_axes]),
+        quats_xyzw=np.concatenate([first.quats_xyzw, second.quats_xyzw]))
+
+
+def moved(table: LandmarkMap, row: int, offset) -> LandmarkMap:
+    centers = table.centers.copy()
+    centers[row] += offset
+    return replace(table, centers=centers)
+
+
+def witness_of(table, detections):
+    views = make_views(detections, MAPPING)
+    return views, hear_witness(views, table, detections.class_names, MAPPING)
+
+
+@pytest.fixture(scope='module')
+def detections():
+    return see(TABLE, walk_around(frames=120), noise_px=1.0)
+
+
+@pytest.fixture(scope='module')
+def report(detections):
+    return check_map(TABLE, detections, options=QUICK)
+
+
+def test_a_true_map_has_no_fault(report):
+    assert all(one.faults == () for one in report.landmarks)
+    assert report.recording.held_out.explained == 1.0
+    assert 0.9 < report.recording.held_out.median_iou < 1.0
+    assert not any(one.is_significant for one in report.recording.corrections)
+    assert report.overlaps == ()
+    assert report.look_alikes == ()
+    assert all('misled' != one.verdict for one in report.recording.trials)
+
+
+def test_recorded_frames_of_a_true_map_are_accepted(report):
+    verdicts = [one.verdict for one in report.recording.trials]
+    assert len(verdicts) == 12
+    assert verdicts.count('accepted') >= 10
+    assert all(one.error_m < 0.1 for one in report.recording.trials if one.verdict == 'accepted')
+
+
+def test_grid_covers_headings_without_landmarks(report):
+    grid = report.grid
+    assert len(grid.trials) == 4 * len(grid.positions)
+    assert (grid.accepted <= grid.headings).all()
+    blind = [one for one in grid.trials if one.landmarks == 0]
+    assert blind
+    assert all(one.verdict == 'refused' for one in blind)
+
+
+def test_equal_seed_and_input_give_an_equal_report(report, detections):
+    again = check_map(TABLE, detections, options=QUICK)
+    assert json.dumps(again.as_dict()) == json.dumps(report.as_dict())
+
+
+def test_a_moved_landmark_is_the_worst_and_named_in_the_advice(detections):
+    report = check_map(moved(TABLE, 4, (0.0, 0.0, 0.45)), detections, options=QUICK)
+    assert report.landmarks[0].landmark_id == 'thing_4'
+    assert report.landmarks[0].support == 0
+    assert report.landmarks[0].expected > 50
+    assert 'is never detected' in report.landmarks[0].faults[0]
+    assert any(text.startswith('thing_4 is never detected') for text in report.advice)
+    assert report.landmarks[1].severity == 0.0
+
+
+def test_a_shifted_landmark_is_told_its_offset(detections):
+    shifted = moved(TABLE, 4, (0.12, 0.0, 0.0))
+    _, witness = witness_of(shifted, detections)
+    assert np.linalg.norm(witness.fitted.centers[4] - TABLE.centers[4]) < 0.01
+    report = check_map(shifted, detections, options=QUICK)
+    assert report.landmarks[0].landmark_id == 'thing_4'
+    assert report.landmarks[0].offset_m == pytest.approx(0.12, abs=0.01)
+    assert 'away from where its boxes put it' in ' '.join(report.landmarks[0].faults)
+
+
+@pytest.mark.parametrize('is_recorded', [False, True])
+def test_every_doubled_landmark_is_a_duplicate(detections, is_recorded):
+    doubled = joined(TABLE, replace(TABLE, centers=TABLE.centers + 0.01))
+    views, witness = witness_of(doubled, detections) if is_recorded else (None, None)
+    overlaps = [one for one in find_map_overlaps(doubled, witness, views) if one.is_duplicate]
+    assert {(one.first, one.second) for one in overlaps} == {(row, row + 9) for row in range(9)}
+
+
+def test_neighbours_that_frames_show_apart_are_no_duplicates():
+    # two of one class whose normalized distance is 0.45
+    axes = np.array([[0.1, 0.1, 0.3], [0.3, 0.1, 0.1]])
+    pair = LandmarkMap('map', ('a', 'b'), ('a', 'b'), ('cup', 'cup'),
+                       np.array([[0.0, 0.0, 0.8], [0.14, 0.0, 0.8]]), axes,
+                       np.array([[0.0, 0.0, 0.0, 1.0]] * 2))
+    views, witness = witness_of(pair, see(pair, walk_around()))
+    (alone,), (recorded,) = (find_map_overlaps(pair, *known)
+                             for known in ((None, None), (witness, views)))
+    assert 0.3 < alone.distance < 0.5
+    assert alone.is_duplicate
+    assert not recorded.is_duplicate
+
+
+@pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
+def test_identical_rooms_look_alike(turn_deg):
+    turn = Rotation.from_euler('z', turn_deg, degrees=True)
+    other = replace(TABLE, centers=turn.apply(TABLE.centers) + (10.0, -3.0, 0.0))
+    (found,) = find_look_alikes(joined(TABLE, other), np.random.default_rng(0))
+    assert found.share == 1.0
+    assert {(first.removesuffix('_b'), second.removesuffix('_b'))
+            for first, second in found.matched} == {(name, name) for name in TABLE.landmark_ids}
+    assert abs(found.turn_deg) == pytest.approx(abs(turn_deg), abs=1.0)
+    assert found.same_labels == 9
+
+
+def test_rooms_of_other_objects_do_not_look_alike():
+    rng = np.random.default_rng(5)
+    other = replace(TABLE, centers=rng.uniform(-1, 1, (9, 3)) + (10.0, 0.0, 0.8))
+    assert find_look_alikes(joined(TABLE, other), rng) == []
+
+
+def test_identical_rooms_fail_the_check():
+    rooms = joined(TABLE, replace(TABLE, centers=TABLE.centers + (10.0, 0.0, 0.0)))
+    report = check_map(rooms, options=QUICK)
+    assert not report.passed
+    assert any('look alike' in text for text in report.failures)
+    assert 'nothing tells them apart' in report.advice[0]
+    assert sum(one.verdict == 'accepted' for one in report.grid.trials) == 0
+
+
+def test_a_hand_written_map_gets_a_shorter_report():
+    report = check_map(TABLE, options=QUICK)
+    assert report.recording is None
+    assert report.as_dict()['recording'] is None
+    assert any('no recording' in note for note in report.notes)
+    assert all(one.support is None for one in report.landmarks)
+
+
+def test_limits_decide():
+    eased = Thresholds(min_positions=0.0)
+    assert check_map(TABLE, options=QUICK, thresholds=eased).passed
+    strict = replace(eased, min_positions=1.0, max_faulty=0.0)
+    report = check_map(TABLE, options=QUICK, thresholds=strict)
+    assert [text.split(':')[0] for text in report.failures] == [
+        'positions with an accepted heading']
+
+
+def pixels(detections, shift_px):
+    return replace(detections, bboxes_xyxy=detections.bboxes_xyxy + np.tile(shift_px, 2))
+
+
+def turned(detections, transform):
+    return detections.with_poses(detections.map_from_camera @ transform)
+
+
+def mount(**change):
+    transform = np.eye(4)
+    transform[:3, 3] = change.get('shift', (0.0, 0.0, 0.0))
+    transform[:3, :3] = Rotation.from_euler('z', change.get('roll', 0.0), True).as_matrix()
+    return transform
+
+
+@pytest.mark.parametrize(('spoil', 'name', 'value', 'tolerance'), [
+    (lambda one: replace(one, camera=replace(CAMERA, fx=500 / 1.03, fy=500 / 1.03)),
+     'focal length fx', 3.0, 0.3),
+    (lambda one: pixels(one, (0.0, 6.0)), 'principal point cy', 6.0, 1.0),
+    (lambda one: turned(one, mount(shift=(0.05, 0.0, 0.0))), 'mount x (right)', -5.0, 0.7),
+    (lambda one: turned(one, mount(roll=2.0)), 'mount rotation about z', -2.0, 0.2),
+    (lambda one: one.with_poses(np.roll(one.map_from_camera, -1, axis=0)),
+     'stamps of the images', -200.0, 20.0),
+], ids=['focal length', 'principal point', 'mount', 'roll', 'stamps'])
+def test_systematic_errors_are_measured(detections, spoil, name, value, tolerance):
+    spoilt = spoil(detections.select_frames(range(119)))
+    views, witness = witness_of(TABLE, spoilt)
+    found = {one.name: one for one in find_corrections(spoilt, views, witness.fitted,
+                                                       witness.shown)}
+    assert found[name].is_significant
+    assert found[name].value == pytest.approx(value, abs=tolerance)
+    assert found[name].explained > 0.3
+
+
+def test_a_landmark_of_one_block_is_missing_from_its_fold():
+    detections = see(TABLE, walk_around(frames=120))
+    # thing_0 is a book: its boxes outside of the first four seconds go
+    _, witness = witness_of(TABLE, detections)
+    kept = (witness.shown != 0) | (detections.frames < 20)
+    counts = np.bincount(detections.frames[kept], minlength=120)
+    rest = replace(detections, frame_offsets=np.cumsum([0, *counts]),
+                   bboxes_xyxy=detections.bboxes_xyxy[kept], classes=detections.classes[kept],
+                   scores=detections.scores[kept])
+    views, witness = witness_of(TABLE, rest)
+    folds = list(make_folds(views, witness, QUICK))
+    assert sorted(np.concatenate([one.frames for one in folds])) == list(range(120))
+    assert 0 not in folds[0].rows
+    assert all(0 in one.rows for one in folds[1:])
+
+
+def test_stretches_without_landmarks_become_advice(detections):
+    # from 4 to 8 s nothing is detected
+    kept = ~np.isin(detections.frames, np.arange(20, 41))
+    counts = np.bincount(detections.frames[kept], minlength=120)
+    gap = replace(detections, frame_offsets=np.cumsum([0, *counts]),
+                  bboxes_xyxy=detections.bboxes_xyxy[kept], classes=detections.classes[kept],
+                  scores=detections.scores[kept])
+    report = check_map(TABLE, gap, options=QUICK)
+    assert any(text.startswith('record this side: 2 frames at 5 s') and 'see no landmarks' in text
+               for text in report.advice), report.advice
+
+
+def test_detector_has_the_misses_and_noise_of_the_recording():
+    detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
+    views, witness = witness_of(TABLE, detections)
+    model = measure_detector(TABLE, detections, views, witness, MAPPING)
+    rng, poses = np.random.default_rng(0), detections.map_from_camera
+    counts = [len(model.detect(pose, rng)[1]) for pose in poses]
+    assert np.mean(counts) == pytest.approx(len(detections.classes) / 200, rel=0.1)
+    assert np.mean([model.expected_detections(pose) for pose in poses[::10]]) == pytest.approx(
+        np.mean(counts), rel=0.1)
+    small = np.hypot(MAPPING.edge_sigma_px, MAPPING.edge_sigma_share * 50.0)
+    assert model.edge_scale * small == pytest.approx(4.0, rel=0.25)
+
+
+def test_what_was_never_detected_is_never_simulated(detections):
+    false = moved(TABLE, 4, (0.0, 0.0, 1.0))
+    views, witness = witness_of(false, detections)
+    model = measure_detector(false, detections, views, witness, MAPPING)
+    assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
+
+
+def test_equal_labels_are_equally_similar():
+    twins = replace(TABLE, labels=('lamp', 'lamp', *NOUNS[2:]),
+                    class_ids=('cup', 'cup', *TABLE.class_ids[2:]))
+    boxes = np.tile([100.0, 100.0, 164.0, 164.0], (200, 1))
+    shown = np.zeros(200, dtype=np.int64)
+    found = LabelModel.of(twins).similarities(shown, ('cup',) * 200, boxes,
+                                              np.random.default_rng(0))
+    assert (found[:, 0] == found[:, 1]).all()
+    assert (found.argmax(axis=1) == 0).mean() > 0.5
+    assert (np.abs(found) <= 1.0).all()
+
+
+def test_grid_is_bounded_and_looks_around():
+    wide = moved(TABLE, 0, (300.0, 0.0, 0.0))
+    grid = make_grid(joined(wide, wide), None, replace(QUICK, max_positions=20, headings=4))
+    assert len(grid.positions) <= 20
+    rotations = grid.poses[:, :3, :3]
+    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
+    assert np.linalg.det(rotations) == pytest.approx(1.0)
+    assert (grid.poses[:, 2, 1] < -0.9).all()  # y of the camera is down
+    assert grid.poses[:2, :2, 2].round(2).tolist() == [[0.98, 0.0], [0.0, 0.98]]
+
+
+@pytest.mark.parametrize(('table', 'message'), [
+    (replace(TABLE, class_ids=('lamp',) * 9), "classes are none of the map's"),
+    (replace(TABLE, centers=TABLE.centers + 50.0), 'have the same coordinate frame'),
+], ids=['classes', 'frame'])
+def test_a_recording_of_another_place_is_refused(detections, table, message):
+    with pytest.raises(MappingError, match=message):
+        check_map(table, detections, options=QUICK)
+
+
+@pytest.mark.parametrize('change', [{'folds': 1}, {'frames': 0}, {'spacing_m': 0.0}])
+def test_options_are_checked(change):
+    with pytest.raises(OptionsError, match=next(iter(change))):
+        CheckOptions(**change)
+
+
+class _Tags(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.found, self.sources = set(), []
+
+    def handle_starttag(self, tag, attrs):
+        self.found.add(tag)
+        self.sources += [value for name, value in attrs if name in ('src', 'href')]
+
+
+def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
+    hostile = '<script>alert(1)</script>&"\'$\\frac{$'
+    doubled = joined(TABLE, replace(TABLE, centers=TABLE.centers + 0.01))
+    named = replace(doubled, frame_id=hostile, labels=(hostile, *doubled.labels[1:]),
+                    landmark_ids=(hostile, *doubled.landmark_ids[1:]))
+    report = check_map(named, detections, options=QUICK)
+    write_report(tmp_path, hostile, named, report)
+    page = (tmp_path / PAGE).read_text()
+    tags = _Tags()
+    tags.feed(page)
+    assert 'script' not in tags.found
+    assert '&lt;script&gt;' in page
+    assert len(tags.sources) == 4
+    assert all(source.startswith('data:image/png;base64,') for source in tags.sources)
+    assert 'http' not in page
+    assert json.loads((tmp_path / DATA).read_text())['landmarks'][0]['faults']
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([PAGE, DATA])
