@@ -199,21 +199,24 @@ def mount(**change):
 
 @pytest.mark.parametrize(('spoil', 'name', 'value', 'tolerance'), [
     (lambda one: replace(one, camera=replace(CAMERA, fx=500 / 1.03, fy=500 / 1.03)),
-     'focal length fx', 3.0, 0.3),
+     'focal length fx', 3.0, 0.8),
     (lambda one: pixels(one, (0.0, 6.0)), 'principal point cy', 6.0, 1.0),
     (lambda one: turned(one, mount(shift=(0.05, 0.0, 0.0))), 'mount x (right)', -5.0, 0.7),
     (lambda one: turned(one, mount(roll=2.0)), 'mount rotation about z', -2.0, 0.2),
     (lambda one: one.with_poses(np.roll(one.map_from_camera, -1, axis=0)),
-     'stamps of the images', -200.0, 20.0),
+     'stamps of the images', -200.0, 5.0),
 ], ids=['focal length', 'principal point', 'mount', 'roll', 'stamps'])
-def test_systematic_errors_are_measured(detections, spoil, name, value, tolerance):
-    spoilt = spoil(detections.select_frames(range(119)))
+def test_systematic_errors_are_measured(spoil, name, value, tolerance):
+    # back on another circle: on one circle, a late clock looks like a turned table
+    poses = [walk_around(frames=60), walk_around(frames=60, radius=1.6)[::-1]]
+    spoilt = spoil(see(TABLE, np.concatenate(poses), noise_px=1.0))
     views, witness = witness_of(TABLE, spoilt)
     found = {one.name: one for one in find_corrections(spoilt, views, witness.fitted,
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
-    assert found[name].explained > 0.3
+    # a turned mount and a shifted principal point look much the same
+    assert found[name].explained > 0.8 * max(one.explained for one in found.values())
 
 
 def test_a_landmark_of_one_block_is_missing_from_its_fold():

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
@@ -51,6 +52,15 @@ from cliploc_ros.mapping.views import Views, make_views
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
 
+_NOTES = (
+    'similarities of crops and labels are simulated, except for queries: labels of equal text '
+    'look equal, and labels that share words look alike',
+    'the grid assumes that the map is right and that walls hide nothing that the recording did '
+    'not show to be hidden')
+_NO_RECORDING = (
+    'no recording: the detector is a guess that finds 60 % of the objects in view within 5 m, in '
+    'images of 640 x 480 px with a focal length of 525 px')
+
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
               queries: Sequence[PosedObservation] = (), options: CheckOptions | None = None,
@@ -77,12 +87,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         The recording says nothing of this map; the message says what to correct.
     """
     options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
-    rng = np.random.default_rng(options.random_seed)
-    views = witness = recording = recorded_poses = None
-    notes = ['similarities of crops and labels are simulated, except for queries: labels of '
-             'equal text look equal, and labels that share words look alike',
-             'the grid assumes that the map is right and that walls hide nothing that the '
-             'recording did not show to be hidden']
+    notes = [*_NOTES]
     if detections is not None:
         tell('judging landmarks', 0.0)
         views = make_views(detections, options.mapping)
@@ -90,33 +95,41 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         witness = hear_witness(views, landmark_map, detections.class_names, options.mapping)
         if not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
-        recorded_poses = detections.map_from_camera
         model = measure_detector(landmark_map, detections, views, witness, options.mapping)
         recording = _check_recording(landmark_map, detections, views, witness, model, options,
                                      tell)
+        overlaps = find_map_overlaps(landmark_map, witness, views)
+        grid = _check_grid(landmark_map, model, detections.map_from_camera, options, tell)
     else:
+        notes.append(_NO_RECORDING)
+        witness = recording = None
         model = guess_detector(landmark_map, options.mapping)
-        notes.append('no recording: the detector is a guess that finds 60 % of the objects in '
-                     'view within 5 m, in images of 640 x 480 px with a focal length of 525 px')
-    overlaps = find_map_overlaps(landmark_map, witness, views)
-    grid = make_grid(landmark_map, recorded_poses, options)
-    trials = try_poses(model, landmark_map, grid.poses, options,
-                       lambda share: tell('relocalizing on the grid', share))
-    verdicts = np.array([one.verdict for one in trials]).reshape(-1, options.headings)
-    visible = np.array([model.expected_detections(pose) for pose in grid.poses])
+        overlaps = find_map_overlaps(landmark_map, None, None)
+        grid = _check_grid(landmark_map, model, None, options, tell)
+    rng = np.random.default_rng(options.random_seed)
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map, rng)),
-        grid=GridCheck(grid.positions, grid.is_near, (verdicts == 'accepted').sum(axis=1),
-                       (verdicts == 'misled').sum(axis=1),
-                       visible.reshape(-1, options.headings), grid.spacing_m, tuple(trials)),
-        recording=recording,
+        grid=grid, recording=recording,
         queries=tuple(try_observations(landmark_map, queries, options,
                                        lambda share: tell('relocalizing queries', share))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids)
     tell('done', 1.0)
     return replace(report, advice=tuple(give_advice(report)),
                    failures=tuple(find_failures(report, thresholds or Thresholds())))
+
+
+def _check_grid(landmark_map: LandmarkMap, model: DetectorModel,
+                recorded: NDArray[np.float64] | None, options: CheckOptions, tell: Progress
+                ) -> GridCheck:
+    grid = make_grid(landmark_map, recorded, options)
+    trials = try_poses(model, landmark_map, grid.poses, options,
+                       lambda share: tell('relocalizing on the grid', share))
+    verdicts = np.array([one.verdict for one in trials]).reshape(-1, options.headings)
+    visible = np.array([model.expected_detections(pose) for pose in grid.poses])
+    return GridCheck(grid.positions, grid.is_near, (verdicts == 'accepted').sum(axis=1),
+                     (verdicts == 'misled').sum(axis=1), visible.reshape(-1, options.headings),
+                     grid.spacing_m, tuple(trials))
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,

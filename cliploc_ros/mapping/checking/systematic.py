@@ -39,6 +39,8 @@ _STEPS, _REFIT_STEPS = 8, 5
 _SIGNIFICANT = 5.0
 _NOTABLE_PX = 1.0
 _MIN_EXPLAINED = 0.015
+# Beyond this, a change of the focal length is no small correction.
+_MAX_STRETCH = 0.5
 
 
 @dataclass(frozen=True)
@@ -140,8 +142,11 @@ def _intrinsics(camera: Camera) -> _Cause:
         return by_number
 
     def apply(views: Views, values: NDArray[np.float64]) -> Views:
-        scale, shift = np.tile(1.0 + values[:2], 2), np.tile(values[2:], 2)
-        return views._replace(edges=(views.edges - shift / focal) / scale)
+        scale = np.tile(1.0 + np.clip(values[:2], -_MAX_STRETCH, _MAX_STRETCH), 2)
+        shift = np.tile(values[2:], 2)
+        # deviations are in pixels: else a longer focal length would shrink all residuals
+        return views._replace(edges=(views.edges - shift / focal) / scale,
+                              stiffness=views.stiffness * scale)
 
     return _Cause('intrinsics', ('focal length fx', 'focal length fy', 'principal point cx',
                                  'principal point cy'),
@@ -192,10 +197,12 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
         linear = _linearize(views, rows, numbers, landmarks)
         step, deviations = _solve(cause.differentiate(views, rows, linear), linear, numbers,
                                   viewpoints)
-        values = values + step
-        views = cause.apply(given, values)
-        landmarks = _refit(views, landmarks, rows, numbers)
-        cost = _cost(_linearize(views, rows, numbers, landmarks))
+        moved = cause.apply(given, values + step)
+        refitted = _refit(moved, landmarks, rows, numbers)
+        trial_cost = _cost(_linearize(moved, rows, numbers, refitted))
+        if trial_cost >= cost:
+            break
+        values, views, landmarks, cost = values + step, moved, refitted, trial_cost
         if (np.abs(step) < 0.2 * deviations).all():
             break
     explained = max(0.0, 1.0 - cost / max(cost_before, 1e-12))

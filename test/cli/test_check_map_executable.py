@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable check_map, as a user starts it."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import make_room
+
+from cliploc_ros.core.map_file import write_map
+
+FAST = ('--positions', 4, '--headings', 2)
+
+
+def check_map(*args):
+    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.check_map', *map(str, args)],
+                          capture_output=True, text=True, timeout=300)
+
+
+def doubled(room):
+    return replace(room, landmark_ids=room.landmark_ids + tuple(
+        f'{one}_b' for one in room.landmark_ids), labels=room.labels * 2,
+        class_ids=room.class_ids * 2, centers=np.tile(room.centers, (2, 1)),
+        semi_axes=np.tile(room.semi_axes, (2, 1)), quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
+
+
+@pytest.fixture
+def room_file(tmp_path):
+    write_map(tmp_path / 'room.yaml', make_room())
+    return tmp_path / 'room.yaml'
+
+
+def test_a_map_without_observations(room_file, tmp_path):
+    done = check_map(room_file, '--out', tmp_path / 'out', '--min-positions', 0, *FAST)
+    assert done.returncode == 0, done.stdout + done.stderr
+    checked = json.loads((tmp_path / 'out/check.json').read_text())
+    assert checked['map'] == 'room.yaml'
+    assert checked['passed']
+    assert checked['recording'] is None
+    assert len(checked['landmarks']) == 12
+    page = (tmp_path / 'out/check.html').read_text()
+    assert page.startswith('<!DOCTYPE html>')
+    assert page.endswith('</html>\n')
+    assert 'data:image/png;base64,' in page
+
+
+def test_a_doubled_map_fails(tmp_path):
+    write_map(tmp_path / 'doubled.yaml', doubled(make_room()))
+    done = check_map(tmp_path / 'doubled.yaml', '--out', tmp_path / 'out', *FAST)
+    assert done.returncode == 1
+    assert 'fails: pairs of duplicates: 12 > 0' in done.stdout
+    assert 'delete one of them' in done.stdout
+    assert not json.loads((tmp_path / 'out/check.json').read_text())['passed']
+
+
+@pytest.mark.parametrize(('args', 'named'), [
+    (('{folder}/missing.yaml', '--out', '{folder}/out'), 'missing.yaml'),
+    (('{room}', '--out', '{room}'), 'room.yaml'),
+    (('{room}', '--observations', '{room}', '--out', '{folder}/out'), 'npz'),
+    (('{room}', '--observations', '{folder}/none.npz', '--out', '{folder}/out'), 'none.npz'),
+    (('{room}', '--folds', '1', '--out', '{folder}/out'), 'folds: 1'),
+], ids=['no map', 'out is a file', 'no npz', 'no observations', 'folds'])
+def test_what_to_correct_is_named(room_file, tmp_path, args, named):
+    done = check_map(*(one.format(folder=tmp_path, room=room_file) for one in args))
+    assert done.returncode == 1
+    assert done.stderr.startswith('error: ')
+    assert named in done.stderr
+    assert 'Traceback' not in done.stderr
+    assert not (tmp_path / 'out/check.json').exists()
+
+
+def test_the_office_passes(shared_data, tmp_path):
+    office = shared_data / 'tum_fr3_office'
+    done = check_map(office / 'map.yaml', '--observations', office / 'observations.npz',
+                     '--queries', office / 'queries.npz', '--every', 20, '--frames', 10,
+                     '--min-positions', 0, '--out', tmp_path, *FAST)
+    assert done.returncode == 0, done.stdout + done.stderr
+    checked = json.loads((tmp_path / 'check.json').read_text())
+    assert checked['recording']['held_out']['explained'] > 0.8
+    assert len(checked['queries']) == 52
