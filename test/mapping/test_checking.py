@@ -72,7 +72,7 @@ def test_a_true_map_has_no_fault(report):
     assert not any(one.is_significant for one in report.recording.corrections)
     assert report.overlaps == ()
     assert report.look_alikes == ()
-    assert all('misled' != one.verdict for one in report.recording.trials)
+    assert all(one.verdict != 'misled' for one in report.recording.trials)
 
 
 def test_recorded_frames_of_a_true_map_are_accepted(report):
@@ -141,7 +141,7 @@ def test_neighbours_that_frames_show_apart_are_no_duplicates():
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
 def test_identical_rooms_look_alike(turn_deg):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
-    other = replace(TABLE, centers=turn.apply(TABLE.centers) + (10.0, -3.0, 0.0))
+    other = replace(TABLE, centers=turn.apply(TABLE.centers) + np.array([10.0, -3.0, 0.0]))
     (found,) = find_look_alikes(joined(TABLE, other), np.random.default_rng(0))
     assert found.share == 1.0
     assert {(first.removesuffix('_b'), second.removesuffix('_b'))
@@ -152,12 +152,13 @@ def test_identical_rooms_look_alike(turn_deg):
 
 def test_rooms_of_other_objects_do_not_look_alike():
     rng = np.random.default_rng(5)
-    other = replace(TABLE, centers=rng.uniform(-1, 1, (9, 3)) + (10.0, 0.0, 0.8))
+    other = replace(TABLE, centers=rng.uniform(-1, 1, (9, 3)) + np.array([10.0, 0.0, 0.8]))
     assert find_look_alikes(joined(TABLE, other), rng) == []
 
 
 def test_identical_rooms_fail_the_check():
-    rooms = joined(TABLE, replace(TABLE, centers=TABLE.centers + (10.0, 0.0, 0.0)))
+    other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
+    rooms = joined(TABLE, other)
     report = check_map(rooms, options=QUICK)
     assert not report.passed
     assert any('look alike' in text for text in report.failures)

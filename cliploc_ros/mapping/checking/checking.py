@@ -88,6 +88,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     """
     options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
     notes = [*_NOTES]
+    witness: Witness | None = None
+    recording: RecordingCheck | None = None
     if detections is not None:
         tell('judging landmarks', 0.0)
         views = make_views(detections, options.mapping)
@@ -102,7 +104,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         grid = _check_grid(landmark_map, model, detections.map_from_camera, options, tell)
     else:
         notes.append(_NO_RECORDING)
-        witness = recording = None
         model = guess_detector(landmark_map, options.mapping)
         overlaps = find_map_overlaps(landmark_map, None, None)
         grid = _check_grid(landmark_map, model, None, options, tell)
