@@ -10,16 +10,10 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.association.scene import Workspace
 from cliploc_ros.core.fit.covariance import odometry_covariance, vertical_information
-from cliploc_ros.core.fit.refinement import VERTICAL_UNKNOWN
-from cliploc_ros.core.fit.several_frames import (
-    _linearize,
-    _pair,
-    _residuals,
-    make_rig,
-    verify_rig,
-)
+from cliploc_ros.core.fit.refinement import linearize_rig, one_to_one, residuals_of_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -30,6 +24,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import make_queries
@@ -165,20 +160,15 @@ def test_the_information_of_verticals_is_that_of_the_refinement(room, walk):
     verticals[2] = VERTICAL_UNKNOWN
     cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
     scenes = [Relocalizer(room, OPTIONS).search(see(room, pose)).scene for pose in walk]
-    informations = []
+    pose, informations = invert_transform(walk[-1]), []
+    rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
     for known in (verticals, np.zeros_like(verticals)):
         rig = make_rig(scenes, cameras, known)
-        workspace, starts = Workspace.allocate(4 * len(room)), np.zeros(5, np.int64)
-        pose = invert_transform(walk[-1])
-        rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
-        verify_rig(rig, rotation, translation, workspace)
-        fixed = _pair(rig, workspace, starts), starts, rig.cameras, known
-        residuals, information = np.empty(4 * starts[-1] + 12), np.empty((6, 6))
-        assert _residuals(*fixed, rotation, translation, residuals)
-        _linearize(*fixed, rotation, translation, residuals, information, np.empty(6))
-        informations.append(information)
-    rotations = cameras[:, :3, :3] @ invert_transform(walk[-1])[:3, :3]
-    np.testing.assert_allclose(vertical_information(rotations, verticals),
+        inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
+        in_front, residuals = residuals_of_rig(rig, inliers, rotation, translation)
+        assert in_front
+        informations.append(linearize_rig(rig, inliers, rotation, translation, residuals)[0])
+    np.testing.assert_allclose(vertical_information(cameras[:, :3, :3] @ rotation, verticals),
                                informations[0] - informations[1], atol=1e-6)
 
 
