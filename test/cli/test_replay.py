@@ -72,6 +72,7 @@ def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener, stor
     assert 'published 67 messages on 4 topics' in done.stdout
 
 
+@pytest.mark.clock
 def test_messages_keep_their_times(tmp_path, listener):
     """Irregular distances at double speed; errors must be small and must not add up."""
     offsets = np.cumsum(np.random.default_rng(0).uniform(5, 120, 60))
