@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.bag_types import typestore
-from cliploc_ros.datasets.tum import NS_PER_S
+from cliploc_ros.units import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'

@@ -18,6 +18,7 @@ from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.datasets.tum import TumSequence
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.units import NS_PER_S
 
 _IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 _CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
@@ -145,7 +146,7 @@ def _frame(bag: Path, message: Any, info: Any, topics: BagTopics, truth: Traject
         image = image_from_msg(message)
         camera = camera_from_msg(info, (image.shape[1], image.shape[0]), topics.rectified)
     except CliplocError as error:
-        raise DatasetError(f'{bag}: {topics.image} at {stamp / 1e9:.6f}: {error}') from error
+        raise DatasetError(f'{bag}: {topics.image} at {stamp / NS_PER_S:.6f}: {error}') from error
     pose = truth.pose_at(stamp)
     return Frame(stamp, image, camera, None if pose is None else pose @ mount)
 

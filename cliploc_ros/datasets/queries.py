@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.datasets.tum import NS_PER_S
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.units import NS_PER_S
 
 #: Arrays of the file, by name: shape in terms of the letters below, and kind of dtype.
 LAYOUT = {

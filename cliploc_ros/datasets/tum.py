@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.units import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 #: builtin_interfaces/Time holds seconds in an int32.
 MAX_STAMP_S = 2**31 - 1
 

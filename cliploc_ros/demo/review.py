@@ -15,9 +15,10 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
+from cliploc_ros.datasets.tum import TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
 from cliploc_ros.demo.truth import TrueBox, read_frames
+from cliploc_ros.units import NS_PER_S
 
 #: Poses farther from the truth than this are wrong [m].
 WRONG_M = 1.0

@@ -15,6 +15,7 @@ WITH_CLIP = {'matching': 'hybrid', 'algorithm': 'auto', 'clip_model': ASSETS / '
              'clip_pretrained': ASSETS / 'clip.safetensors'}
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('parameters', [{'algorithm': 'auto'}, WITH_CLIP],
                          ids=['class', 'CLIP'])
 def test_the_first_request_is_no_slower(own_relocalizer, tester, parameters, tmp_path):

@@ -108,6 +108,7 @@ def test_stop_of_an_idle_worker_is_immediate_and_final(worker):
     worker.stop()
 
 
+@pytest.mark.clock
 def test_stop_does_not_wait_for_a_long_task_but_drops_what_waits(worker, gate):
     running = gate.hold(worker)
     ran = []
