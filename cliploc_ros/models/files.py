@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights and caches as files: where they are, what is wrong with them, which ones they are."""
+"""Files of weights and caches: where they lie, whether they are intact, their fingerprint."""
 
 import atexit
 import hashlib
@@ -69,11 +69,11 @@ def _process_cache(reason: str) -> Path:
 
 
 def fingerprint_file(path: Path) -> str:
-    """Return a hash that tells one file of weights from another, in milliseconds.
+    """Return a hash that distinguishes files of weights, within milliseconds.
 
     It is the SHA-256 of the size and of 66 blocks of 64 KiB: head, tail and 64 evenly spaced
-    between them. Training changes every tensor and so the blocks; an edit of a few bytes that
-    falls between them is not seen.
+    between them. Training changes every tensor and so the blocks. The hash misses an edit of a few
+    bytes between the blocks.
     """
     size = path.stat().st_size
     last = max(size - _BLOCK_BYTES, 0)
@@ -87,9 +87,9 @@ def fingerprint_file(path: Path) -> str:
 
 
 def check_weights_file(path: Path) -> None:
-    """Refuse with a ModelError a file that is missing, unreadable, cut off or no weights at all.
+    """Raise a ModelError for a file that is missing, unreadable, cut off or no weights at all.
 
-    Only the frame of the file is looked at; what it holds is for the loader to judge.
+    This looks at head and end of the file only; the loader checks the content.
     """
     if path.is_dir():
         raise ModelError(f'{path} is a folder: name the file with the weights')

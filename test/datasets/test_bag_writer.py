@@ -206,5 +206,5 @@ def test_full_disk_leaves_nothing(tmp_path, storage):
         capture_output=True, text=True, check=True, timeout=300,
     )
     assert 'cannot be written' in run.stdout
-    assert 'nothing was left behind' in run.stdout
+    assert 'no partial file remains' in run.stdout
     assert list(tmp_path.iterdir()) == []

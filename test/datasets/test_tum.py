@@ -111,8 +111,8 @@ def test_no_stamps(text):
         ('rgb.txt', '1.0\n', r'rgb.txt:1: expected timestamp and file name'),
         ('rgb.txt', 'one rgb/1.1.png\n', r"rgb.txt:1: 'one' is no timestamp"),
         ('rgb.txt', '# x\n\n1.0 rgb/none.png\n', r'rgb.txt:3: image .*none.png does not exist'),
-        ('rgb.txt', '1.1 rgb/1.1.png\n1.1 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
-        ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.1 rgb/1.1.png\n', r'rgb.txt:2: .*not exceed the one'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not exceed the one'),
         ('rgb.txt', '# nothing\n', r'rgb.txt: lists no images'),
         ('groundtruth.txt', '1 2 3\n', r'groundtruth.txt:1: expected .*, got 3 fields'),
         ('groundtruth.txt', '1 0 0 0 0 0 0 one\n', r'groundtruth.txt:1: .*not seven numbers'),
@@ -134,7 +134,7 @@ def test_missing_files_are_named(folder, tmp_path):
     with pytest.raises(DatasetError, match=r'rgb\.txt: cannot be read'):
         read_tum(folder)
     (folder / 'rgb.txt').unlink()
-    with pytest.raises(DatasetError, match=r'rgb\.txt: not there'):
+    with pytest.raises(DatasetError, match=r'rgb\.txt: no such file'):
         read_tum(folder)
     with pytest.raises(DatasetError, match='cannot be read'):
         read_tum_trajectory(tmp_path / 'none.txt')
@@ -305,7 +305,7 @@ def test_recorded_detections(tmp_path):
         ([{'detections': []}], "frame 0: field 'timestamp' is missing"),
         ([{'timestamp': '1'}], "frame 0: field 'detections' is missing"),
         ([{'timestamp': 'x', 'detections': []}], "frame 0: 'x' is no timestamp"),
-        ([{'timestamp': '1', 'detections': []}] * 2, 'frame 1: timestamp 1 is there twice'),
+        ([{'timestamp': '1', 'detections': []}] * 2, 'frame 1: timestamp 1 is a repetition'),
         ([{'timestamp': '1', 'detections': [{}]}], "detection 0: field 'class_id' is missing"),
         ([3], "frame 0: field 'timestamp' is missing"),
         ([{'timestamp': '1', 'detections': [{**BOOK, 'score': 2}]}], 'score is 2.0'),

@@ -151,7 +151,7 @@ def test_unknown_names(tmp_path):
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'device': 'tpu'}, "device 'tpu'"), ({'device': 'cuda:99'}, "device 'cuda:99' is not there"),
+    ({'device': 'tpu'}, "device 'tpu'"), ({'device': 'cuda:99'}, "device 'cuda:99' is missing"),
     ({'precision': 'int8'}, "precision 'int8'"), ({'max_batch': 0}, 'max_batch'),
 ])
 def test_options_out_of_range(small_clip, tmp_path, change, message):
