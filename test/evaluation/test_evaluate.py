@@ -177,7 +177,7 @@ def test_one_worker_or_two(files, tmp_path):
 def long_run(files, tmp_path_factory):
     """The arguments of a run of seconds, and its results."""
     arguments = small(files, '--methods', 'hybrid_b-prosac', 'class_ransac', '--iterations', 20000,
-                      '--trials', 4, '--sweep', '--workers', 2, '--no-figures')
+                      '--trials', 3, '--sweep', '--workers', 2, '--no-figures')
     whole = tmp_path_factory.mktemp('whole')
     assert evaluate(*arguments, '--out', whole).returncode == 0
     return arguments, results_of(whole)
