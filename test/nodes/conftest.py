@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real nodes as processes, and a node in the test that talks to them over the wire."""
+"""Nodes as processes, and a node in the test that exchanges messages with them."""
 
 import time
 from contextlib import contextmanager
@@ -29,7 +29,7 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Tester(Node):
-    """Publishes frames, asks for poses, and keeps what the relocalizer publishes."""
+    """Publishes frames, requests poses, and keeps what the relocalizer publishes."""
 
     def __init__(self):
         super().__init__('tester')
@@ -56,7 +56,7 @@ class Tester(Node):
         return keep
 
     def forget(self):
-        """Forget what was published until now, also what is still on its way here."""
+        """Drop all messages published before now, including those still in transit."""
         self._forgotten_ns = time.time_ns()
         for kept in (self.poses, self.initial_poses, self.hypotheses):
             kept.clear()
@@ -68,14 +68,14 @@ class Tester(Node):
         wait_for(condition, what, patience_s, self.spin)
 
     def connect(self):
-        """Wait until one relocalizer answers, and is heard."""
+        """Wait until exactly one relocalizer publishes and its services are ready."""
         self.wait(lambda: len(self.get_publishers_info_by_topic('/relocalizer/pose')) == 1,
                   'one relocalizer')
         self.wait(self._relocalize.service_is_ready, 'the service relocalize')
         self.wait(self._reinitialize.service_is_ready, 'the service reinitialize')
 
     def call(self, service_type, name, request):
-        """Call any service; return its answer."""
+        """Call a service; return the response."""
         client = self.create_client(service_type, name)
         self.wait(client.service_is_ready, name)
         answer = self.answer(client.call_async(request))
@@ -90,7 +90,7 @@ class Tester(Node):
 
     @contextmanager
     def hearing_detections(self):
-        """Keep the first detections of every stamp [ns] that anybody publishes meanwhile."""
+        """Collect the detections published meanwhile, the first for each stamp [ns]."""
         heard = {}
         subscription = self.create_subscription(
             Detection2DArray, 'detections',
@@ -102,12 +102,12 @@ class Tester(Node):
             self.destroy_subscription(subscription)
 
     def listened_to(self):
-        """Return how many subscriptions there are to what this node publishes."""
+        """Return the number of subscriptions to this node's topics."""
         return sum(publisher.get_subscription_count() for publisher in (
             self.images, self.compressed, self.infos, self.detections))
 
     def ask(self):
-        """Send a wake-up request; return its future."""
+        """Send a request to relocalize; return its future."""
         return self._relocalize.call_async(Trigger.Request())
 
     def ask_reinitialize(self):
@@ -124,7 +124,7 @@ class Tester(Node):
              Detection2DArray: self.detections}[type(message)].publish(message)
 
     def feed_until(self, condition, frame, what='an answer'):
-        """Publish a frame again and again, as a camera would, until a condition holds."""
+        """Publish a frame repeatedly, like a camera, until a condition holds."""
         def work():
             self.publish(frame)
             for _ in range(5):
@@ -132,7 +132,7 @@ class Tester(Node):
         wait_for(condition, what, work=work)
 
     def relocalize(self, frame):
-        """Ask, publish a frame until there is an answer, and return it."""
+        """Send a request, publish a frame until the answer comes, and return the answer."""
         future = self.ask()
         self.feed_until(future.done, frame)
         return future.result()
@@ -185,7 +185,7 @@ def room_map(tmp_path_factory):
 
 
 def starter(folder):
-    """Return a function that starts modules as processes, and the list of those it started."""
+    """Return a function that starts modules as processes, and the list of these processes."""
     started = []
 
     def run(module, *arguments, parameters=None, **options):
@@ -201,7 +201,7 @@ def starter(folder):
 
 @pytest.fixture
 def start(tmp_path):
-    """Start modules of the package as processes; all are ended with the test."""
+    """Start modules of the package as processes; stop them at the end of the test."""
     run, started = starter(tmp_path)
     yield run
     for process in started:
@@ -210,7 +210,7 @@ def start(tmp_path):
 
 @pytest.fixture(scope='module')
 def start_shared(tmp_path_factory):
-    """The same for processes that several tests ask."""
+    """The same for processes that the tests of a module share."""
     run, started = starter(tmp_path_factory.mktemp('shared'))
     yield run
     for process in started:
@@ -224,7 +224,7 @@ def class_matching(room_map, **parameters):
 
 @pytest.fixture(scope='module')
 def relocalizer(start_shared, tester, room_map):
-    """A relocalizer that matches classes in the simulated room, ready to be asked."""
+    """A relocalizer that matches classes in the simulated room, ready for requests."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(room_map))
     process.wait_for_output('ready after')
     tester.connect()
@@ -235,7 +235,7 @@ def relocalizer(start_shared, tester, room_map):
 
 @pytest.fixture
 def own_relocalizer(start, tester, room_map):
-    """Start a relocalizer with parameters of the test's own; ready, or with its error logged."""
+    """Start a relocalizer with the test's parameters; wait until it is ready or logs an error."""
     def run(*arguments, expect='ready after', fresh=False, **parameters):
         process = start('nodes.relocalizer', *arguments, fresh=fresh,
                         parameters=class_matching(room_map, **parameters))
