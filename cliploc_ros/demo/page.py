@@ -41,8 +41,8 @@ To find out, run the nodes on your own recordings.</p>"""
 
 _HOW = """\
 <p>The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors compare
-with the recording's ground truth, which the nodes never see. No topic tells which box belongs to
-which landmark. For the pictures the demo therefore repeats the search on the same detections with
+with the recording's ground truth, which the nodes never see. No topic carries the matches of boxes
+and landmarks. For the pictures the demo therefore repeats the search on the same detections with
 the same code, networks, options and seed, and compares its pose with the one from ROS
 ({repeated}). CLIP is the cosine similarity of crop and label, rank its place among all labels of
 the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the

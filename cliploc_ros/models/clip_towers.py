@@ -23,7 +23,7 @@ _FOREIGN_SUFFIXES = ('.npz', '.npy')
 def load_image_tower(
     weights: ClipWeights, device: 'torch.device', precision: str
 ) -> 'tuple[Any, Callable[[Image], torch.Tensor]]':
-    """Return a CLIP of which only ``encode_image`` works, and open_clip's preprocessing for it.
+    """Return a CLIP with ``encode_image`` only, and open_clip's preprocessing for it.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def load_image_tower(
 
 
 def load_text_tower(weights: ClipWeights, device: 'torch.device') -> Any:
-    """Return a CLIP of which only ``encode_text`` works, in fp32; raises as the image tower."""
+    """Return a CLIP with ``encode_text`` only, in fp32; see `load_image_tower`."""
     model, _ = _load(weights, 'text', device, 'fp32')
     return model
 

@@ -27,9 +27,9 @@ logger = logging.getLogger(__name__)
 def resolve_cache_dir(cache_dir: str) -> Path:
     """Return the folder for downloads and label embeddings; '' means the user's cache.
 
-    That is ``$XDG_CACHE_HOME/cliploc_ros``, else ``~/.cache/cliploc_ros``. Whoever writes there
-    chooses what CLIP answers. So where the user has no home folder, or others can write to the
-    cache, a private folder takes its place until the process ends.
+    That is ``$XDG_CACHE_HOME/cliploc_ros``, else ``~/.cache/cliploc_ros``. A forged label
+    embedding leads to wrong poses. So if the user has no home folder, or other users own the cache
+    or can write to it, a private folder replaces it until the process ends.
     """
     if cache_dir:
         return Path(cache_dir).expanduser().absolute()
@@ -54,7 +54,7 @@ def _is_open_to_others(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-    except OSError:  # nobody can write there: whoever needs the folder reports it
+    except OSError:  # the first write reports it
         return False
     return status.st_uid != os.getuid() or bool(status.st_mode & stat.S_IWOTH)
 

@@ -160,7 +160,7 @@ def assert_refused(capfd):
 
 
 def assert_one_line(errors, *messages):
-    """One line says what to mend (beside the bar and OpenCV's own complaints)."""
+    """Expect one line with the error, beside the progress bar and OpenCV's messages."""
     assert errors.splitlines()[-1].startswith('error: ')
     assert 'Traceback' not in errors
     for message in messages:
@@ -240,7 +240,7 @@ def test_existing_output_is_kept(make_sequence, tmp_path):
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_full_disk_leaves_nothing(make_sequence, tmp_path, storage):
-    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    """A limit on the size of files gives the error of a full disk."""
     sequence = make_sequence(count=30)
 
     def limit():
@@ -259,7 +259,7 @@ def test_interruption_leaves_nothing(make_sequence, tmp_path, start, number):
     sequence = make_sequence()
     image = sequence.folder / 'rgb' / f'{sequence.stamps[0]}.png'
     with (sequence.folder / 'rgb.txt').open('a') as file:
-        for index in range(5_000):  # one image under many names: far from done when stopped
+        for index in range(5_000):  # many links to one image: too many to finish before the signal
             os.link(image, sequence.folder / 'rgb' / f'{index}.png')
             file.write(f'{200 + index} rgb/{index}.png\n')
     process = start('tum_to_bag', sequence.folder, tmp_path / 'bag')

@@ -175,7 +175,7 @@ def assert_same(queries, others):
 
 def test_round_trip(tmp_path):
     queries = load_queries(save(tmp_path / 'q.npz', make_arrays()))
-    # a stamp that no float64 of seconds can hold
+    # A float64 of seconds cannot hold this stamp.
     exact = replace(queries[2], stamp_ns=1341847981000000123)
     queries = replace(queries, frames=(*queries.frames[:2], exact))
     save_queries(tmp_path / 'again.npz', queries)
@@ -213,7 +213,7 @@ def test_malformed_queries_are_not_written(tmp_path):
 
 
 def test_full_disk_keeps_the_old_file(tmp_path):
-    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    """A limit on the size of files gives the error of a full disk."""
     path = save(tmp_path / 'q.npz', make_arrays())
     before = path.read_bytes()
     program = textwrap.dedent("""

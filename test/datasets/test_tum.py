@@ -22,7 +22,7 @@ MS = 1_000_000
 
 @pytest.fixture
 def folder(tmp_path):
-    """A TUM folder of three images; their content does not matter here."""
+    """A TUM folder of three placeholder images."""
     path = tmp_path / 'rgbd_dataset_freiburg2_desk'
     (path / 'rgb').mkdir(parents=True)
     lines = ['# color images', '# timestamp filename']
@@ -153,14 +153,14 @@ quaternions = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
 @given(quaternions, quaternions, st.floats(0, 1))
 def test_slerp_agrees_with_scipy(start, end, fraction):
     turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).magnitude()
-    if turn > np.pi - 1e-3:  # two shortest arcs: either is right
+    if turn > np.pi - 1e-3:  # two arcs are equally short
         return
     expected = Rotation.from_quat(start) * Rotation.from_rotvec(
         fraction * (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
     )
     result = slerp(start, end, fraction)
     assert np.linalg.norm(result) == pytest.approx(1, abs=1e-9)
-    # below cosine 0.9995 slerp is exact; above it is linear, and 3e-6 rad off at most
+    # Below cosine 0.9995 slerp is exact; above it is linear, with an error of at most 3e-6 rad.
     assert (expected.inv() * Rotation.from_quat(result)).magnitude() < 1e-5
 
 
