@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from conftest import make_frame
+from tester import make_frame
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.ros.conversions import detections_to_msg

@@ -14,9 +14,9 @@ import time
 import open_clip
 import pytest
 import torch
-from conftest import class_matching, make_frame, transform_of
 from rcl_interfaces.srv import GetParameters
 from scene import MAP_FROM_CAMERA, make_room, see_room
+from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections

@@ -4,10 +4,10 @@
 
 import pytest
 import yaml
-from conftest import class_matching, make_frame
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from std_srvs.srv import Trigger
+from tester import class_matching, make_frame
 
 
 def dump(tester, name):
