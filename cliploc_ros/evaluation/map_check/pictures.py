@@ -154,7 +154,7 @@ def _grid_figure(landmark_map: LandmarkMap, report: CheckReport, bounds: NDArray
     handles += _draw_misled(axes, grid)
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), _HEAT), ax=axes, shrink=0.7,
                           pad=0.02)
-    bar.set_label('right pose accepted [% of the headings that show 3 or more landmarks]')
+    bar.set_label('right pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
     _add_legend(figure, handles)
     return figure
 

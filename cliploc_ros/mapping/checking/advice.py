@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
 from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, GridCheck
 
-_MOST_OF_A_KIND = 5
+_MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # A shorter run of refused frames is no side of a room.
 _MIN_SPAN = 2
 _FEW_LANDMARKS = 3
@@ -30,11 +30,11 @@ def _on_misled(report: CheckReport) -> Iterator[str]:
     trials = [*(report.recording.trials if report.recording else ()), *report.queries,
               *report.grid.trials]
     wrong = [one for one in trials if one.verdict == 'misled']
-    for one in wrong[:_MOST_OF_A_KIND]:
-        assert one.error_m is not None
+    for one in sorted(wrong, key=lambda one: -(one.error_m or 0.0))[:_MOST_MISLED]:
         yield (f'a robot at {_place(one.position)} looking {_heading(one)} would be misled by '
                f'{one.error_m:.1f} m: raise min_confidence, or map more distinct objects there')
-    yield from _more(len(wrong), 'views that mislead')
+    if len(wrong) > _MOST_MISLED:
+        yield f'and {len(wrong) - _MOST_MISLED} more views that mislead'
 
 
 def _on_duplicates(report: CheckReport) -> Iterator[str]:
