@@ -63,7 +63,6 @@ BAD_FRAMES = {
 
 @pytest.mark.parametrize('name', BAD_FRAMES)
 def test_bad_frames(relocalizer, tester, name):
-    tester.set_parameter('timeout_s', 3.0)
     change, reason = BAD_FRAMES[name]
     frame = make_frame()
     change(*frame)
