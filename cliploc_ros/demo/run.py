@@ -77,6 +77,7 @@ class DemoOptions:
         matching, _, algorithm = self.method.partition('_')
         parameters: dict[str, object] = {'map_file': self.assets / 'map.yaml',
                                          'matching': matching, 'algorithm': algorithm,
+                                         'require_localizer': False,  # the demo has no AMCL
                                          # a search that the clock ends cannot be repeated
                                          'time_budget_ms': 10_000.0}
         if matching != 'class':
