@@ -75,15 +75,11 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     views = given
     draft = _draft(views, options, rng, tell)
     if options.pose_errors is not None:
-        for _ in range(options.rebuilds):
-            tell('refining poses', 0.0)
-            views, _ = refine_jointly(given, views, draft.landmarks, draft.shown,
-                                      options.pose_errors)
+        for number in range(options.rebuilds):
+            tell('refining poses', number / options.rebuilds)
+            views, draft = _refine(given, views, draft, options)
             draft = _draft(views, options, rng, tell)
-        tell('refining poses', 0.5)
-        views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown,
-                                          options.pose_errors)
-        draft = draft._replace(landmarks=landmarks)
+        views, draft = _refine(given, views, draft, options)
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
         raise MappingError(_nothing_found(draft))
@@ -121,6 +117,22 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
     return _Draft(landmarks, associate(views, landmarks, options.association_iou), left_out,
                   [reason for reason in reasons if reason is not None],
                   evidence.select(~kept))
+
+
+def _refine(given: Views, views: Views, draft: _Draft, options: MappingOptions
+            ) -> tuple[Views, _Draft]:
+    """Return the views with refined poses, and the landmarks that fit them.
+
+    Errors of the poses split objects in two. Poses and parts move towards each other in turns,
+    until the parts merge.
+    """
+    assert options.pose_errors is not None
+    landmarks, shown = draft.landmarks, draft.shown
+    for _ in range(options.refinements):
+        views, landmarks = refine_jointly(given, views, landmarks, shown, options.pose_errors)
+        landmarks = _settle(views, landmarks, options)
+        shown = associate(views, landmarks, options.association_iou)
+    return views, draft._replace(landmarks=landmarks, shown=shown)
 
 
 def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,

@@ -89,12 +89,10 @@ def _evidence_of(views: Views, center: NDArray[np.float64], basis: NDArray[np.fl
     frames = views.frames[rows]
     offsets = center - camera_centers(views, frames)
     distances = np.linalg.norm(offsets, axis=1)
-    viewpoints = len(np.unique(views.viewpoints[frames]))
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-    # frames of one viewpoint err alike: they count as one
-    covariance = np.linalg.inv(information)[:3, :3] * (len(rows) / viewpoints)
-    return (len(rows), viewpoints,
+    covariance = np.linalg.inv(information)[:3, :3]
+    return (len(rows), len(np.unique(views.viewpoints[frames])),
             count_expected(views, center, basis, _REACH * distances.max()),
             widest_angle_deg(offsets / distances[:, None]),
             float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),

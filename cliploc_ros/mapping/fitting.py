@@ -130,15 +130,16 @@ def accumulate(views, rows, center, basis, information, gradient):
     cost = 0.0
     for row in rows:
         frame = views.frames[row]
+        share = views.weights[frame]
         if not linearize_box(views.rotations[frame], views.translations[frame], center, basis,
                              box, by_landmark, by_pose):
-            cost += 4.0 * robust_cost(_BEHIND_RESIDUAL)
+            cost += share * 4.0 * robust_cost(_BEHIND_RESIDUAL)
             continue
         for edge in range(4):
             residual = edge_residual(views, row, edge, box)
-            cost += robust_cost(residual)
+            cost += share * robust_cost(residual)
             stiffness = views.stiffness[row, edge]
-            weight = robust_weight(residual)
+            weight = share * robust_weight(residual)
             if residual == 0.0:
                 continue
             for i in range(LANDMARK_SIZE):

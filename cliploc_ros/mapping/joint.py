@@ -248,9 +248,10 @@ def _accumulate(views, rows, landmarks, centers, bases, of_landmarks, of_poses, 
         row, landmark = rows[place], landmarks[place]
         frame = views.frames[row]
         rotation = views.rotations[frame]
+        share = views.weights[frame]
         if not linearize_box(rotation, views.translations[frame], centers[landmark],
                              bases[landmark], box, by_landmark, by_motion):
-            cost += _BEHIND_COST
+            cost += share * _BEHIND_COST
             continue
         # a pose's error in the map's axes moves the map against it in the camera's
         by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
@@ -259,10 +260,10 @@ def _accumulate(views, rows, landmarks, centers, bases, of_landmarks, of_poses, 
             residual = edge_residual(views, row, edge, box)
             if residual == 0.0:
                 continue
-            cost += robust_cost(residual)
+            cost += share * robust_cost(residual)
             stiffness = views.stiffness[row, edge]
-            weight = robust_weight(residual) * stiffness * stiffness
-            pull = robust_weight(residual) * stiffness * residual
+            weight = share * robust_weight(residual) * stiffness * stiffness
+            pull = share * robust_weight(residual) * stiffness * residual
             for i in range(LANDMARK_SIZE):
                 landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
                 for j in range(LANDMARK_SIZE):

@@ -69,6 +69,8 @@ class MappingOptions:
         Refine the poses with the landmarks, as far as they may be off; None: poses are exact.
     rebuilds : int
         How often the map is built anew with refined poses.
+    refinements : int
+        How often poses and landmarks are refined together before each of these, and after all.
     frame_id, source : str
         What the map says of itself: its coordinate frame, and where it comes from.
     random_seed : int
@@ -93,6 +95,7 @@ class MappingOptions:
     min_median_iou: float = 0.5
     pose_errors: PoseErrors | None = None
     rebuilds: int = 1
+    refinements: int = 3
     frame_id: str = 'map'
     source: str = 'build_map'
     random_seed: int = 0

@@ -27,6 +27,8 @@ class Views(NamedTuple):
     viewpoints : ndarray (F,) of int
         Number of the viewpoint of each frame, ascending: frames that the camera took without
         moving share one.
+    weights : ndarray (F,)
+        One over the number of frames of the same viewpoint: their boxes err alike.
     offsets : ndarray (F + 1,) of int
         First box of each frame.
     frames, classes : ndarray (n,) of int
@@ -45,6 +47,7 @@ class Views(NamedTuple):
     translations: NDArray[np.float64]
     stamps_s: NDArray[np.float64]
     viewpoints: NDArray[np.int64]
+    weights: NDArray[np.float64]
     offsets: NDArray[np.int64]
     frames: NDArray[np.int64]
     classes: NDArray[np.int64]
@@ -67,9 +70,10 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
     is_open[:, :2] = boxes_px[:, :2] <= options.border_px
     is_open[:, 2:] = boxes_px[:, 2:] >= size[2:] - options.border_px
     rotations, translations = camera_from_map(detections.map_from_camera)
+    viewpoints = number_viewpoints(detections.map_from_camera)
     return Views(
         rotations, translations, np.ascontiguousarray(detections.stamps_s, dtype=np.float64),
-        number_viewpoints(detections.map_from_camera), detections.frame_offsets,
+        viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints], detections.frame_offsets,
         detections.frames, detections.classes, (boxes_px - principal) / focal,
         focal / deviations_px, is_open,
         (np.array([0.0, 0.0, camera.width, camera.height]) - principal) / focal)
