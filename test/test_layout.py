@@ -19,7 +19,7 @@ SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('errors', 'units'),
+    ('errors', 'units', 'replace_file'),
     ('core.compiled', 'core.parameter_file', 'core.time_budget'),
     ('core.geometry',),
     ('core.index',),
@@ -30,8 +30,9 @@ LAYERS = (
     ('core.acceptance',),
     ('core',),
     ('mapping',),
-    ('messages', 'command'),
+    ('messages', 'command', 'parallel'),
     ('models', 'datasets'),
+    ('recording',),
     ('evaluation',),
     ('benchmark',),
     ('ros.qos', 'ros.conversions'),
