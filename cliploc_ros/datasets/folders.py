@@ -27,6 +27,7 @@ _SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0, (-0.025, 0.0, 0.0)
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
+_NO_CHANGE = DepthFormat()
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class FolderOptions:
     trajectory: Trajectory | None = None
     max_gap_ns: int = 0
     body_from_camera: NDArray[np.float64] | None = None
-    depth: DepthFormat = DepthFormat()
+    depth: DepthFormat = _NO_CHANGE
 
 
 def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions | None = None
