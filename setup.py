@@ -38,7 +38,7 @@ setup(
         ],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
-        'test': ['hypothesis', 'pytest'],
+        'test': ['hypothesis', 'pytest', 'pytest-xdist'],
     },
     zip_safe=False,
     maintainer='the cliploc_ros authors',
@@ -48,6 +48,7 @@ setup(
     entry_points={
         'console_scripts': [
             f'build_map = {PACKAGE}.cli.build_map:main',
+            f'check_map = {PACKAGE}.cli.check_map:main',
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',

@@ -19,8 +19,8 @@ SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('errors', 'units', 'replace_file'),
-    ('core.compiled', 'core.parameter_file', 'core.time_budget'),
+    ('errors', 'replace_file', 'units'),
+    ('core.compiled', 'core.landmark_details', 'core.parameter_file', 'core.time_budget'),
     ('core.geometry',),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
@@ -48,8 +48,6 @@ RANKS = {f'{ROOT}.{prefix}': rank for rank, prefixes in enumerate(LAYERS) for pr
 MAX_MODULE_LINES = 400
 MAX_FUNCTION_LINES = 60
 MAX_PARAMETERS = 10
-#: Takes four vectors as scalars, which the compiler keeps in registers.
-MANY_PARAMETERS = {'_upright_rotation'}
 
 
 def prefix_of(module: str) -> str:
@@ -89,7 +87,7 @@ def test_importing_the_package_imports_no_library():
     code = (f'import sys; before = set(sys.modules); import {ROOT}\n'
             "print(sorted({'rclpy', 'torch', 'numpy'} & (set(sys.modules) - before)))")
     done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=True,
-                          capture_output=True, text=True, timeout=60)
+                          capture_output=True, text=True, timeout=300)
     assert done.stdout.strip() == '[]'
 
 
@@ -108,5 +106,4 @@ def test_functions_have_few_parameters(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
-            assert count <= MAX_PARAMETERS or node.name in MANY_PARAMETERS, (
-                f'{node.name} has {count} parameters')
+            assert count <= MAX_PARAMETERS, f'{node.name} has {count} parameters'

@@ -21,7 +21,7 @@ SOURCES = [*MODULES, PROJECT / 'setup.py', *sorted((PROJECT / 'demo_world').rglo
            *sorted((PROJECT / 'test').rglob('*.py'))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
-EXECUTABLES = ['demo', 'detector', 'relocalizer', 'replay', 'tum_to_bag']
+EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'relocalizer', 'replay', 'tum_to_bag']
 
 # As vision_msgs 4.1.1 of Jazzy has them, in this order.
 VISION_MSGS_FIELDS = {
@@ -54,7 +54,7 @@ def relative(path: Path) -> str:
 
 def run_python(code: str, cwd: Path) -> str:
     done = subprocess.run(
-        [sys.executable, '-c', code], cwd=cwd, capture_output=True, text=True, timeout=120
+        [sys.executable, '-c', code], cwd=cwd, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -122,7 +122,7 @@ def test_installed_package_is_complete(tmp_path):
 
 def test_what_built_the_demo_is_not_installed(tmp_path):
     subprocess.run([sys.executable, 'setup.py', '--quiet', 'build_py', '--build-lib', tmp_path],
-                   cwd=PROJECT, check=True, capture_output=True, timeout=120)
+                   cwd=PROJECT, check=True, capture_output=True, timeout=300)
     assert [path.name for path in tmp_path.iterdir()] == ['cliploc_ros']
     built = {path.relative_to(tmp_path / 'cliploc_ros') for path in tmp_path.rglob('*.py')}
     assert built == {path.relative_to(PROJECT / 'cliploc_ros') for path in MODULES}

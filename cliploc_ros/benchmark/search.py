@@ -141,10 +141,10 @@ def _measure_hypotheses(scene: Scene) -> None:
 @compiled
 def _verify_all(bench, samples):
     """Make every hypothesis and verify it to the end; return how many there are."""
-    targets, poses, overlaps = bench.targets, bench.poses, bench.overlaps
+    candidates, prior, targets, sample, poses, overlaps = bench
     solved = 0
     for number in range(samples.shape[0]):
-        which = make_hypothesis(bench, samples, number, 0.0)
+        which = make_hypothesis(candidates, prior, sample, poses, samples, number, 0.0)
         if which >= 0:
             verify_beyond(targets, poses, which, overlaps, -1.0)
             solved += 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``replay``: publishes a recording where no ``ros2 bag`` is installed."""
+"""The executable ``replay``: publish a recording where no ``ros2 bag`` is installed."""
 
 import argparse
 import math
@@ -18,12 +18,12 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command, split_ros_args
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
     from cliploc_ros.ros.replay.player import Player, PlayReport
 
 NODE_NAME = 'replay'
-NS_PER_S = 1_000_000_000
 
 EPILOG = """\
 examples:
@@ -77,21 +77,21 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         '--clock', nargs='?', type=_positive, const=40.0, metavar='HZ',
-        help="publish the recording's time on /clock, HZ times a second (40 if not given), for "
-        'nodes with use_sim_time; with --loop it jumps back at each start',
+        help="publish the recording's time on /clock, HZ times a second (default: 40), for nodes "
+        'with use_sim_time; with --loop it jumps back at each start',
     )
     parser.add_argument(
         '--wait-for-subscribers', nargs='*', metavar='TOPIC',
-        help='begin only when each of these topics (all if none is named) has a subscriber',
+        help='begin when each of these topics (all if none is named) has a subscriber',
     )
     parser.add_argument(
         '--wait-timeout', type=_not_negative, default=30.0, metavar='S',
         help='give up waiting for subscribers after S seconds (default: 30)',
     )
     parser.add_argument(
-        '--wait-for-all-acked', type=_not_negative, default=0.3, metavar='S',
+        '--wait-for-all-acked', type=_not_negative, default=10.0, metavar='S',
         help='at the end, wait up to S seconds until reliable subscribers have acknowledged all '
-        'messages; acknowledgements may take 3 s (default: 0.3)',
+        'messages, which takes about 3 s (default: 10)',
     )
     return parser
 
@@ -102,7 +102,7 @@ def replay(args: list[str], stop: threading.Event) -> int:
     Parameters
     ----------
     args : list of str
-        The command line, those for ROS among them.
+        The command line, including the arguments for ROS.
     stop : threading.Event
         Ends the replay.
 
@@ -114,7 +114,7 @@ def replay(args: list[str], stop: threading.Event) -> int:
     Raises
     ------
     CliplocError
-        For a recording or an option that cannot be used, or where ROS is not there.
+        For a recording or an option that cannot be used, or without ROS.
     """
     plain_args, ros_args = split_ros_args(args)
     options = make_parser().parse_args(plain_args)
@@ -123,11 +123,11 @@ def replay(args: list[str], stop: threading.Event) -> int:
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise OptionsError(
-            f'ROS 2 is not there to publish with ({error}): source it, or run script/setup'
+            f'replay needs ROS 2 ({error}): source it, or run script/setup'
         ) from error
     try:
         rclpy.init(args=ros_args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # what rclpy makes of arguments that it cannot read
+    except RuntimeError as error:  # rclpy cannot read the arguments
         raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
     try:
         with BagReader(options.bag) as reader:
@@ -152,9 +152,8 @@ def _make_player(
         remap=dict(options.remap),
         clock_hz=options.clock,
         loop=options.loop,
-        linger_s=options.wait_for_all_acked,
     )
-    # nothing spins this node, so it could not serve its parameters
+    # Nothing spins this node, so it could not serve its parameters.
     node = Node(NODE_NAME, start_parameter_services=False)
     try:
         return Player(node, reader, play_options, stop)
@@ -175,10 +174,16 @@ def _play(player: 'Player', options: argparse.Namespace, stop: threading.Event) 
     begin = time.monotonic()
     with tqdm(
         total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
-        disable=None,  # without a terminal there is nothing to draw on
+        disable=None,  # draws on a terminal only
     ) as bar:
         report = player.play(_progress(bar, player.start_ns))
-    _tell(report, stopped=stop.is_set(), elapsed_s=time.monotonic() - begin)
+    _print_report(report, stopped=stop.is_set(), elapsed_s=time.monotonic() - begin)
+    if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
+        print(
+            f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
+            f'within {options.wait_for_all_acked:g} s',
+            file=sys.stderr,
+        )
     return 0
 
 
@@ -189,7 +194,7 @@ def _progress(bar: 'tqdm[None]', start_ns: int) -> Callable[[BagMessage], None]:
     return show
 
 
-def _tell(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
+def _print_report(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
     passes = f', {report.passes} passes' if report.passes > 1 else ''
     print(
         f'{"stopped: " if stopped else ""}published {report.counts.total()} messages on '
@@ -199,8 +204,8 @@ def _tell(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
     )
     if report.unread:
         print(
-            f'warning: {report.unread} messages that the recording lists could not be found in '
-            'it; is it damaged?',
+            f'warning: {report.unread} messages that the recording lists were not found in it; '
+            'is it damaged?',
             file=sys.stderr,
         )
 

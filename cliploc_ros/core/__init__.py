@@ -1,3 +1,25 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method: from an observation and a map to a pose. No ROS, no torch."""
+"""The method: from an observation and a map to a pose. No ROS, no torch.
+
+Imports point downwards only, in this order (test/test_layout.py checks it):
+
+relocalizer, session, relocalization, warm_up
+    Entry points and results.
+acceptance
+    Confidence, and the decision to accept or refuse.
+fit
+    Verification, refinement, several frames, covariance.
+search
+    Minimal samples to the best hypotheses of one frame.
+association
+    Observation and map to candidates and the scene of one frame.
+landmark_map, observation, options
+    Inputs.
+index
+    Landmarks by class, by similarity of labels, and by place.
+geometry
+    Transforms, camera, ellipses, ellipsoids, minimal solvers.
+compiled, parameter_file, time_budget
+    Helpers.
+"""

@@ -21,7 +21,7 @@ from cliploc_ros.errors import MapError
 
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 _MAX_TEXT_LENGTH = 1000
-# Squares and fourth powers of lengths in this range stay far from under- and overflow.
+# Squares and fourth powers of lengths in this range neither underflow nor overflow.
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
 _MAX_COORDINATE_M = 1e7
 _MAX_QUATERNION_NORM_ERROR = 0.01
@@ -141,10 +141,10 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
     low, high = _SEMI_AXIS_RANGE_M
     if not all(low <= axis <= high for axis in semi_axes):
-        raise MapError(f'{where}: semi_axes: {semi_axes} must lie within {low:g} and {high:g} m')
+        raise MapError(f'{where}: semi_axes: {semi_axes} must be within {low:g} to {high:g} m')
     center = _numbers(fields['center'], 3, f'{where}: center')
     if max(map(abs, center)) > _MAX_COORDINATE_M:
-        raise MapError(f'{where}: center: {center} is farther than {_MAX_COORDINATE_M:g} m away')
+        raise MapError(f'{where}: center: {center} is beyond {_MAX_COORDINATE_M:g} m')
     quat_xyzw = _numbers(fields['orientation'], 4, f'{where}: orientation')
     if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
         raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has the norm '
@@ -173,7 +173,7 @@ def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
 
 def _text(value: Any, where: str) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise MapError(f'{where}: must be text that is not empty (quote numbers and yes/no), '
+        raise MapError(f'{where}: must be non-empty text (quote numbers and yes/no), '
                        f'not {value!r}')
     if len(value) > _MAX_TEXT_LENGTH:
         raise MapError(f'{where}: longer than {_MAX_TEXT_LENGTH} characters')

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a ROS 2 parameter file without ROS, and without trusting it.
+"""Reading untrusted ROS 2 parameter files without ROS.
 
-The tree is built from the parser's events: nothing is recursive, nothing is instantiated, and
-size and depth are bounded, so that a hostile file ends in an error and not in a crash.
+The tree is built from the parser's events, without recursion and without instantiating objects.
+Size and depth are limited, so a hostile file ends in an error and not in a crash.
 """
 
 import os
@@ -17,11 +17,11 @@ from cliploc_ros.errors import MapError
 
 MAX_FILE_BYTES = 256 * 1024 * 1024
 _MAX_DEPTH = 16
-# Words that YAML 1.1, and with it ROS, reads as truth values.
+# Words that YAML 1.1, and so ROS, reads as booleans.
 _TRUE = frozenset({'y', 'yes', 'true', 'on'})
 _FALSE = frozenset({'n', 'no', 'false', 'off'})
 _QUOTED_STYLES = ('"', "'", '|', '>')
-# Longer digits are no number that anybody measured; 300 of them would overflow a float.
+# Longer text is no measured number; 300 digits would overflow a float.
 _MAX_NUMBER_LENGTH = 40
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
@@ -32,14 +32,14 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     MapError
-        The file cannot be read, is none, is too large, is no YAML mapping, is nested too deeply,
-        has an alias or a repeated key. The message names file and line.
+        The file is unreadable, not a regular file, too large, no YAML mapping, nested too deeply,
+        or has an alias or a repeated key. The message names file and line.
     """
     path = Path(path)
     try:
         if not S_ISREG(path.stat().st_mode):
-            # whoever may set parameters may name a device or a pipe, which have no end
-            raise MapError(f'{path}: is no regular file')
+            # a parameter may name a device or a pipe, which never end
+            raise MapError(f'{path}: not a regular file')
         with path.open('rb') as file:
             content = file.read(MAX_FILE_BYTES + 1)
         if len(content) > MAX_FILE_BYTES:
@@ -61,13 +61,13 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 class _TreeError(Exception):
-    """What the YAML grammar allows and a parameter file must not have."""
+    """A construct that YAML allows and a parameter file must not have."""
 
 
 def _build_tree(text: str) -> Any:
     """Return the one document of a YAML text, from its events."""
     root: list[Any] = []
-    # the open collections, innermost last, each with the key that awaits its value
+    # the open collections, innermost last, each with the key that waits for its value
     stack: list[tuple[Any, list[str]]] = [(root, [])]
     for event in yaml.parse(text, Loader=_LOADER):
         line = event.start_mark.line + 1
@@ -89,7 +89,7 @@ def _build_tree(text: str) -> Any:
 
 
 def _add(open_collection: tuple[Any, list[str]], value: Any, line: int) -> None:
-    """Put a value into the innermost collection: an item, a key, or a key's value."""
+    """Add a value to a collection, as an item, a key, or the value of the pending key."""
     collection, pending_key = open_collection
     if isinstance(collection, list):
         collection.append(value)
@@ -100,12 +100,12 @@ def _add(open_collection: tuple[Any, list[str]], value: Any, line: int) -> None:
     else:
         key = str(value)
         if key in collection:
-            raise _TreeError(f"line {line}: '{key}' stands twice")
+            raise _TreeError(f"line {line}: '{key}' is repeated")
         pending_key.append(key)
 
 
 def _scalar(event: yaml.ScalarEvent) -> Any:
-    """Return a scalar as ROS would type it: quoted text is text, the rest by its looks."""
+    """Return a scalar with the type that ROS gives it; quoted text stays text."""
     text = event.value
     if event.style in _QUOTED_STYLES or event.tag == 'tag:yaml.org,2002:str':
         return text

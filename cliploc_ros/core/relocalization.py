@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
 
 
@@ -46,6 +47,8 @@ class Relocalization:
         The best distinct hypotheses, best first; empty when nothing was found.
     matches : tuple of Match
         Inliers of the best hypothesis in the newest frame.
+    evidence : Evidence or None
+        Evidence for the best hypothesis, which decided; None when nothing was found.
     covariance : ndarray (6, 6) or None
         Of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was found.
     tried : int
@@ -64,6 +67,7 @@ class Relocalization:
     reason: str
     hypotheses: tuple[Hypothesis, ...] = ()
     matches: tuple[Match, ...] = ()
+    evidence: Evidence | None = None
     covariance: NDArray[np.float64] | None = None
     tried: int = 0
     best_iteration: int = 0

@@ -154,7 +154,8 @@ class Relocalizer:
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in finalists),
                                  likely * evidence.found, supports)),
-            matches=matches[0][-1], covariance=covariance_of(frames, rig, best, matches[0]),
+            matches=matches[0][-1], evidence=evidence,
+            covariance=covariance_of(frames, rig, best, matches[0]),
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
 

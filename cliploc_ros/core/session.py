@@ -25,7 +25,7 @@ _MOVED_M = 0.05
 _MOVED_DEG = 3.0
 
 
-class _KeptFrame(NamedTuple):
+class KeptFrame(NamedTuple):
     """A searched frame, and the odom_from_camera (4, 4) of the first frame that it replaced.
 
     A camera that creeps moves away from this anchor in the end.
@@ -45,7 +45,7 @@ class Session:
 
     def __init__(self, relocalizer: Relocalizer) -> None:
         self._relocalizer = relocalizer
-        self._frames: list[_KeptFrame] = []
+        self._frames: list[KeptFrame] = []
         self._looks = Looks()
         self._run = -1
         self._stamp_ns = 0
@@ -78,9 +78,9 @@ class Session:
         if run != self._run or observation.stamp_ns < self._stamp_ns:
             self._frames, self._looks = [], Looks()
         self._run, self._stamp_ns = run, observation.stamp_ns
-        earlier, anchor = _frames_to_fuse(self._frames, observation, limit, length_s)
+        earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
         budget = self._relocalizer.begin(len(earlier) + 1)
-        newest = _KeptFrame(self._relocalizer.search(observation, budget.search_end()), anchor)
+        newest = KeptFrame(self._relocalizer.search(observation, budget.search_end()), anchor)
         frames = [*earlier, newest]
         found = self._relocalizer.locate([one.searched for one in frames], budget, self._looks)
         self._frames = frames
@@ -89,8 +89,8 @@ class Session:
         return found
 
 
-def _frames_to_fuse(frames: Sequence[_KeptFrame], observation: Observation, limit: int,
-                    length_s: float) -> tuple[list[_KeptFrame], NDArray[np.float64]]:
+def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit: int,
+                   length_s: float) -> tuple[list[KeptFrame], NDArray[np.float64]]:
     """Return the frames to fuse a new one with, oldest first, and the anchor of the new one.
 
     Of too many frames those remain that are furthest apart, so a camera that turns is localized

@@ -13,7 +13,7 @@ from cliploc_ros.evaluation.summary import LIMITS_M, Summary, compare, find_best
 from cliploc_ros.evaluation.trials import Result
 
 _HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
-           'search [ms]', 'accepted', 'precision at 1 m (95 %)', 'false accepts')
+           'search [ms]', 'accepted', 'precision (95 %)', 'false accepts')
 _WITHIN_NOISE = '~'
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
+from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -76,13 +77,15 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
     """
     relocalizer, rng = Relocalizer(landmark_map, options), np.random.default_rng(seed)
     for query in queries:
-        session, alone, accepted, errors_m = Session(relocalizer), [], [], []
+        session = Session(relocalizer)
+        alone, accepted, errors_m = [], [], []
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
             found = session.localize(look)
             accepted.append(found.accepted)
-            alone.append(relocalizer.relocalize([look]).accepted)
+            alone.append(found.evidence is not None and not refusal(
+                replace(found.evidence, looks=1, agreeing=1), options))
             errors_m.append(np.inf if found.map_from_camera is None else
                             pose_error(found.map_from_camera, query.map_from_camera)[0])
         yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))

@@ -19,13 +19,16 @@ from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.joint import pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks, no_landmarks
-from cliploc_ros.mapping.merging import merge_duplicates
+from cliploc_ros.mapping.merging import merge_classes, merge_duplicates
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
-from cliploc_ros.mapping.triangulation import triangulate
-from cliploc_ros.mapping.views import Views, make_views, map_from_cameras
+from cliploc_ros.mapping.triangulation import SUPPORT_IOU, triangulate
+from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_out
+
+# Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
+_WINDOW_S, _OVERLAP_S = 90.0, 30.0
 
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
@@ -101,9 +104,9 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
     """Return the landmarks that the views show, for the poses that they have."""
     landmarks = no_landmarks()
     for number in range(options.discovery_rounds):
-        tell('finding landmarks', number / options.discovery_rounds)
         free = associate(views, landmarks, options.association_iou) < 0
-        landmarks = join_landmarks(landmarks, _discover(views, free, options, rng))
+        landmarks = join_landmarks(landmarks, _discover(views, free, options, rng,
+                                                        tell))
         tell('fitting landmarks', number / options.discovery_rounds)
         landmarks = _settle(views, landmarks, options)
     evidence = gather_evidence(views, landmarks,
@@ -136,11 +139,35 @@ def _refine(given: Views, views: Views, draft: _Draft, options: MappingOptions
 
 
 def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
-              rng: np.random.Generator) -> Landmarks:
-    """Return landmarks that explain the free boxes, class by class."""
-    return join_landmarks(*(
-        triangulate(views, np.nonzero(free & (views.classes == number))[0], options, rng)
-        for number in np.unique(views.classes[free])))
+              rng: np.random.Generator, tell: Progress) -> Landmarks:
+    """Return landmarks that explain the free boxes, class by class and minute by minute.
+
+    What a window of time has found explains boxes of the next one, so that the work grows with
+    the length of the recording only.
+    """
+    free = free & thin_out(views, options.frames_per_viewpoint)[views.frames]
+    found = [no_landmarks()]
+    for first, last in _windows(views.stamps_s):
+        tell('finding landmarks', first / len(views.stamps_s))
+        window = views.between(first, last)
+        left = free[views.offsets[first]:views.offsets[last]].copy()
+        left &= associate(window, found[-1], SUPPORT_IOU) < 0
+        found.append(join_landmarks(*(
+            triangulate(window, np.nonzero(left & (window.classes == number))[0], options, rng)
+            for number in np.unique(window.classes[left]))))
+    return join_landmarks(*found)
+
+
+def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return the first frame of each window of time, and the one after its last."""
+    windows, begin_s = [], stamps_s[0]
+    while True:
+        first, last = np.searchsorted(stamps_s, [begin_s, begin_s + _WINDOW_S])
+        if last > first:
+            windows.append((int(first), int(last)))
+        if last == len(stamps_s):
+            return windows
+        begin_s = stamps_s[last] - _OVERLAP_S
 
 
 def _settle(views: Views, landmarks: Landmarks, options: MappingOptions) -> Landmarks:
@@ -174,24 +201,25 @@ def _nothing_found(draft: _Draft) -> str:
 
 def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
             options: MappingOptions, notes: list[str]) -> BuiltMap:
-    evidence = gather_evidence(views, draft.landmarks, draft.shown)
-    explained, median_iou = explained_boxes(views, draft.landmarks)
+    landmarks, shown = merge_classes(views, draft.landmarks, draft.shown, options)
+    evidence = gather_evidence(views, landmarks, shown)
+    explained, median_iou = explained_boxes(views, landmarks, shown)
     changes = np.square(pose_errors(given, views))
     report = MappingReport(
         frames=len(detections), viewpoints=int(views.viewpoints[-1]) + 1,
-        boxes=len(detections.classes), landmarks=len(draft.landmarks.centers),
+        boxes=len(detections.classes), landmarks=len(landmarks.centers),
         explained=explained, median_iou=median_iou,
         pose_change_m=float(np.sqrt(changes[:, :3].sum(axis=1).mean())),
         pose_change_deg=float(np.degrees(np.sqrt(changes[:, 3:].sum(axis=1).mean()))),
         left_out=describe_left_out(detections, draft.left_out, draft.evidence_against,
                                    draft.reasons),
         notes=tuple(notes))
-    return BuiltMap(make_landmark_map(detections, draft.landmarks, evidence, options), report,
-                    draft.shown, map_from_cameras(views))
+    return BuiltMap(_make_map(detections, landmarks, shown, evidence, options), report, shown,
+                    map_from_cameras(views))
 
 
-def make_landmark_map(detections: PosedDetections, landmarks: Landmarks, evidence: Evidence,
-                      options: MappingOptions) -> LandmarkMap:
+def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[np.int64],
+              evidence: Evidence, options: MappingOptions) -> LandmarkMap:
     """Return landmarks as a map; labels are the class names."""
     names = tuple(detections.class_names[number] for number in landmarks.classes)
     semi_axes = np.linalg.norm(landmarks.bases, axis=1)
@@ -199,6 +227,7 @@ def make_landmark_map(detections: PosedDetections, landmarks: Landmarks, evidenc
     rotations[np.linalg.det(rotations) < 0.0] *= -1.0
     details = tuple(
         LandmarkDetails(
+            class_weights=_class_weights(detections, shown == row),
             position_sigma=float(evidence.position_sigma[row]),
             support=int(evidence.support[row]), seen_ratio=float(evidence.seen_ratio[row]),
             baseline_deg=float(evidence.baseline_deg[row]),
@@ -206,6 +235,16 @@ def make_landmark_map(detections: PosedDetections, landmarks: Landmarks, evidenc
         for row in range(len(names)))
     return LandmarkMap(options.frame_id, _landmark_ids(names), names, names, landmarks.centers,
                        semi_axes, Rotation.from_matrix(rotations).as_quat(), details)
+
+
+def _class_weights(detections: PosedDetections, rows: NDArray[np.bool_]
+                   ) -> tuple[tuple[str, float], ...] | None:
+    """Return the classes of some boxes with their shares, the greatest first; None for one."""
+    counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))
+    if np.count_nonzero(counts) < 2:
+        return None
+    return tuple((detections.class_names[number], float(counts[number] / counts.sum()))
+                 for number in np.argsort(-counts, kind='stable') if counts[number])
 
 
 def _landmark_ids(names: tuple[str, ...]) -> tuple[str, ...]:

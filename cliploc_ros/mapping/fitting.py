@@ -198,7 +198,8 @@ def add_axis_prior(basis, information, gradient):
             for j in range(i + 1):
                 other = ((0.5 if j == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
                 information[diagonal[i], diagonal[j]] += slope * other
-    # shears turn the axes: half of their change per axis difference; keep them from drifting
+    # The numbers beside the diagonal turn the axes, which boxes of a sphere leave open: a weak
+    # hold keeps the equations regular, and has no target.
     for off in (4, 5, 7):
         information[off, off] += 0.5 / (_AXIS_SPREAD * _AXIS_SPREAD)
     return cost

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Merge landmarks that are one object.
 
-Two landmarks of one class that lie in one another are one object, unless frames show both at
-once: a detector draws one box around one object.
+Two landmarks that lie in one another are one object, unless frames show both of them apart. A
+detector may call one object by two names, in different frames or in one.
 """
 
 import numpy as np
@@ -14,7 +14,11 @@ from cliploc_ros.mapping.evidence import group_boxes, ious_with
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.projection import box_iou
 from cliploc_ros.mapping.views import Views
+
+# Two boxes of one frame that overlap more than this are one object. A guess.
+_ONE_BOX_IOU = 0.6
 
 
 def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
@@ -29,15 +33,40 @@ def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64
         The landmark that each box shows, -1 for none.
     options : MappingOptions
     """
+    return _merge(views, landmarks, shown, pairs_of_one_class(landmarks, options.merge_distance),
+                  options)
+
+
+def merge_classes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                  options: MappingOptions) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return the landmarks with those merged that are one object under two classes.
+
+    The class that the more boxes have stays. Parameters as in merge_duplicates.
+    """
+    pairs = [pair for pair in _close_pairs(landmarks, options.class_merge_distance)
+             if landmarks.classes[pair[0]] != landmarks.classes[pair[1]]]
+    return _merge(views, landmarks, shown, pairs, options)
+
+
+def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
+    """Return the pairs of one class nearer than a normalized distance, the nearest first."""
+    return [pair for pair in _close_pairs(landmarks, max_distance)
+            if landmarks.classes[pair[0]] == landmarks.classes[pair[1]]]
+
+
+def _merge(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+           pairs: list[tuple[int, int]], options: MappingOptions
+           ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Merge those of the pairs that are one object."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     rows_of = group_boxes(shown, len(centers))
     is_kept = np.ones(len(centers), dtype=np.bool_)
-    for first, second in _close_pairs(landmarks, options.merge_distance):
+    for first, second in pairs:
         if not (is_kept[first] and is_kept[second]):
             continue
         keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
                       else (second, first))
-        if _seen_together(views, rows_of[keep], rows_of[drop]) > options.max_shared_views:
+        if _seen_apart(views, rows_of[keep], rows_of[drop]) > options.max_seen_apart:
             continue
         rows = np.sort(np.concatenate([rows_of[keep], rows_of[drop]]))
         fit = fit_ellipsoid(views, rows, centers[keep], bases[keep])
@@ -56,17 +85,17 @@ def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64
 
 
 def _close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
-    """Return the pairs of equal class nearer than a normalized distance, the nearest first."""
+    """Return the pairs nearer than a normalized distance, the nearest first."""
     if len(landmarks.centers) < 2:
         return []
     reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
+    # the smaller of two touching landmarks lies within the reach of the larger one
     tree = cKDTree(landmarks.centers)
-    pairs = [(first, second) for first in range(len(reach))
+    pairs = {(min(first, second), max(first, second)) for first in range(len(reach))
              for second in tree.query_ball_point(landmarks.centers[first],
                                                  2.0 * max_distance * reach[first])
-             if second != first and landmarks.classes[first] == landmarks.classes[second]]
-    unique = sorted({(min(pair), max(pair)) for pair in pairs})
-    close = [(normalized_distance(landmarks, *pair), pair) for pair in unique]
+             if second != first}
+    close = [(normalized_distance(landmarks, *pair), pair) for pair in sorted(pairs)]
     return [pair for distance, pair in sorted(close) if distance < max_distance]
 
 
@@ -78,7 +107,13 @@ def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:
     return float(np.sqrt(offset @ np.linalg.solve(shape, offset)))
 
 
-def _seen_together(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
-    """Return in which share of the frames of the rarer of two landmarks the other shows, too."""
-    shared = np.intersect1d(views.frames[rows], views.frames[others])
-    return len(shared) / max(1, min(len(rows), len(others)))
+def _seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+    """Return in which share of the frames of the rarer landmark both have a box of their own.
+
+    Two boxes that overlap well are one object under two classes.
+    """
+    _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
+                                      return_indices=True)
+    apart = sum(box_iou(views.edges[row], views.edges[other], views.bounds) < _ONE_BOX_IOU
+                for row, other in zip(rows[first], others[second], strict=True))
+    return float(apart) / max(1, min(len(rows), len(others)))

@@ -43,6 +43,8 @@ class MappingOptions:
         An edge this near to the image border is open: the object may extend beyond it [px].
     pairs_per_box : int
         Hypotheses that each box is the seed of.
+    frames_per_viewpoint : int
+        At most so many frames of a viewpoint are searched for new landmarks.
     min_viewpoints : int
         A landmark needs support from so many viewpoints.
     discovery_rounds, settling_rounds : int
@@ -53,8 +55,10 @@ class MappingOptions:
     merge_distance : float
         Landmarks of one class nearer than this may be one object, see
         cliploc_ros.mapping.merging.normalized_distance.
-    max_shared_views : float
-        Unless they are seen together in more than this share of the frames of the rarer one.
+    class_merge_distance : float
+        The same for landmarks of two classes.
+    max_seen_apart : float
+        Unless more than this share of the frames of the rarer one show them as two boxes.
     merge_loss : float
         Or the mean IoU of their boxes falls by more than this.
     min_seen_ratio : float
@@ -81,12 +85,14 @@ class MappingOptions:
     edge_sigma_share: float = 0.04
     border_px: float = 3.0
     pairs_per_box: int = 3
+    frames_per_viewpoint: int = 8
     min_viewpoints: int = 3
     discovery_rounds: int = 2
     settling_rounds: int = 3
     association_iou: float = 0.2
     merge_distance: float = 0.8
-    max_shared_views: float = 0.15
+    class_merge_distance: float = 0.4
+    max_seen_apart: float = 0.15
     merge_loss: float = 0.1
     min_seen_ratio: float = 0.03
     min_baseline_deg: float = 20.0

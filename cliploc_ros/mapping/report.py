@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cliploc_ros.mapping.evidence import Evidence, best_ious
+from cliploc_ros.mapping.evidence import Evidence, best_ious, group_boxes, ious_with
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views
@@ -92,9 +93,23 @@ class MappingReport:
         return rows
 
 
-def explained_boxes(views: Views, landmarks: Landmarks) -> tuple[float, float]:
-    """Return the share of boxes that landmarks of their class explain, and their median IoU."""
+def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64] | None = None
+                    ) -> tuple[float, float]:
+    """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
+
+    Parameters
+    ----------
+    views : Views
+    landmarks : Landmarks
+    shown : ndarray (n,) of int, optional
+        The landmark that each box shows, -1 for none: explains a box although the landmark's
+        class is another one.
+    """
     ious = best_ious(views, landmarks)
+    if shown is not None:
+        for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
+            own = ious_with(views, rows, landmarks.centers[number], landmarks.bases[number])
+            ious[rows] = np.maximum(ious[rows], own)
     is_explained = ious > _EXPLAINED_IOU
     if not is_explained.any():
         return 0.0, 0.0

@@ -56,6 +56,17 @@ class Views(NamedTuple):
     is_open: NDArray[np.bool_]
     bounds: NDArray[np.float64]
 
+    def between(self, first: int, last: int) -> 'Views':
+        """Return the frames from first up to last, last excluded; nothing is copied."""
+        frames = slice(first, last)
+        boxes = slice(int(self.offsets[first]), int(self.offsets[last]))
+        return Views(
+            self.rotations[frames], self.translations[frames], self.stamps_s[frames],
+            self.viewpoints[frames], self.weights[frames],
+            self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
+            self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
+            self.bounds)
+
 
 def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
     """Return what the kernels read of posed detections."""
@@ -85,6 +96,14 @@ def camera_from_map(map_from_camera: NDArray[np.float64]
     rotations = np.ascontiguousarray(map_from_camera[:, :3, :3].transpose(0, 2, 1))
     translations = -np.einsum('fij,fj->fi', rotations, map_from_camera[:, :3, 3])
     return rotations, np.ascontiguousarray(translations)
+
+
+def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
+    """Return a mask (F,) of at most so many frames of each viewpoint, evenly chosen."""
+    counts = np.bincount(views.viewpoints - views.viewpoints[0])
+    places = np.arange(len(views.viewpoints)) - np.repeat(np.cumsum(counts) - counts, counts)
+    counts = np.maximum(np.repeat(counts, counts), most)
+    return np.asarray((places * most) // counts != ((places - 1) * most) // counts)
 
 
 def map_from_cameras(views: Views) -> NDArray[np.float64]:

@@ -112,7 +112,8 @@ class Requests:
         may_go_on = answer.pose is None
         if answer.pose is not None:
             try:
-                self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline)
+                self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
+                                        answer.received_at)
             except HandOffError as error:
                 answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
                                  detail=f'{error} ({answer.message})')

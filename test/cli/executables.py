@@ -21,10 +21,18 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rosbags.interfaces import QosHistory
+
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.rosbag import RELIABLE_QOS, BagWriter
 
 PROJECT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0  # a limit for hangs alone, on a machine under load
 SIZE = (64, 48)
+START_NS = 1_700_000_000_123_456_789
+MS = 1_000_000
+# As `ros2 bag record` writes it: discovery reports neither history nor depth.
+RECORDED_QOS = RELIABLE_QOS._replace(history=QosHistory.UNKNOWN, depth=0)
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> None:
@@ -87,6 +95,20 @@ def write_sequence(folder: Path, count: int = 4, suffix: str = 'png') -> SmallSe
         ],
     }))
     return SmallSequence(folder, stamps, images, detections)
+
+
+def write_poses(path, offsets_ms, topics=None):
+    """Write a recording of poses at offsets [ms] on topics with their QoS, all at once."""
+    topics = topics or {'/pose': RECORDED_QOS}
+    with BagWriter(path, 'mcap') as bag:
+        for name, qos in topics.items():
+            bag.add_topic(name, bag_messages.POSE, qos)
+        for offset in offsets_ms:
+            stamp = START_NS + round(offset * MS)
+            message = bag_messages.pose_message(stamp, 'world', np.eye(4))
+            for name in topics:
+                bag.write(name, stamp, message)
+    return path
 
 
 class Listener:

@@ -10,6 +10,10 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.fit.covariance import odometry_covariance, vertical_information
+from cliploc_ros.core.fit.refinement import linearize_rig, one_to_one, residuals_of_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -20,6 +24,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import make_queries
@@ -82,19 +87,16 @@ def test_the_last_frame_is_the_one_asked_about(room, walk):
         assert pose_error(found.map_from_camera, walk[last]) < (0.01, 0.2)
 
 
-def test_what_was_searched_before_is_not_searched_again(room, walk):
+def test_frames_searched_one_by_one_give_the_same_result(room, walk):
     relocalizer = Relocalizer(room, OPTIONS)
-    frames, searched = [see(room, pose) for pose in walk], []
+    frames = [see(room, pose) for pose in walk]
+    searched = [relocalizer.search(one) for one in frames]
     for count in range(1, 5):
         at_once = relocalizer.relocalize(frames[:count])
-        bit_by_bit = relocalizer.relocalize(frames[:count], searched)
-        assert len(searched) == count
-        np.testing.assert_array_equal(bit_by_bit.map_from_camera, at_once.map_from_camera)
-        np.testing.assert_array_equal(bit_by_bit.covariance, at_once.covariance)
-        assert (bit_by_bit.confidence, bit_by_bit.tried) == (at_once.confidence, at_once.tried)
-    impatient = Relocalizer(room, replace(OPTIONS, time_budget_s=1e-6))
-    assert impatient.relocalize(frames).coverage < 1.0
-    assert impatient.relocalize(frames, searched).coverage == 1.0
+        one_by_one = relocalizer.locate(searched[:count])
+        np.testing.assert_array_equal(one_by_one.map_from_camera, at_once.map_from_camera)
+        np.testing.assert_array_equal(one_by_one.covariance, at_once.covariance)
+        assert (one_by_one.confidence, one_by_one.tried) == (at_once.confidence, at_once.tried)
 
 
 def test_one_frame_needs_no_odometry_and_is_not_changed_by_it(room, walk):
@@ -114,7 +116,6 @@ def test_the_same_view_again_is_no_more_evidence(refine, room):
     once, often = relocalizer.relocalize([frame]), relocalizer.relocalize([frame] * 5)
     assert often.score == pytest.approx(5 * once.score, rel=0.02)
     assert often.confidence == pytest.approx(once.confidence, rel=0.05)
-    # to what one view leaves open comes what odometry does
     assert (np.diag(often.covariance) > 0.9 * np.diag(once.covariance)).all()
 
 
@@ -126,7 +127,76 @@ def test_a_frame_that_shows_nothing_changes_nothing(room, walk):
         assert pose_error(found.map_from_camera, walk[1]) < (0.01, 0.2)
     found = relocalizer.relocalize([see(room, walk[0], []), see(room, walk[1], [3])])
     assert not found.solved
-    assert found.reason == '1 detections give fewer than 3 different correspondence candidates'
+    assert found.reason.startswith('1 detections give fewer than 3 distinct correspondence cand')
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def knowing_up(frame, map_from_camera):
+    return replace(frame, up_in_camera=map_from_camera[:3, :3].T @ UP)
+
+
+def tilt_deg(found):
+    """Standard deviation of the tilt that a covariance states."""
+    return np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:5, 3:5]).max()))
+
+
+@pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
+def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
+    """They come from one sensor on one mount, so its error does not average out."""
+    relocalizer = Relocalizer(room, replace(OPTIONS, vertical_deviation_deg=deviation_deg))
+    at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
+    one, four = (tilt_deg(relocalizer.relocalize([
+        knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
+        for shares in (at_once, one_by_one))
+    print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
+    assert four == pytest.approx(one, rel=1e-3)
+
+
+def test_the_information_of_verticals_is_that_of_the_refinement(room, walk):
+    verticals = np.array([[*(pose[:3, :3].T @ UP), *UP, 0.02] for pose in walk])
+    verticals[1, :3] = Rotation.from_rotvec([0.03, 0.02, 0.0]).apply(verticals[1, :3])
+    verticals[2] = VERTICAL_UNKNOWN
+    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
+    scenes = [Relocalizer(room, OPTIONS).search(see(room, pose)).scene for pose in walk]
+    informations = []
+    for known in (verticals, np.zeros_like(verticals)):
+        rig = make_rig(scenes, cameras, known)
+        pose = invert_transform(walk[-1])
+        rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
+        inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
+        in_front, residuals = residuals_of_rig(rig, inliers, rotation, translation)
+        assert in_front
+        information, _ = linearize_rig(rig, inliers, rotation, translation, residuals)
+        informations.append(information)
+    rotations = cameras[:, :3, :3] @ invert_transform(walk[-1])[:3, :3]
+    np.testing.assert_allclose(vertical_information(rotations, verticals),
+                               informations[0] - informations[1], atol=1e-6)
+
+
+def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
+    relocalizer, spreads = Relocalizer(room, OPTIONS), []
+    for step_m in (0.02, 0.1, 0.2):
+        poses = [moved(MAP_FROM_CAMERA, step_m * number, 0.0) for number in range(4)]
+        fused = relocalizer.relocalize([see(room, pose) for pose in poses])
+        alone = relocalizer.relocalize([see(room, poses[-1])])
+        spreads.append(np.sqrt(np.diag(fused.covariance)[:3]).max()
+                       - np.sqrt(np.diag(alone.covariance)[:3]).max())
+    assert spreads[0] < spreads[1] < spreads[2]
+
+
+def test_the_covariance_of_odometry():
+    """Two frames of equal weight: half of the deviation of the one that is displaced."""
+    cameras = np.tile(np.eye(4), (2, 1, 1))
+    assert not odometry_covariance(cameras, np.array([3.0, 3.0])).any(), 'did not move'
+    cameras[0] = make_transform(Rotation.from_euler('z', 10, degrees=True).as_matrix(),
+                                np.array([0.5, 0.0, 0.0]))
+    added = np.sqrt(np.diag(odometry_covariance(cameras, np.array([3.0, 3.0]))))
+    assert added[:3] == pytest.approx(0.5 * (0.005 + 0.03 * 0.5))
+    assert added[3:] == pytest.approx(0.5 * np.radians(0.25 + 0.03 * 10.0))
+    assert not odometry_covariance(cameras, np.array([0.0, 3.0])).any(), 'explains nothing'
+    assert not odometry_covariance(cameras, np.zeros(2)).any()
 
 
 def test_two_rooms_alike_are_ambiguous_in_any_number_of_frames(room, walk):

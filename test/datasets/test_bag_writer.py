@@ -203,7 +203,7 @@ def test_full_disk_leaves_nothing(tmp_path, storage):
     """)
     run = subprocess.run(
         [sys.executable, '-c', program, tmp_path / 'bag', storage],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True, timeout=300,
     )
     assert 'cannot be written' in run.stdout
     assert 'nothing was left behind' in run.stdout

@@ -229,7 +229,7 @@ def test_full_disk_keeps_the_old_file(tmp_path):
     """)
     run = subprocess.run(
         [sys.executable, '-c', program, path],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True, timeout=300,
     )
     assert 'cannot be written: File too large; nothing was left behind' in run.stdout
     assert [one.name for one in tmp_path.iterdir()] == ['q.npz']

@@ -21,5 +21,5 @@ def worlds(tmp_path_factory):
     folder = tmp_path_factory.mktemp('worlds')
     subprocess.run(
         [sys.executable, '-m', 'demo_world.make_worlds', str(folder), '--count', '2',
-         '--frames', '3', '--seed', '40'], cwd=PROJECT, check=True, timeout=120)
+         '--frames', '3', '--seed', '40'], cwd=PROJECT, check=True, timeout=300)
     return folder

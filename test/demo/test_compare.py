@@ -26,14 +26,14 @@ PROJECT = Path(__file__).resolve().parents[2]
 def compare(folder, *arguments):
     return subprocess.run(
         [sys.executable, '-m', 'demo_world.compare', '--out', str(folder), *arguments],
-        cwd=PROJECT, capture_output=True, text=True, timeout=300, check=False)
+        cwd=PROJECT, capture_output=True, text=True, timeout=900, check=False)
 
 
 @pytest.fixture(scope='module')
 def compared(tmp_path_factory):
     """The folder and the output of a comparison, with little time for the exhaustive methods."""
     folder = tmp_path_factory.mktemp('compare')
-    done = compare(folder, '--budget', '0.05', '--trials', '3')
+    done = compare(folder, '--budget', '0.05', '--trials', '1')
     assert done.returncode == 0, done.stderr
     print('\n' + done.stdout)
     return folder, done.stdout

@@ -32,7 +32,7 @@ FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration'
            'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')
 IMAGES = 16
-TIMEOUT_S = 300.0  # with networks, on a machine that does other things too
+TIMEOUT_S = 900.0  # with networks, on a machine under load
 
 
 def command(*arguments):
@@ -109,7 +109,7 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
 
 
 def test_five_frames_at_a_time(shared_data, tmp_path):
-    """The whole of it on real data: better than one at a time, and nothing wrong is believed."""
+    """On real data: higher success than with one frame, and no false accept."""
     office = shared_data / 'tum_fr3_office'
     given = ('--queries', office / 'queries.npz', '--map', office / 'map.yaml', '--methods',
              'auto', '--no-figures')
@@ -126,8 +126,8 @@ def test_five_frames_at_a_time(shared_data, tmp_path):
     assert not [row for row in found['five'] if row['accepted'] and row['error_m'] > 1.0]
 
 
-def test_frames_of_a_group_are_joined(files, recording, room, tmp_path, evaluate_here):
-    """Twelve views of one place: each alone too poor or not, together always rich enough."""
+def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
+    """Twelve views of one place: some are refused alone, all are accepted together."""
     recorded = changed(files, tmp_path, query_group=np.zeros(12, dtype=np.int64),
                        is_main=np.arange(12) == 1)
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
@@ -214,7 +214,7 @@ def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     assert evaluate(*arguments, '--out', broken, '--resume').returncode == 0
     assert results_of(broken) == whole
     assert not journal.exists()
-    print(f'\nbroken off after {done} parts, then resumed')
+    print(f'\nstopped after {done} parts, then resumed')
 
 
 @pytest.fixture(scope='module')
@@ -247,7 +247,7 @@ def evaluated_bag(walk):
 
 
 def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag):
-    assert f'left out, as no true pose lies within 20 ms: 1 of {IMAGES}' in evaluated_bag.stdout
+    assert f'skipped without ground truth within 20 ms: 1 of {IMAGES}' in evaluated_bag.stdout
     done = evaluate('--tum', walk / 'tum', *NETWORKS, *METHODS, '--out', walk / 'from_tum')
     assert done.returncode == 0, done.stderr
     done = evaluate('--queries', walk / 'saved.npz', '--map', ASSETS / 'map.yaml', *METHODS,
@@ -280,19 +280,8 @@ def test_detector_and_clip_run_once(walk, evaluated_bag):
     done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
                     '--out', walk / 'once_more', '--no-figures')
     assert done.returncode == 0
-    assert 'recording anew' in done.stderr
+    assert 'recording again' in done.stderr
     assert results_of(walk / 'again') == results_of(walk / 'once_more')
-
-
-def test_tuning_from_the_command_line(files, tmp_path, evaluate_here):
-    done = evaluate(*small(files, '--methods', 'hybrid_b-prosac', '--tune', '--trials', 1, '--out',
-                           tmp_path))
-    assert done.returncode == 0, done.stderr
-    assert 'on the 6 queries that did not choose' in done.stdout
-    parameters = yaml.safe_load((tmp_path / 'tuned.yaml').read_text())
-    assert parameters['relocalizer']['ros__parameters']['matching'] == 'hybrid'
-    assert_error(evaluate_here(*small(files, '--tune', '--out', tmp_path)),
-                 '--tune is for one method')
 
 
 def test_no_ros_is_needed(files, tmp_path):
@@ -353,7 +342,7 @@ def test_missing_input_is_named(files, tmp_path, arguments, named, evaluate_here
 @pytest.mark.parametrize(('arguments', 'named'), [
     (('--methods', 'best'), "'best' is none of"), (('--iterations', 0), 'iterations: 0'),
     (('--out', '/proc/x'), '--out /proc/x'), (('--map', '/nowhere.yaml'), '/nowhere.yaml'),
-    (('--save-queries', 'q.npz'), '--save-queries is for')])
+    (('--save-queries', 'q.npz'), '--save-queries needs')])
 def test_bad_options_are_named(files, tmp_path, arguments, named, evaluate_here):
     assert_error(evaluate_here(*small(files, '--out', tmp_path, *arguments)), named)
 

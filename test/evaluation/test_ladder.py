@@ -25,4 +25,4 @@ def test_each_rung_runs_and_the_last_is_the_best(shared_data):
     success = [one.success(0.5) for one in found]
     print(f'\nsuccess at 0.5 m, {GROUPS} queries: {" ".join(f"{rate:.2f}" for rate in success)}')
     assert success[-1] == max(success) > success[0]
-    assert sum(one.wrongly_accepted() for one in found) == 0
+    assert sum(one.false_accepts() for one in found) == 0

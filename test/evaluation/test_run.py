@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
-from test_summary import make_summary
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.evaluation import tuning
 from cliploc_ros.evaluation.journal import Journal
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.run import count_searches, run_methods
@@ -115,30 +112,3 @@ def test_a_journal_forgets_only_a_line_cut_off(results, tmp_path):
     journal._path.write_text('\n'.join([lines[0], 'rubbish', lines[1]]))
     with pytest.raises(OptionsError, match='damaged'):
         journal.read({'trials': 3})
-
-
-def test_tuning_chooses_on_one_half_and_judges_on_the_other(room, questions):
-    start = RelocalizerOptions(k=1, iterations=500, min_confidence=1.0)
-    seen = []
-    tuned = tuning.tune(room, start, questions, trials=2, workers=1, seed=0, advance=seen.extend)
-    chose, judged = tuning.split(questions, 0)
-    assert len(seen) == tuning.count_searches(start, len(room), len(questions), 2)
-    assert not {one.number for one in chose} & {one.number for one in judged}
-    assert tuned.after.queries == tuned.before.queries == tuple(one.number for one in judged)
-    assert not tuned.before.accepted.any()
-    assert tuned.after.accepted.any()
-    assert tuned.options.min_confidence < 1.0
-    read = yaml.safe_load(tuning.as_parameter_file(tuned.options))['relocalizer']
-    assert read['ros__parameters']['k'] == tuned.options.k
-    with pytest.raises(OptionsError, match='at least 8'):
-        tuning.split(questions[:7], 0)
-
-
-def test_the_least_confidence_that_is_right_often_enough():
-    def least(errors, levels):
-        return tuning.least_confidence(make_summary(
-            errors, accepted=[True] * len(errors), confidence=levels))
-
-    assert least([0.1, 0.1, 2.0], [0.9, 0.8, 0.7]) == 0.8
-    assert least([0.1, 2.0, 0.1], [0.90001, 0.8, 0.7]) == 0.9001
-    assert least([2.0, 0.1], [0.9, 0.8]) == 1.0

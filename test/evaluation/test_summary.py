@@ -18,7 +18,13 @@ from cliploc_ros.evaluation.paper_table import (
     notes,
     table_rows,
 )
-from cliploc_ros.evaluation.summary import Summary, compare, find_best, summarize
+from cliploc_ros.evaluation.summary import (
+    Summary,
+    compare,
+    find_best,
+    summarize,
+    wilson_interval,
+)
 from cliploc_ros.evaluation.trials import Result
 
 
@@ -50,12 +56,28 @@ def test_success_and_errors():
     assert one.mean_error_m == pytest.approx((0.1 + 0.4 + 3.0 + 0.1 + 0.9 + 0.2 + 3.0) / 7)
 
 
-def test_belief():
+def test_precision_and_recall():
     one = make_summary([0.1, 0.4, 2.0, np.inf], accepted=[True, False, True, False])
-    assert (one.wrongly_accepted(), one.precision(), one.recall()) == (1, 0.5, 0.5)
+    assert (one.false_accepts(), one.precision(), one.recall()) == (1, 0.5, 0.5)
     none = make_summary([np.inf, np.inf])
     assert (none.precision(), none.recall()) == (1.0, 1.0)
+    assert none.precision_interval() == (0.0, 1.0)
     assert np.isnan(none.mean_error_m)
+
+
+def test_the_interval_of_the_precision_counts_queries():
+    """Trials of one query are not independent, so more trials do not narrow it."""
+    once = make_summary([0.1] * 10, accepted=[True] * 10)
+    often = make_summary([[0.1] * 10] * 5, accepted=[[True] * 10] * 5)
+    assert once.precision_interval() == (pytest.approx(0.722, abs=1e-3), 1.0)
+    assert often.precision_interval() == once.precision_interval()
+
+
+def test_wilson_interval():
+    low, high = wilson_interval(10, 10)
+    assert (low, high) == (pytest.approx(0.722, abs=1e-3), 1.0)
+    low, high = wilson_interval(5, 10)
+    assert (low, high) == (pytest.approx(0.237, abs=1e-3), pytest.approx(0.763, abs=1e-3))
 
 
 def test_summaries_keep_the_order_and_the_missing():
@@ -99,7 +121,9 @@ def test_the_table_marks_noise_and_cut_searches():
     assert rows[3][:3] == ('mine', '', '.00 / .00 / .00 ± .00')
     assert as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
     assert all(len(line) < 130 for line in as_text(rows).splitlines())
-    assert 'hybrid_bf' in notes([good, near])[1]
+    assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
+    assert 'not held out' in notes([good, near])[1]
+    assert 'hybrid_bf' in notes([good, near])[2]
 
 
 def test_csv_and_json_say_the_same():
@@ -107,6 +131,8 @@ def test_csv_and_json_say_the_same():
                for query, error in enumerate([0.1, 0.4, 3.0, None])]
     rows = list(csv.DictReader(io.StringIO(as_csv(summarize(results)))))
     assert float(rows[0]['success_0.5m']) == 0.5
+    bounds = [float(rows[0][f'precision_1m{end}']) for end in ('_low', '', '_high')]
+    assert 0.0 < bounds[0] < bounds[1] == 0.5 < bounds[2] < 1.0
     assert [row['error_m'] for row in json.loads(as_json(results))] == [0.1, 0.4, 3.0, None]
     assert len(as_json(results).splitlines()) == 6
 

@@ -29,7 +29,7 @@ def resolve(*within: str, **environment: str) -> tuple[list[str], str]:
     """Resolve the default cache in a process; return folder, mode and owner, and the log."""
     variables = {name: value for name, value in os.environ.items() if name != 'XDG_CACHE_HOME'}
     done = subprocess.run([*within, sys.executable, '-c', RESOLVE], cwd=PROJECT, text=True,
-                          env=variables | environment, capture_output=True, timeout=60,
+                          env=variables | environment, capture_output=True, timeout=300,
                           check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.split(), done.stderr

@@ -48,7 +48,7 @@ def run(script: str, cache: Path, *within: str, **environment: str) -> dict[str,
     done = subprocess.run(
         [*within, sys.executable, '-c', script, str(cache)], cwd=PROJECT, text=True,
         env={**os.environ, 'NO_PROXY': '127.0.0.1', **environment}, capture_output=True,
-        timeout=120, check=False)
+        timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -43,7 +43,7 @@ def run(folder, small_clip, script):
     weights.symlink_to(small_clip.file)
     done = subprocess.run(
         [*small_disk(disk), sys.executable, '-c', PRELUDE + script, str(disk), str(weights)],
-        cwd=PROJECT, capture_output=True, text=True, timeout=120, check=False)
+        cwd=PROJECT, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return done.stderr.splitlines()
 

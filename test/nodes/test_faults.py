@@ -125,6 +125,7 @@ def fast_frame():
     return at
 
 
+@pytest.mark.clock
 def test_a_fast_camera_leaves_no_backlog(own_relocalizer, tester, fast_frame):
     process = own_relocalizer(fresh=True, mode='continuous')
     latencies_s, memory_mib = [], []

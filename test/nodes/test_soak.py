@@ -177,6 +177,7 @@ def judge(request, witness):
     raise AssertionError(f'no pose was published for: {request.message}')
 
 
+@pytest.mark.clock
 def test_soak(start, ros, own_relocalizer, recording):
     process = own_relocalizer(fresh=True, image_transport='compressed')
     executor = SingleThreadedExecutor()

@@ -44,6 +44,7 @@ def test_stages_are_told_in_whole_milliseconds():
     assert str(times) == 'decoding 0 ms'
 
 
+@pytest.mark.clock
 def test_rates_survive_a_new_beginning(wait):
     rates = Rates()
     start = time.monotonic()

@@ -14,7 +14,6 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from std_srvs.srv import Empty
 
-from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
@@ -58,13 +57,13 @@ class Robot:
     def __init__(self, make_node, wait):
         self.node, self.wait = make_node('relocalizer'), wait
         self.localizer = Localizer(make_node('amcl'))
-        self.odometry = OdometrySource(self.node, CoordinateFrames(self.node))
+        self.odometry = OdometrySource(self.node)
         self.handoff = HandOff(self.node, self.odometry)
 
     def hand_over(self, timeout_s=10.0, **changes):
         """Hand a pose over; return how long it took [s]."""
         start = time.monotonic()
-        self.handoff.hand_over(make_pose(), VALUES | changes, start + timeout_s)
+        self.handoff.hand_over(make_pose(), VALUES | changes, start + timeout_s, start)
         return time.monotonic() - start
 
     def meet(self):
@@ -97,6 +96,7 @@ def test_a_localizer_that_is_there_gets_the_pose(robot):
     assert robot.localizer.poses[0].header == make_pose().header
 
 
+@pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld(robot):
     start = time.monotonic()
     with pytest.raises(NoLocalizerError, match=r'^nobody subscribes /initialpose: start the '
@@ -122,6 +122,7 @@ def test_a_robot_without_a_localizer_need_not_wait_for_one(robot):
     assert robot.hand_over(require_localizer=False) < 1.0
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('timeout_s', [0.3, 0.0, -1.0])
 def test_no_wait_goes_beyond_the_deadline(robot, timeout_s):
     start = time.monotonic()
@@ -179,10 +180,11 @@ def test_a_service_that_never_answers_costs_little_and_leaves_nothing(robot, tim
 def wheels(robot, make_node):
     """A publisher of odometry that has said nothing yet; the robot listens to it."""
     wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
-    with robot.odometry.listening():
-        robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
-                   'the wheels to be heard')
-        yield wheels
+    robot.odometry.open()
+    robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
+               'the wheels to be heard')
+    yield wheels
+    robot.odometry.close()
 
 
 def rest(wheels):
@@ -194,6 +196,7 @@ def rest(wheels):
         wheels.publish(odometry)
 
 
+@pytest.mark.clock
 def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
     robot.localizer.subscribe()
     robot.meet()
@@ -201,6 +204,38 @@ def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
     with pytest.raises(HandOffError, match='the robot may be moving'):
         robot.hand_over(0.3)
     assert time.monotonic() - start < 0.8
+    assert not robot.localizer.poses
+
+
+def test_after_the_deadline_odometry_of_late_will_do(robot, wheels):
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.wait(lambda: robot.odometry.speeds_by_poses(0.0) is not None, 'odometry',
+               lambda: rest(wheels))
+    assert robot.hand_over(-1.0) < 0.5
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+def test_without_time_to_see_it_rest_a_robot_is_not_taken_to_rest(robot, wheels):
+    """One message of odometry, whose twist many leave empty: it may be moving."""
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.wait(lambda: robot.odometry.recent(2.0, 0.1), 'odometry',
+               lambda: wheels.publish(Odometry()))
+    start = time.monotonic()
+    with pytest.raises(HandOffError, match='too little time'):
+        robot.hand_over(0.3)
+    assert time.monotonic() - start < 0.8
+    assert not robot.localizer.poses
+
+
+def test_a_jump_between_search_and_hand_over_withholds_the_pose(robot):
+    robot.localizer.subscribe()
+    robot.meet()
+    received_at = time.monotonic()
+    robot.handoff.forget()
+    with pytest.raises(TimeJumpError):
+        robot.handoff.hand_over(make_pose(), VALUES, received_at + 10.0, received_at)
     assert not robot.localizer.poses
 
 
@@ -213,7 +248,7 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
         robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
         robot.handoff.forget()
         rest(wheels)
-        with pytest.raises(TimeJumpError, match='during the hand-over'):
+        with pytest.raises(TimeJumpError, match='time jumped back before'):
             handing_over.result()
         assert not robot.localizer.poses
         handing_over = pool.submit(robot.hand_over)

@@ -98,6 +98,7 @@ def test_an_image_waits_for_the_message_after_it(robot, source):
     late.join()
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('moments', [[], [10.0], [12.0], [1.0]])
 def test_an_image_outside_of_odometry_costs_no_time(robot, source, moments):
     talk(source, *moments)
@@ -105,7 +106,7 @@ def test_an_image_outside_of_odometry_costs_no_time(robot, source, moments):
     assert place(robot, 10.3) is None
     assert time.monotonic() - start < 0.5
     assert source.covers_soon(stamp(10.3), 0.1) == (moments in ([10.0], [12.0]))
-    newest = source.recent(5.0)
+    newest = source.recent(5.0, 5.0)
     assert (newest.header.stamp == stamp(moments[-1])) if moments else newest is None
 
 
@@ -129,7 +130,7 @@ def test_an_invalid_message_changes_nothing(robot, source):
     np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
     assert place(robot, 10.05).run == first.run
-    assert source.recent(1.0).header.stamp == stamp(10.1)
+    assert source.recent(1.0, 1.0).header.stamp == stamp(10.1)
 
 
 def test_it_subscribes_while_it_is_open(make_node, spin_until):
@@ -143,7 +144,7 @@ def test_it_subscribes_while_it_is_open(make_node, spin_until):
     assert publisher.get_subscription_count() == 1
     source.close()
     spin_until([], lambda: publisher.get_subscription_count() == 0, 'the subscription to end')
-    assert source.recent(0.0) is None
+    assert source.recent(0.0, 0.0) is None
     talk(source, 10.0)
     assert place(robot, 10.0).run != run, 'the robot may have moved in between'
 
@@ -153,9 +154,10 @@ def test_poses_give_the_speed_where_the_twist_is_empty(source):
     assert source.speeds_by_poses(1.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize('moments', [[], [10.0], [9.9, 10.0], [9.0, 10.0]])
 def test_too_few_poses_give_no_speed(source, moments):
     talk(source, *moments)
     start = time.monotonic()
-    assert source.speeds_by_poses(0.2) == (0.0, 0.0)
+    assert source.speeds_by_poses(0.2) is None
     assert time.monotonic() - start < 1.0

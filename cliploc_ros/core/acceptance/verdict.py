@@ -109,8 +109,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
         return ''
     compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
     if evidence.likely >= options.min_confidence:
-        return (f'{compared}; the search met this pose only {evidence.meetings:g} times in '
-                f'{evidence.tried} samples; raise iterations or set algorithm to auto')
+        return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
+                'samples; raise iterations or set algorithm to auto')
     # the rival holds most of the missing probability, or is likelier than the best score
     if evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely)):
         return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}; '

@@ -60,10 +60,14 @@ class Inliers(NamedTuple):
         See residuals_of.
     starts : ndarray (F + 1,)
         Where each frame's begin.
+    cameras, verticals : ndarray (F, 3, 4), (F, 7)
+        Of the rig.
     """
 
     pairs: NDArray[np.float64]
     starts: NDArray[np.int64]
+    cameras: NDArray[np.float64]
+    verticals: NDArray[np.float64]
 
 
 @compiled
@@ -84,7 +88,7 @@ def refine_rig(rig, rotation, translation):
         inliers = one_to_one(rig, found)
         if len(inliers.pairs) < least:
             break
-        new_rotation, new_translation = _minimize(rig, inliers, rotation, translation)
+        new_rotation, new_translation = _minimize(inliers, rotation, translation)
         new = verify_rig(rig, new_rotation, new_translation)
         if new.score < LEAST_SHARE * best_score:
             break
@@ -96,9 +100,9 @@ def refine_rig(rig, rotation, translation):
     inliers = one_to_one(rig, found)
     information = np.zeros((6, 6))
     if len(inliers.pairs) >= least:
-        in_front, residuals = residuals_of_rig(rig, inliers, rotation, translation)
+        in_front, residuals = residuals_of_rig(inliers, rotation, translation)
         if in_front:
-            information, _ = linearize_rig(rig, inliers, rotation, translation, residuals)
+            information, _ = linearize_rig(inliers, rotation, translation, residuals)
     return Refined(rotation, translation, found.score, information)
 
 
@@ -122,7 +126,7 @@ def one_to_one(rig, found):
                 pairs[count, 7 + column] = scene.shapes[landmark, column]
             count += 1
         starts[frame + 1] = count
-    return Inliers(pairs[:count], starts)
+    return Inliers(pairs[:count], starts, rig.cameras, rig.verticals)
 
 
 @compiled
@@ -139,14 +143,14 @@ def _best_detection(found, detection, first, last):
 
 
 @compiled
-def residuals_of_rig(rig, inliers, rotation, translation):
+def residuals_of_rig(inliers, rotation, translation):
     """Return whether all landmarks are in front of their cameras, and all frames' residuals."""
-    starts = inliers.starts
-    residuals = np.empty(4 * len(inliers.pairs) + 3 * len(rig.cameras))
-    for frame in range(len(rig.cameras)):
-        own_rotation, own_translation = camera_pose(rig, frame, rotation, translation)
+    pairs, starts, cameras, verticals = inliers
+    residuals = np.empty(4 * len(pairs) + 3 * len(cameras))
+    for frame in range(len(cameras)):
+        own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)
         first, last = starts[frame], starts[frame + 1]
-        if not residuals_of(inliers.pairs[first:last], rig.verticals[frame], own_rotation,
+        if not residuals_of(pairs[first:last], verticals[frame], own_rotation,
                             own_translation,
                             residuals[4 * first + 3 * frame:4 * last + 3 * frame + 3]):
             return False, residuals
@@ -154,15 +158,15 @@ def residuals_of_rig(rig, inliers, rotation, translation):
 
 
 @compiled
-def linearize_rig(rig, inliers, rotation, translation, residuals):
+def linearize_rig(inliers, rotation, translation, residuals):
     """Return information and gradient of all frames, in steps of the reference."""
-    starts = inliers.starts
+    pairs, starts, cameras, verticals = inliers
     information, gradient = np.zeros((6, 6)), np.zeros(6)
-    for frame in range(len(rig.cameras)):
-        own_rotation, own_translation = camera_pose(rig, frame, rotation, translation)
+    for frame in range(len(cameras)):
+        own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)
         first, last = starts[frame], starts[frame + 1]
         own_information, own_gradient = linearize(
-            inliers.pairs[first:last], rig.verticals[frame], own_rotation, own_translation,
+            pairs[first:last], verticals[frame], own_rotation, own_translation,
             residuals[4 * first + 3 * frame:4 * last + 3 * frame + 3])
         lever = np.zeros(3)
         for axis in range(3):
@@ -194,15 +198,15 @@ def _move_to_reference(lever, information, gradient):
 
 
 @compiled
-def _minimize(rig, inliers, rotation, translation):
+def _minimize(inliers, rotation, translation):
     """Return the pose of least robust sum of squares (Levenberg-Marquardt)."""
     step, damping = np.zeros(6), _FIRST_DAMPING
-    in_front, residuals = residuals_of_rig(rig, inliers, rotation, translation)
+    in_front, residuals = residuals_of_rig(inliers, rotation, translation)
     if not in_front:
         return rotation, translation
     cost = robust_cost(residuals)
     for _ in range(_STEPS):
-        information, gradient = linearize_rig(rig, inliers, rotation, translation, residuals)
+        information, gradient = linearize_rig(inliers, rotation, translation, residuals)
         improved, new_cost = False, cost
         for _ in range(_TRIALS):
             damped = information.copy()
@@ -214,8 +218,7 @@ def _minimize(rig, inliers, rotation, translation):
                 damping = 10.0 * damping
                 continue
             new_rotation, new_translation = move(rotation, translation, step)
-            in_front, new_residuals = residuals_of_rig(rig, inliers, new_rotation,
-                                                       new_translation)
+            in_front, new_residuals = residuals_of_rig(inliers, new_rotation, new_translation)
             if in_front:
                 new_cost = robust_cost(new_residuals)
                 if new_cost < cost:

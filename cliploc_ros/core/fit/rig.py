@@ -118,9 +118,8 @@ def scene_of(rig, frame):
 
 
 @compiled
-def camera_pose(rig, frame, rotation, translation):
-    """Return camera_from_map of one frame (3, 3), (3,) at a pose of the reference."""
-    camera = rig.cameras[frame]
+def camera_pose(camera, rotation, translation):
+    """Return camera_from_map (3, 3), (3,) of a camera (3, 4) at a pose of the reference."""
     own_rotation, own_translation = np.empty((3, 3)), np.empty(3)
     for i in range(3):
         for j in range(3):

@@ -48,7 +48,7 @@ def verify_rig(rig, rotation, translation):
     landmarks = np.full(starts[-1], -1)
     score = 0.0
     for frame in range(len(rig.cameras)):
-        own_rotation, own_translation = camera_pose(rig, frame, rotation, translation)
+        own_rotation, own_translation = camera_pose(rig.cameras[frame], rotation, translation)
         first, last = starts[frame], starts[frame + 1]
         score += _verify(scene_of(rig, frame), own_rotation, own_translation, ious[first:last],
                          landmarks[first:last])
@@ -58,13 +58,15 @@ def verify_rig(rig, rotation, translation):
 @compiled
 def _verify(scene, rotation, translation, ious, landmarks):
     """Write each detection's landmark and its IoU; return the score of the frame."""
-    potential = scene.potential
+    boxes, potential = scene.box_ellipses, scene.potential
     for u in range(potential.landmarks.shape[0]):
-        detections = potential.detections[potential.starts[u]:potential.starts[u + 1]]
-        _compare(scene, potential.landmarks[u], detections, rotation, translation, ious,
-                 landmarks)
+        landmark = potential.landmarks[u]
+        outline = project_ellipsoid(rotation, translation, scene.centers[landmark],
+                                    scene.shapes[landmark])
+        _offer(boxes, potential.detections[potential.starts[u]:potential.starts[u + 1]],
+               landmark, outline, ious, landmarks)
     if scene.groups.members.shape[0] > 0:
-        _compare_groups(scene, rotation, translation, ious, landmarks)
+        _offer_groups(scene, rotation, translation, ious, landmarks)
     score = 0.0
     for detection in range(ious.shape[0]):
         if landmarks[detection] < 0:
@@ -74,28 +76,29 @@ def _verify(scene, rotation, translation, ious, landmarks):
 
 
 @compiled
-def _compare_groups(scene, rotation, translation, ious, landmarks):
-    """Compare detections with the landmarks of their class that the pose may see."""
-    groups = scene.groups
+def _offer_groups(scene, rotation, translation, ious, landmarks):
+    """Offer detections the landmarks of their class that the pose may see."""
+    boxes, groups, numbers = scene.box_ellipses, scene.groups, scene.sorted_landmarks.numbers
     visible = np.empty((2, groups.members.shape[0]), dtype=np.int64)
     pose = Poses(rotation.reshape(1, 3, 3), translation.reshape(1, 3))
     for place in range(visible_members(groups, pose, ZERO, visible)):
         row, group = groups.members[visible[0, place], 0], groups.members[visible[0, place], 1]
-        detections = groups.detections[groups.starts[group]:groups.starts[group + 1]]
-        _compare(scene, scene.sorted_landmarks.numbers[row], detections, rotation, translation,
-                 ious, landmarks)
+        outline = project_ellipsoid(rotation, translation, scene.centers[numbers[row]],
+                                    scene.shapes[numbers[row]])
+        _offer(boxes, groups.detections[groups.starts[group]:groups.starts[group + 1]],
+               numbers[row], outline, ious, landmarks)
 
 
 @compiled
-def _compare(scene, landmark, detections, rotation, translation, ious, landmarks):
-    """Give a landmark to those detections that overlap it more than what they have."""
-    in_front, cx, cy, exx, exy, eyy = project_ellipsoid(
-        rotation, translation, scene.centers[landmark], scene.shapes[landmark])
+def _offer(boxes, detections, landmark, outline, ious, landmarks):
+    """Offer a landmark to some detections: they take it if it overlaps them more than theirs."""
+    in_front, cx, cy, exx, exy, eyy = outline
     if not in_front:
         return
     half_x, half_y, axes = sqrt(exx), sqrt(eyy), sqrt(max(0.0, exx * eyy - exy * exy))
     for detection in detections:
-        u, v, half_width, half_height = scene.box_ellipses[detection]
+        u, v = boxes[detection, 0], boxes[detection, 1]
+        half_width, half_height = boxes[detection, 2], boxes[detection, 3]
         if iou_bound(u, v, half_width, half_height, cx, cy, half_x, half_y,
                      axes) <= ious[detection]:
             continue

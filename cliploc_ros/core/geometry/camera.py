@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The camera: intrinsics, distortion, and the way from its pixels to the normalized plane."""
+"""The camera: intrinsics, distortion, and the projection between pixels and the plane z = 1."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _COEFFICIENT_COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14),
                        'equidistant': (4,)}
 _NEWTON_STEPS = 20
 _NEWTON_DIFFERENCE = 1e-6
-# Where redistorting misses a pixel by more than this, the model cannot be inverted there.
+# A larger error after undistorting and distorting again means that the model has no inverse.
 _MAX_ROUND_TRIP_PX = 0.1
 
 
@@ -88,20 +88,20 @@ class Camera:
         if not any(self.distortion) or len(points_px) == 0:
             return normalized
         if self.distortion_model == 'equidistant':
-            # starts where a fisheye lens bends most: tan of the angle, short of 90 degrees
+            # invert an ideal fisheye first: the tangent of the angle, limited below 90 degrees
             angle = np.minimum(np.linalg.norm(normalized, axis=1, keepdims=True), 1.5)
             normalized *= np.tan(angle) / np.maximum(angle, 1e-12)
         with np.errstate(all='ignore'):
             for _ in range(_NEWTON_STEPS):
                 normalized -= self._newton_step(normalized, points_px)
             missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
-            # Beyond the fold of a lens model there are roots that no ray has.
+            # Beyond its fold, a lens model has roots that belong to no ray.
             sound = (missed <= _MAX_ROUND_TRIP_PX) & self._keeps_sides(normalized)
         normalized[~sound] = np.nan
         return normalized
 
     def _keeps_sides(self, normalized: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which points (n, 2) the lens neither mirrors nor moves across the middle."""
+        """Return which points (n, 2) the lens neither mirrors nor moves across the centre."""
         projected, along_x, along_y = self._linearized(normalized)
         determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
         distorted = (projected - (self.cx, self.cy)) / (self.fx, self.fy)
@@ -109,7 +109,7 @@ class Camera:
         return (determinant > 0) & (np.sum(normalized * distorted, axis=1) >= 0.01 * square)
 
     def _linearized(self, normalized: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return pixels (n, 2) of points (n, 2), and how they move with each coordinate."""
+        """Return the pixels (n, 2) of points (n, 2) and their derivatives by x and y."""
         projected = self.project_normalized(normalized)
         along_x, along_y = (
             (self.project_normalized(normalized + step) - projected) / _NEWTON_DIFFERENCE
@@ -118,7 +118,7 @@ class Camera:
 
     def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
                      ) -> NDArray[np.float64]:
-        """Return by how much points (n, 2) overshoot those that project to given pixels."""
+        """Return the Newton step (n, 2) to subtract from points that should project to pixels."""
         projected, along_x, along_y = self._linearized(normalized)
         missed = projected - points_px
         determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
@@ -143,7 +143,7 @@ class Camera:
     def normalize_bboxes(self, bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return boxes (n, 4) [px] as undistorted boxes (n, 4) of the plane z = 1.
 
-        Each edge goes where its midpoint goes: there the ellipse inscribed in the box touches.
+        The midpoint of each edge, where the inscribed ellipse touches, decides where it goes.
         """
         bboxes_xyxy = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4)
         left, top, right, bottom = bboxes_xyxy.T

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The largest real root of a cubic: what both conic pencils here (P3P, overlap) come down to."""
+"""The largest real root of a cubic, which both conic pencils need (P3P and overlap)."""
 
 from math import acos, copysign, cos, sqrt
 
@@ -27,16 +27,16 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
         cosine = min(1.0, max(-1.0, -0.5 * q / (radius * radius * radius)))
         root = 2.0 * radius * cos(acos(cosine) / 3.0) - shift
     else:
-        # The cube root of larger magnitude first: the other follows without cancellation.
+        # Start with the cube root of larger magnitude: the other follows without cancellation.
         u = np.cbrt(-0.5 * q - copysign(sqrt(discriminant), q))
         depressed = u - p / (3.0 * u) if u != 0.0 else 0.0
         if depressed < 0.0 and discriminant <= _DOUBLE_ROOT * q * q:
-            depressed *= -0.5  # the other two coincide, but for rounding, and are larger
+            depressed *= -0.5  # the other two roots coincide, up to rounding, and are larger
         root = depressed - shift
     for _ in range(2):
         value = ((root + c2) * root + c1) * root + c0
         terms = ((abs(root) + abs(c2)) * abs(root) + abs(c1)) * abs(root) + abs(c0)
         if abs(value) <= _ROUNDING * terms:
-            break  # at a double root a further step would go anywhere
+            break  # near a double root, the next step would be arbitrary
         root -= value / ((3.0 * root + 2.0 * c2) * root + c1)
     return root

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Overlap of two ellipses, exactly.
+"""The exact overlap of two ellipses.
 
-A conic pencil makes it a matter of one cubic. Scale the plane so that the first ellipse is the
+A conic pencil reduces it to one cubic. Scale the plane so that the first ellipse is the
 unit circle and turn it so that the second is parallel to the axes: then
 
     x^2 + y^2 = 1   and   a (x - h)^2 + b (y - k)^2 = 1,   a <= b.
 
 Among the conics (second) + lambda (first) the one with the largest root lambda in [-b, -a] of
-its determinant is a pair of real lines, and these carry the common points of both outlines, in
-pairs that do not cross. Each line cuts a cap off both ellipses, one cap inside the other, and
-the area shared is one whole ellipse less the difference of the caps.
+its determinant is a pair of real lines through the common points of both outlines, in pairs that
+do not cross. Each line cuts a cap off both ellipses, one cap inside the other. The shared area is
+one whole ellipse minus the difference of the caps.
 """
 
 from math import acos, copysign, pi, sqrt
@@ -18,8 +18,8 @@ from math import acos, copysign, pi, sqrt
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.cubic import largest_cubic_root
 
-# Two semi-axes closer than this (relative, squared) are treated as this far apart: the pencil of
-# two circles holds no pair of finite lines. The area changes by less than 1e-9 of itself.
+# The least relative difference of the squared semi-axes: the pencil of two circles has no pair of
+# finite lines. The area changes by less than 1e-9 of itself.
 _MIN_ELONGATION = 1e-9
 # An upper bound is raised by this, more than rounding can raise an IoU or a sum of them.
 _ROUNDING = 1e-9
@@ -56,8 +56,8 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     if root > -a:
         root = _root_between(a, b, c, ah2, bk2)
     root = min(-a, max(-b, root))
-    # The pair of lines: (r y - s x + e1)(r y + s x + e2) = 0. The larger of r and s is safe to
-    # divide by; what belongs to the smaller follows from the product e1 e2 = c - lambda.
+    # The pair of lines: (r y - s x + e1)(r y + s x + e2) = 0. Divide by the larger of r and s; the
+    # other term follows from the product e1 e2 = c - lambda.
     s, r = sqrt(-a - root), sqrt(b + root)
     if r >= s:
         total = -2.0 * b * k / r
@@ -73,13 +73,13 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     cuts1, cuts2 = abs(e1) < 1.0, abs(e2) < 1.0
     if not (cuts1 or cuts2):
         return _nested_or_apart(h, k, a, b, ellipse_area)
-    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. Of
-    # two lines that fall together (both outlines touch twice) one looks to either side.
+    # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. If
+    # both lines coincide (the outlines touch twice), one looks to each side.
     along = r * r - s * s
     side1, side2 = e1 - e2 * along, e2 - e1 * along
     sign1 = 1.0 if not cuts2 or side1 <= 0.0 else -1.0
     sign2 = 1.0 if not cuts1 or side2 < 0.0 or (side2 == 0.0 and along < 0.0) else -1.0
-    # caps of the disc less those of the ellipse, one inside the other on every line
+    # caps of the disc minus those of the ellipse, one inside the other on every line
     surplus = 0.0
     width = sqrt(s * s * p * p + r * r * q * q)
     if cuts1:
@@ -88,7 +88,7 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     if cuts2:
         surplus += _cap_area(-sign2 * e2)
         surplus -= p * q * _cap_area(-sign2 * (r * k + s * h + e2) / width)
-    # Where one lies in the other and touches it, the caps tell nothing: it is the smaller one.
+    # If one ellipse touches the other from inside, the caps cancel: the smaller area is shared.
     shared = ellipse_area + surplus if surplus < 0.0 else pi - surplus
     return max(0.0, min(pi, ellipse_area, shared))
 
@@ -109,7 +109,7 @@ def _root_between(a: float, b: float, c: float, ah2: float, bk2: float) -> float
 
 @compiled
 def _nested_or_apart(h: float, k: float, a: float, b: float, ellipse_area: float) -> float:
-    """Return the area shared by two outlines without a common point."""
+    """Return the area shared by the unit disc and an ellipse whose outlines do not meet."""
     if ellipse_area < pi:
         return ellipse_area if h * h + k * k < 1.0 else 0.0
     return pi if a * h * h + b * k * k < 1.0 else 0.0

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ellipsoids and their outlines in the image.
 
-The outline of an ellipsoid is an ellipse, exactly, and dual quadrics make it a product: with
-Q* = [S + c c^T, c; c^T, 1] up to sign, P Q* P^T is the outline's dual conic (Rubino, Crocco and
-Del Bue, "3D Object Localisation from Multi-view Image Detections", PAMI 2018).
+The outline of an ellipsoid is an ellipse. With the dual quadric Q* = [S + c c^T, c; c^T, 1] up to
+sign, P Q* P^T is the outline's dual conic (Rubino, Crocco and Del Bue, "3D Object Localisation
+from Multi-view Image Detections", PAMI 2018).
 
-A shape matrix S = R diag(a^2, b^2, c^2) R^T stands here as its upper triangle
-(xx, xy, xz, yy, yz, zz); an ellipse as centre and the upper triangle of
-E in (x - c)^T E^-1 (x - c) <= 1.
+A shape matrix S = R diag(a^2, b^2, c^2) R^T is stored as its upper triangle
+(xx, xy, xz, yy, yz, zz), an ellipse as its centre c and the upper triangle of E in
+(x - c)^T E^-1 (x - c) <= 1.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def project_ellipsoid(rotation, translation, center, shape):
     z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + translation[2]
     if not z > 0.0:
         return False, 0.0, 0.0, 0.0, 0.0, 0.0
-    # column of S for the optical axis: its product with each row of R is a row of R S R^T
+    # S times the optical axis; its products with the rows of R are a row of R S R^T
     z0 = sxx * r[2, 0] + sxy * r[2, 1] + sxz * r[2, 2]
     z1 = sxy * r[2, 0] + syy * r[2, 1] + syz * r[2, 2]
     z2 = sxz * r[2, 0] + syz * r[2, 1] + szz * r[2, 2]
@@ -117,7 +117,7 @@ def project_ellipsoids(camera_from_map: NDArray[np.float64], centers: NDArray[np
 
 
 def ellipse_bboxes(ellipses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the boxes x, y, x, y (n, 4) that just hold ellipses (n, 5)."""
+    """Return the bounding boxes x, y, x, y (n, 4) of ellipses (n, 5)."""
     half = np.sqrt(ellipses[:, [2, 4]])
     return np.concatenate([ellipses[:, :2] - half, ellipses[:, :2] + half], axis=1)
 

@@ -20,7 +20,7 @@ from cliploc_ros.core.geometry.cubic import largest_cubic_root
 
 MAX_SOLUTIONS = 4
 _NEWTON_STEPS = 3
-# Triangles or bearings whose normalized cross products fall below this are degenerate.
+# Triangles whose normalized cross product is below this are degenerate.
 _MIN_SINE = 1e-9
 
 
@@ -51,7 +51,7 @@ def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
 
 @compiled
 def p3p(bearings, points, rotations, translations):
-    """Write up to four poses into the two arrays; return how many (see solve_p3p)."""
+    """Write up to four poses into the two arrays; return their number (see solve_p3p)."""
     m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
     a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
                      _squared_distance(points, 1, 2))
@@ -113,7 +113,7 @@ def _cofactors(c):
 
 @compiled
 def _degenerate_lines(first, second):
-    """Split a degenerate conic of the pencil into two lines; False when they are not real."""
+    """Split a degenerate conic of the pencil into two lines; False if they are not real."""
     # det(first + g second) is a cubic in g with these coefficients (mixed determinants)
     adj1, adj2 = _cofactors(first), _cofactors(second)
     det1 = first[0] * adj1[0] + first[1] * adj1[1] + first[2] * adj1[2]
@@ -123,7 +123,7 @@ def _degenerate_lines(first, second):
     mixed2 = (adj2[0] * first[0] + adj2[3] * first[3] + adj2[5] * first[5]
               + 2.0 * (adj2[1] * first[1] + adj2[2] * first[2] + adj2[4] * first[4]))
     nowhere = (0.0, 0.0, 0.0)
-    # Dividing by the larger end of the cubic keeps the root finite: g or 1 / g is sought.
+    # Divide by the larger of both end coefficients, so that the root, g or 1 / g, is finite.
     if abs(det2) >= abs(det1):
         if det2 == 0.0:
             return nowhere, nowhere, False
@@ -186,7 +186,7 @@ def _meet_line_and_conic(line, c):
     quadratic, half, constant = _bilinear(c, u, u), _bilinear(c, u, v), _bilinear(c, v, v)
     discriminant = half * half - quadratic * constant
     if discriminant < 0.0:
-        # A double root that rounding made complex is one pose; a truly complex one is none.
+        # Rounding may make a double root complex; it still is one pose.
         if discriminant < -1e-12 * (half * half + abs(quadratic * constant)):
             return 0, u, v
         discriminant = 0.0
@@ -206,7 +206,7 @@ def _bilinear(c, u, v):
 
 @compiled
 def _combine(s, u, t, v):
-    """Return s u + t v, turned so that its components are positive where they can be."""
+    """Return s u + t v with the sign that makes the sum of its components positive."""
     x, y, z = s * u[0] + t * v[0], s * u[1] + t * v[1], s * u[2] + t * v[2]
     if x + y + z < 0.0:
         return -x, -y, -z
@@ -258,7 +258,7 @@ def _inverse_triangle_frame(points):
 
 @compiled
 def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translations, which):
-    """Write camera_from_map: the rotation carries the map's triangle into the camera's."""
+    """Write camera_from_map: its rotation maps the map's triangle to the camera's."""
     y0, y1, y2 = d1 * bearings[0, 0], d1 * bearings[0, 1], d1 * bearings[0, 2]
     u0, u1, u2 = (y0 - d2 * bearings[1, 0], y1 - d2 * bearings[1, 1], y2 - d2 * bearings[1, 2])
     v0, v1, v2 = (y0 - d3 * bearings[2, 0], y1 - d3 * bearings[2, 1], y2 - d3 * bearings[2, 2])

@@ -23,7 +23,7 @@ def invert_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
-    """Tell whether an array is a rotation and a translation (4, 4), all of it finite."""
+    """Return whether an array is a finite rigid transform (4, 4)."""
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         return False
     rotation = transform[:3, :3]
@@ -50,7 +50,7 @@ def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
 
 
 def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float]:
-    """Return how far two poses (4, 4) lie apart: distance [m], angle [deg]."""
+    """Return the distance [m] and the angle [deg] between two poses (4, 4)."""
     distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
     return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
 

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of a camera from two points, where the vertical is known.
 
-The vertical leaves a rotation about itself and a translation. In frames whose third axis is up,
-camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw) (X2 - X1)``, with depths d along the
-bearings b. Its third row and its length in the plane do not know the yaw,
+The vertical leaves a rotation about itself and a translation unknown. In coordinate frames whose
+third axis is up, camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw) (X2 - X1)``, with
+depths d along the bearings b. The third row and the length do not depend on the yaw:
 
-    d2 b2z - d1 b1z = Dz   and   |d2 b2 - d1 b1|^2 = |D|^2,
+    d2 b2z - d1 b1z = Dz   and   |d2 b2 - d1 b1|^2 = |D|^2.
 
-a line and a conic, which share up to two points; the yaw and the translation follow (after
+These are a line and a conic, which share up to two points; yaw and translation follow (after
 Kukelova, Bujnak and Pajdla, "Closed-form Solutions to Minimal Absolute Pose Problems with Known
 Vertical Direction", ACCV 2010).
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.compiled import ZERO, compiled
 
 MAX_TWO_POINT_SOLUTIONS = 2
-# Below this, relative, two points are one, a bearing is level, or a baseline is vertical.
+# Relative limit below which a baseline is vertical or bearings are level.
 _MIN_SINE = 1e-9
 _ROUNDING = 1e-12
 
@@ -29,7 +29,7 @@ _ROUNDING = 1e-12
 def solve_two_point(bearings: NDArray[np.float64], points: NDArray[np.float64],
                     up_in_camera: NDArray[np.float64], up_in_map: NDArray[np.float64]
                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses from which two points are seen along two bearings, upright.
+    """Return the poses with a known vertical from which two points are seen along two bearings.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ def solve_two_point(bearings: NDArray[np.float64], points: NDArray[np.float64],
 
 @compiled
 def two_point(bearings, points, verticals, rotations, translations):
-    """Write up to two poses into the two arrays; return how many (see solve_two_point).
+    """Write up to two poses into the two arrays; return their number (see solve_two_point).
 
-    The first six of the verticals are up in the camera and up in the map.
+    The first six values of verticals are up in the camera and up in the map.
     """
     b10, b11, b12 = bearings[0, 0], bearings[0, 1], bearings[0, 2]
     b20, b21, b22 = bearings[1, 0], bearings[1, 1], bearings[1, 2]
@@ -72,21 +72,21 @@ def two_point(bearings, points, verticals, rotations, translations):
     height = e0 * w0 + e1 * w1 + e2 * w2
     level_square = square - height * height
     if not level_square > _MIN_SINE * square:
-        return 0  # one above the other: any yaw will do
+        return 0  # one point is above the other: the yaw is free
     rise1 = b10 * u0 + b11 * u1 + b12 * u2
     rise2 = b20 * u0 + b21 * u1 + b22 * u2
     cosine = b10 * b20 + b11 * b21 + b12 * b22
-    # The line d2 rise2 - d1 rise1 = height, as d = base + s direction, base its nearest to zero;
-    # the conic d1^2 + d2^2 - 2 d1 d2 cosine = square is a quadratic in s.
+    # The line d2 rise2 - d1 rise1 = height as d = base + s direction, with base its point nearest
+    # to zero. The conic d1^2 + d2^2 - 2 d1 d2 cosine = square is a quadratic in s.
     steepness = rise1 * rise1 + rise2 * rise2
     if not steepness > _MIN_SINE * _MIN_SINE:
-        return 0  # both at the height of the camera: how far they are apart says all but depth
+        return 0  # both points are level with the camera: the depths are free
     base1, base2 = -rise1 * height / steepness, rise2 * height / steepness
     quadratic = steepness - 2.0 * rise1 * rise2 * cosine
     half = base1 * rise2 + base2 * rise1 - cosine * (base1 * rise1 + base2 * rise2)
     constant = base1 * base1 + base2 * base2 - 2.0 * base1 * base2 * cosine - square
     discriminant = half * half - quadratic * constant
-    # A double root that rounding made complex is one pose; a truly complex one is none.
+    # Rounding may make a double root complex; it still is one pose.
     if not (discriminant >= -_ROUNDING * (half * half + abs(quadratic * constant))
             and quadratic > 0.0):
         return 0
@@ -100,8 +100,8 @@ def two_point(bearings, points, verticals, rotations, translations):
         d1, d2 = base1 + s * rise2, base2 + s * rise1
         if d1 > 0.0 and d2 > 0.0:
             f0, f1, f2 = d2 * b20 - d1 * b10, d2 * b21 - d1 * b11, d2 * b22 - d1 * b12
-            if _upright_rotation(e0, e1, e2, f0, f1, f2, u0, u1, u2, w0, w1, w2, rotations,
-                                 count):
+            if _upright_rotation((e0, e1, e2), (f0, f1, f2), (u0, u1, u2), (w0, w1, w2),
+                                 rotations, count):
                 for row in range(3):
                     translations[count, row] = d1 * bearings[0, row] - (
                         rotations[count, row, 0] * points[0, 0]
@@ -112,9 +112,13 @@ def two_point(bearings, points, verticals, rotations, translations):
 
 
 @compiled
-def _upright_rotation(e0, e1, e2, f0, f1, f2, u0, u1, u2, w0, w1, w2, rotations, which):
-    """Write the rotation that carries the vertical w to u and e to f, of equal heights."""
-    # along: the level part; across: up x along. Both frames are right-handed, (along, across, up).
+def _upright_rotation(e, f, u, w, rotations, which):
+    """Write the rotation that maps the vertical w to u, and e to f, which have equal heights."""
+    e0, e1, e2 = e
+    f0, f1, f2 = f
+    u0, u1, u2 = u
+    w0, w1, w2 = w
+    # a and g are the level parts of e and f; c and h are up x level part
     height = e0 * w0 + e1 * w1 + e2 * w2
     a0, a1, a2 = e0 - height * w0, e1 - height * w1, e2 - height * w2
     length = sqrt(a0 * a0 + a1 * a1 + a2 * a2)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How alike crops and labels are, for maps of any size: never more than a block of it at once.
+"""Similarities of crops and labels for maps of any size, a block of labels at a time.
 
-A label that many landmarks share is kept and compared once. With U different labels of d numbers,
-L landmarks and n crops the memory is 4 U d + 8 L bytes for as long as the map is loaded, and
-about 0.6 MB for 12 crops, whatever the map, while they are compared: 1,000 labels of ViT-L-14
-(d = 768) take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB.
+A label that several landmarks share is stored and compared once. U different labels of d numbers
+and L landmarks take 4 U d + 8 L bytes as long as the map is loaded: with ViT-L-14 (d = 768), 1,000
+labels take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB. Comparing 12 crops takes 0.6 MB
+more, whatever the map.
 """
 
 from collections.abc import Iterator
@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import OptionsError
 
-# Labels compared at once: a block stays in the processor's cache, between product and selection.
+# Labels compared at once: a block stays in the processor's cache from product to selection.
 _BLOCK = 2048
 
 
 @dataclass(frozen=True)
 class LabelEmbeddings:
-    """The embeddings of a map's labels, each different label once. An array (L, d) to NumPy.
+    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d).
 
     Parameters
     ----------
     unique : ndarray (U, d) float32
         Unit rows, one for each different label.
     of_landmarks : ndarray (L,) of int
-        The row of each landmark's label; every row is some landmark's.
+        The row of each landmark's label. Every row belongs to a landmark.
     """
 
     unique: NDArray[np.float32]
@@ -39,19 +39,19 @@ class LabelEmbeddings:
 
     @staticmethod
     def of(embeddings: 'LabelEmbeddings | NDArray[np.float32]') -> 'LabelEmbeddings':
-        """Return embeddings (L, d), one for each landmark, as if all labels differed."""
+        """Return label embeddings from an array (L, d), one row for each landmark."""
         if isinstance(embeddings, LabelEmbeddings):
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the number of landmarks, and of an embedding's numbers."""
+        """Return the number of landmarks and the length of an embedding."""
         return len(self.of_landmarks), self.unique.shape[1]
 
     @cached_property
     def landmarks(self) -> NDArray[np.int64]:
-        """Return the landmarks (L,), those of one label together, in the map's order."""
+        """Return the landmarks (L,) grouped by label, in the map's order within a label."""
         return np.argsort(self.of_landmarks, kind='stable')
 
     @cached_property
@@ -67,9 +67,9 @@ class LabelEmbeddings:
 
 @dataclass(frozen=True)
 class CropSimilarities:
-    """Cosine similarities of crops and landmarks, computed when they are asked for.
+    """Cosine similarities of crops and landmarks, computed when needed.
 
-    An array (n, L) to NumPy.
+    NumPy sees an array (n, L).
 
     Parameters
     ----------
@@ -97,9 +97,9 @@ Similarities = NDArray[np.float32] | CropSimilarities
 
 def nearest_landmarks(similarities: Similarities, k: int
                       ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k landmarks (n, k) most similar to each crop, best first, and how similar.
+    """Return the k landmarks (n, k) most similar to each crop, best first, and their similarities.
 
-    Of equally similar ones those that the map has first.
+    Equal similarities keep the map's order.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _label_blocks(similarities: CropSimilarities) -> Iterator[tuple[int, NDArray
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
                      ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k greatest of each row (count, k), as columns and values, best first."""
+    """Return columns and values (count, k) of the k greatest of each row, best first."""
     columns = np.empty((count, 0), dtype=np.int64)
     values = np.empty((count, 0), dtype=np.float32)
     for start, block in blocks:
@@ -151,13 +151,13 @@ def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: i
 
 
 def _greatest(block: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-    """Return the columns of each row's k greatest values, in no order; of equals the first."""
+    """Return the columns of each row's k greatest values, unordered; of equals, the first."""
     count, width = block.shape
     if k >= width:
         return np.tile(np.arange(width), (count, 1))
     chosen = np.argpartition(block, width - k, axis=1)[:, width - k:]
     least = np.take_along_axis(block, chosen, axis=1).min(axis=1, keepdims=True)
-    # partitions take any of equals
+    # a partition takes any of equal values
     for row in np.nonzero((block >= least).sum(axis=1) > k)[0]:
         chosen[row] = np.argsort(-block[row], kind='stable')[:k]
     return chosen
@@ -165,7 +165,7 @@ def _greatest(block: NDArray[np.float32], k: int) -> NDArray[np.int64]:
 
 def _best(columns: NDArray[np.int64], values: NDArray[np.float32], k: int
           ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k best of each row, best first, and of equals the lower column first."""
+    """Return the k best of each row, best first; of equals, the lower column first."""
     order = np.lexsort((columns, -values), axis=1)[:, :k]
     return np.take_along_axis(columns, order, axis=1), np.take_along_axis(values, order, axis=1)
 
@@ -181,7 +181,7 @@ def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray
     alike = np.repeat(values.ravel(), counts)
     order = np.lexsort((landmarks, -alike, rows))
     ranks = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    taken = order[ranks < k]  # of each row at least k, since its k best labels have as many
+    taken = order[ranks < k]  # k of each row: its k best labels have at least k landmarks
     return landmarks[taken].reshape(-1, k), alike[taken].reshape(-1, k)
 
 
@@ -196,9 +196,9 @@ def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
 
 def sampled_similarities(similarities: Similarities, crops: NDArray[np.int64], most: int
                          ) -> NDArray[np.float32]:
-    """Return the similarities (m, s) of crops (m,) with landmarks spread over the map.
+    """Return the similarities (m, s) of crops (m,) and landmarks spread evenly over the map.
 
-    Of a small map these are all landmarks, of others at least half of the most asked for.
+    These are all landmarks of a map that has at most `most`; otherwise half of `most` at least.
     """
     step = -(-similarities.shape[1] // most)
     if not isinstance(similarities, CropSimilarities):

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which two correspondences can hold at once: what cannot is never made a sample of.
+"""Which two candidates can be right at once; others never form a sample.
 
-A box says how far away its landmark is, roughly: as far as makes the landmark that large. So two
-boxes and the angle between them bound the distance of their landmarks, which the map knows.
+The size of a box gives the distance of its landmark, roughly. So two boxes and the angle between
+them bound the distance between their landmarks, which the map knows.
 """
 
 from math import sqrt
@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.compiled import compiled
 
-# Distance of a landmark over what the size of its box says. On 1375 boxes of real TUM frames with
-# a fitted map, 99.8 % lie within .67 and 2.5: boxes hold more than the ellipsoid, or are cut.
+# Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
+# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
+# boxes are larger than the ellipsoid, or cut by the border.
 NEAREST, FARTHEST = 0.55, 2.5
 
 
 def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
-    """Return which candidates (c, c) may stand in one sample.
+    """Return which pairs of candidates (c, c) may form a sample; symmetric.
 
-    Two may if detections and landmarks differ, and if some distances that their boxes allow put
-    the landmarks as far apart as the map has them. Symmetric.
+    Detections and landmarks must differ, and the landmarks' distance in the map must be within
+    the range that their boxes allow.
     """
     depths = _depths(scene)
     compatible = np.zeros((len(scene.pairs), len(scene.pairs)), dtype=np.bool_)
@@ -38,7 +39,7 @@ def _depths(scene: Scene) -> NDArray[np.float64]:
     determinant = (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     radius = np.cbrt(np.sqrt(np.maximum(determinant, 0.0)))
     half = scene.box_ellipses[scene.pairs[:, 0], 2:]
-    # boxes lie on the plane z = 1, whose points are farther the more they are off the axis
+    # boxes are on the plane z = 1, whose points are farther away off the axis
     middle = scene.box_ellipses[scene.pairs[:, 0], :2]
     return np.asarray(radius / np.sqrt(half.prod(axis=1))
                       * np.sqrt(1.0 + (middle * middle).sum(axis=1)))
@@ -62,10 +63,10 @@ def _compare_all(scene, depths, compatible):
 
 @compiled
 def _distance_range(depth_a, depth_b, cosine):
-    """Return the least and greatest distance of two points at depths about these."""
+    """Return the least and greatest distance of two points whose depths are about these."""
     near_a, far_a = NEAREST * depth_a, FARTHEST * depth_a
     near_b, far_b = NEAREST * depth_b, FARTHEST * depth_b
-    # The squared distance is convex in both depths: greatest in a corner, least on an edge.
+    # The squared distance is convex in both depths: greatest at a corner, least on an edge.
     high = max(_square(near_a, near_b, cosine), _square(near_a, far_b, cosine),
                _square(far_a, near_b, cosine), _square(far_a, far_b, cosine))
     low = min(_square(near_a, min(max(near_a * cosine, near_b), far_b), cosine),

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Minimal samples: which three candidates are tried next.
+"""Minimal samples: PROSAC, RANSAC, and the enumeration of all samples.
 
-A sample is three candidates of three different detections and three different landmarks.
+A sample is three candidates with three different detections and three different landmarks.
 """
 
 import numpy as np
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from cliploc_ros.core.compiled import compiled
 
 SAMPLE_SIZE = 3
-# An enumeration pauses after so many steps, of some nanoseconds each, even if it found nothing.
+# An enumeration returns after so many steps of some nanoseconds each, even without a sample.
 _MAX_STEPS = 500_000
-# A draw that meets no valid sample in this many attempts is left out (its row is -1): among the
-# first candidates of PROSAC there may be none.
+# A draw without a valid sample in this many attempts is skipped (its row is -1): the first
+# candidates of PROSAC may not have any.
 _MAX_ATTEMPTS = 100
 
 
 def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
-    """Return T'_m .. T'_N: in which iteration PROSAC's candidate set stops at each size.
+    """Return T'_m .. T'_N: the last iteration of PROSAC with each size of its candidate set.
 
     Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, with T_N = iterations (with
     the textbook's 200,000 a search of 500 never leaves its first five candidates).
@@ -29,7 +29,7 @@ def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
     candidate_count : int
         N, at least 3.
     iterations : int
-        T_N, after how many iterations PROSAC becomes RANSAC.
+        T_N, the iterations after which PROSAC becomes RANSAC.
 
     Returns
     -------
@@ -41,14 +41,14 @@ def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
                                   for i in range(SAMPLE_SIZE)])
     expected = drawn * np.cumprod(np.concatenate(
         [[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
-    # The tolerance keeps a whole number from being rounded up for its last digit.
+    # The tolerance keeps whole numbers from being rounded up because of their last digit.
     steps = np.ceil(np.diff(expected) - 1e-9).astype(np.int64)
     return 1 + np.concatenate([[0], np.cumsum(steps)])
 
 
 def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
                 ) -> NDArray[np.int64]:
-    """Return samples (iterations, 3) of candidates drawn uniformly; -1 where none is valid.
+    """Return samples (iterations, 3) of uniformly drawn candidates; rows of -1 are skipped.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Genera
     """
     samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
     if len(pairs) >= SAMPLE_SIZE:
-        # a set that has stopped growing before the first iteration is the whole set
+        # the whole set from the first iteration on
         growth = np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
         _draw(np.ascontiguousarray(pairs), growth, rng, samples)
     return samples
@@ -65,7 +65,7 @@ def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Genera
 
 def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
                 ) -> NDArray[np.int64]:
-    """Return samples (iterations, 3) as PROSAC draws them; -1 where none is valid.
+    """Return samples (iterations, 3) as PROSAC draws them; rows of -1 are skipped.
 
     Parameters
     ----------
@@ -100,14 +100,14 @@ def _draw(pairs, growth, rng, samples):
 
 @compiled
 def enumerate_triples(pairs, cursor, samples):
-    """Write the next valid samples, in lexicographic order; return how many.
+    """Write the next valid samples in lexicographic order; return their number.
 
     Parameters
     ----------
     pairs : ndarray (c, 2)
         Detection and landmark of each candidate.
     cursor : ndarray (3,)
-        Where to go on, at first 0, 1, 2; moved. The end is reached at c - 2 in its first place.
+        The next sample, at first 0, 1, 2; updated. Its first value is c - 2 at the end.
     samples : ndarray (t, 3)
         Filled from the first row on.
     """
@@ -134,21 +134,20 @@ def enumerate_triples(pairs, cursor, samples):
 
 @compiled
 def _clash(pairs, a, b):
-    """Tell whether two candidates share a detection or a landmark."""
+    """Return whether two candidates share a detection or a landmark."""
     return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
 
 
 @compiled
 def enumerate_compatible_triples(compatible, cursor, samples):
-    """Write the next samples of compatible candidates, by their newest; return how many.
+    """Write the next samples of compatible candidates, by their newest; return their number.
 
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.compatibility.
     cursor : ndarray (3,)
-        Newest, first and second candidate, at first 2, 0, 1; moved. The end is c in the first
-        place.
+        Newest, first and second candidate, at first 2, 0, 1; updated. The newest is c at the end.
     samples : ndarray (t, 3)
         Filled from the first row on: first, second, newest.
     """
@@ -174,14 +173,14 @@ def enumerate_compatible_triples(compatible, cursor, samples):
 
 @compiled
 def enumerate_compatible_pairs(compatible, cursor, samples):
-    """Write the next pairs of compatible candidates, by their newer; return how many.
+    """Write the next pairs of compatible candidates, by their newer; return their number.
 
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.compatibility.
     cursor : ndarray (2,)
-        Newer and older candidate, at first 1, 0; moved. The end is c in the first place.
+        Newer and older candidate, at first 1, 0; updated. The newer is c at the end.
     samples : ndarray (t, 3)
         Its first two columns are filled from the first row on: older, newer.
     """

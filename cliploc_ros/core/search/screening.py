@@ -169,12 +169,13 @@ def _overlaps(targets: Targets) -> Overlaps:
 
 
 @compiled
-def make_hypothesis(bench, samples, number, least_iou):
-    """Write the poses of one of some samples to the bench; return which to verify, or -1.
+def make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou):
+    """Write the poses of one of some samples; return which of them to verify, or -1.
 
     Parameters
     ----------
-    bench : Bench
+    candidates, prior, sample, poses
+        Of the bench. A bench as a whole is slow to pass: its arrays are counted at each call.
     samples : ndarray (t, 3) of int
         Three candidates, or two and -1.
     number : int
@@ -182,15 +183,14 @@ def make_hypothesis(bench, samples, number, least_iou):
     least_iou : float
         A pose whose sampled pairs have a smaller sum of IoUs is not verified.
     """
-    sample, poses = bench.sample, bench.poses
     size = 3 if samples[number, 2] >= 0 else 2
-    _load(bench.candidates, samples, number, size, sample)
+    _load(candidates, samples, number, size, sample)
     if size == 3:
         count = p3p(sample.bearings, sample.landmarks, poses.rotations, poses.translations)
     else:
-        count = two_point(sample.bearings, sample.landmarks, bench.prior, poses.rotations,
+        count = two_point(sample.bearings, sample.landmarks, prior, poses.rotations,
                           poses.translations)
-    return _choose_pose(bench.prior, sample, size, poses, count, least_iou)
+    return _choose_pose(prior, sample, size, poses, count, least_iou)
 
 
 @compiled
@@ -301,35 +301,6 @@ def verify_beyond(targets, poses, which, overlaps, floor):
     overlaps : Overlaps
     floor : float
     """
-    count = _bound_all(targets, poses, which, overlaps)
-    boxes, iou_threshold, outlines = targets.boxes, targets.iou_threshold, overlaps.outlines
-    pairs, bounds, best_bounds = overlaps.pairs, overlaps.bounds, overlaps.best_bounds
-    upper = 0.0
-    for detection in range(boxes.shape[0]):
-        if best_bounds[detection] > iou_threshold:
-            upper += best_bounds[detection]
-    if upper <= floor:
-        return floor
-    score = 0.0
-    for detection in range(boxes.shape[0]):
-        if best_bounds[detection] <= iou_threshold:
-            continue
-        best = iou_threshold
-        for pair in range(count):
-            if pairs[pair, 0] == detection and bounds[pair] > best:
-                best = max(best, _outline_iou(boxes, detection, outlines, pairs[pair, 1]))
-        if best <= iou_threshold:
-            best = 0.0
-        score += best
-        upper += best - best_bounds[detection]
-        if upper <= floor:
-            return floor
-    return score
-
-
-@compiled
-def _bound_all(targets, poses, which, overlaps):
-    """Write the pairs that may overlap enough at a pose, and their bounds; return their number."""
     groups, outlines = targets.groups, overlaps.outlines
     overlaps.best_bounds[:] = targets.iou_threshold
     single = targets.landmarks.shape[0]
@@ -339,7 +310,7 @@ def _bound_all(targets, poses, which, overlaps):
         last = project_visible(targets.sorted_landmarks, groups, poses, which, overlaps.visible,
                                outlines, overlaps.owners, single)
         count = _bound(targets, groups.starts, groups.detections, single, last, overlaps, count)
-    return count
+    return _score_beyond(targets.boxes, targets.iou_threshold, overlaps, count, floor)
 
 
 @compiled
@@ -361,3 +332,31 @@ def _bound(targets, starts, detections, first, last, overlaps, count):
                 best_bounds[detection] = max(best_bounds[detection], bound)
                 count += 1
     return count
+
+
+@compiled
+def _score_beyond(boxes, iou_threshold, overlaps, count, floor):
+    """Return the score of the pairs with bounds if it is above a floor; if not, the floor."""
+    outlines, pairs, bounds = overlaps.outlines, overlaps.pairs, overlaps.bounds
+    best_bounds = overlaps.best_bounds
+    upper = 0.0
+    for detection in range(boxes.shape[0]):
+        if best_bounds[detection] > iou_threshold:
+            upper += best_bounds[detection]
+    if upper <= floor:
+        return floor
+    score = 0.0
+    for detection in range(boxes.shape[0]):
+        if best_bounds[detection] <= iou_threshold:
+            continue
+        best = iou_threshold
+        for pair in range(count):
+            if pairs[pair, 0] == detection and bounds[pair] > best:
+                best = max(best, _outline_iou(boxes, detection, outlines, pairs[pair, 1]))
+        if best <= iou_threshold:
+            best = 0.0
+        score += best
+        upper += best - best_bounds[detection]
+        if upper <= floor:
+            return floor
+    return score

@@ -197,12 +197,12 @@ class _Pace:
 @compiled
 def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
     """Make the hypotheses of the first samples, and remember those that lead."""
-    targets, poses, overlaps = bench.targets, bench.poses, bench.overlaps
+    candidates, prior, targets, sample, poses, overlaps = bench
     floor = worst_score(leaders)
     for number in range(count):
         if samples[number, 0] < 0:
             continue
-        which = make_hypothesis(bench, samples, number, least_iou)
+        which = make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou)
         if which < 0:
             continue
         score = verify_beyond(targets, poses, which, overlaps, floor)

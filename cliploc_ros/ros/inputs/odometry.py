@@ -27,8 +27,9 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of the poses would look like a speed.
 _MOMENT_NS = 300_000_000
-# A late answer is better than taking a moving robot on a busy machine for one at rest.
-_MOMENT_PATIENCE_S = 2.0
+#: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
+#: taking a moving robot on a busy machine for one at rest.
+MOMENT_PATIENCE_S = 2.0
 
 
 class BodyPose(NamedTuple):
@@ -106,31 +107,38 @@ class OdometrySource:
                              np.array([q.x, q.y, q.z, q.w]))
             self._heard.notify_all()
 
-    def recent(self, patience_s: float) -> Odometry | None:
-        """Return the newest message if it is at most this old, or arrives within this time [s].
+    def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
+        """Return the newest message, or the next one if that arrives in time; else None.
+
+        Parameters
+        ----------
+        max_age_s : float
+            The newest message counts if it arrived at most this long ago [s].
+        patience_s : float
+            How long to wait for another one [s].
 
         Returns at once where nobody publishes odometry.
         """
         def is_recent() -> bool:
             return (self._newest is not None
-                    and time.monotonic() - self._newest_at <= patience_s)
+                    and time.monotonic() - self._newest_at <= max_age_s)
         with self._heard:
             if self.is_published:
                 self._heard.wait_for(is_recent, patience_s)
             return self._newest if is_recent() else None
 
-    def speeds_by_poses(self, patience_s: float) -> tuple[float, float]:
+    def speeds_by_poses(self, patience_s: float) -> tuple[float, float] | None:
         """Return speed [m/s] and turn rate [rad/s] over the last 0.3 s of poses.
 
         Many sources of poses leave the twist empty. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; 0 where it does not.
+        `patience_s`, at most 2 s, to cover that time; None where it does not.
         """
         with self._heard:
             self._heard.wait_for(lambda: self._last_moment() is not None,
-                                 min(patience_s, _MOMENT_PATIENCE_S))
+                                 min(patience_s, MOMENT_PATIENCE_S))
             moment = self._last_moment()
         if moment is None:
-            return 0.0, 0.0
+            return None
         distance_m, angle_deg = pose_error(*moment)
         seconds = _MOMENT_NS / 1e9
         return distance_m / seconds, math.radians(angle_deg) / seconds

@@ -20,12 +20,14 @@ from std_srvs.srv import Empty
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
 # degree. AMCL draws its particles from x, y and yaw; without any scatter they would all be one.
 _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
+# Odometry of a robot at rest may be this old (a guess): slow sources send at 1 Hz.
+_MAX_ODOM_AGE_S = 2.0
 # How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
 # How long to wait for a subscriber of initialpose; discovery of a running one takes less.
@@ -79,7 +81,7 @@ class HandOff:
         self._jumped_at = time.monotonic()
 
     def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
-                  deadline: float) -> None:
+                  deadline: float, received_at: float) -> None:
         """Publish a pose on `initialpose`, and return when the localizer had time to settle.
 
         Parameters
@@ -91,6 +93,8 @@ class HandOff:
         deadline : float
             When to return at the latest (monotonic clock) [s]. A hand-over that need not wait is
             made after it, too.
+        received_at : float
+            When the image arrived (monotonic clock) [s].
 
         Raises
         ------
@@ -99,9 +103,8 @@ class HandOff:
         NoLocalizerError
             Nobody subscribes `initialpose`; nothing was published.
         TimeJumpError
-            Time jumped back meanwhile; nothing was published.
+            Time has jumped back since; nothing was published.
         """
-        start = time.monotonic()
         if not values['base_frame']:
             self._node.get_logger().warning(
                 "initialpose carries the camera's pose: base_frame is empty; for AMCL set it to "
@@ -109,8 +112,8 @@ class HandOff:
         if values['require_localizer']:
             self._wait_for_localizer(deadline)
         self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
-        if self._jumped_at >= start:
-            raise TimeJumpError('time jumped back during the hand-over: initialpose is withheld')
+        if self._jumped_at >= received_at:
+            raise TimeJumpError('time jumped back before the hand-over: the pose is from before')
         if self._stopped.is_set():
             raise HandOffError('the node was deactivated during the hand-over')
         self._publisher.publish(usable_pose(pose, self._node.get_clock().now()))
@@ -133,7 +136,8 @@ class HandOff:
 
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""
-        odometry = self._odometry.recent(min(_ODOM_PATIENCE_S, _left_s(deadline)))
+        odometry = self._odometry.recent(_MAX_ODOM_AGE_S,
+                                         min(_ODOM_PATIENCE_S, _left_s(deadline)))
         if odometry is None:
             if not self._odometry.is_published:
                 self._node.get_logger().warning(
@@ -142,9 +146,13 @@ class HandOff:
                 return
             raise HandOffError(f'{self._odometry.topic} has a publisher but no messages: the '
                                'robot may be moving')
+        left_s = _left_s(deadline)
+        by_poses = self._odometry.speeds_by_poses(left_s)
+        if by_poses is None and left_s < MOMENT_PATIENCE_S:
+            raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
+                               'left to see whether the robot moves: ask again')
         # np.maximum passes NaN on, which no limit allows
-        speed_m_s, turn_rad_s = np.maximum(
-            speeds(odometry), self._odometry.speeds_by_poses(_left_s(deadline)))
+        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), by_poses or (0.0, 0.0))
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers that stand for recorded ones: of the same type, with the same offers."""
+"""Make publishers with the type and the QoS of recorded ones."""
 
 from collections.abc import Collection
 from importlib import import_module
@@ -21,14 +21,14 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from cliploc_ros.datasets.bag_reader import BagTopic
 from cliploc_ros.errors import DatasetError
 
-#: Depth where the recording does not know it: discovery does not tell a publisher's history.
+#: Depth where the recording has none: discovery does not report a publisher's history.
 DEFAULT_DEPTH = 10
-#: From here on a recorded duration means for ever; the value of Foxy's Fast DDS was the least.
+#: A recorded duration of this or more is infinite. Foxy's Fast DDS wrote the least such value.
 _INFINITE_S = 2**31 - 1
 
 
 def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
-    """Make a publisher that offers what the recorded one did.
+    """Make a publisher with the QoS that the recorded one offered.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
     Raises
     ------
     DatasetError
-        If the type is not installed, or is another than the recorded one.
+        If the type is not installed, or differs from the recorded one.
     """
     publisher: Publisher = node.create_publisher(
         message_class(topic), name, qos_profile(topic.offered_qos)
@@ -69,17 +69,17 @@ def message_class(topic: BagTopic) -> Any:
         return getattr(import_module(f'{package}.{namespace or "msg"}'), name)
     except (ImportError, AttributeError):
         raise DatasetError(
-            f'{topic.name} needs {topic.msgtype}, but the package {package} with that type is not '
-            f'installed or not sourced (apt: ros-jazzy-{package.replace("_", "-")}); '
-            f'or leave the topic out: --exclude {topic.name}'
+            f'{topic.name} needs {topic.msgtype}, but the package {package} with this type is not '
+            f'installed or not sourced: apt install ros-jazzy-{package.replace("_", "-")}, or '
+            f'leave the topic out: --exclude {topic.name}'
         ) from None
 
 
 def qos_profile(offered: Collection[Qos]) -> QoSProfile:
     """Return the profile that replays what a topic's publishers offered.
 
-    Of several publishers' offers the strongest reliability and durability are taken, which
-    all their subscribers match.
+    Of several publishers' offers it takes the strongest reliability and durability, which
+    match all their subscribers.
 
     Parameters
     ----------
@@ -124,12 +124,12 @@ def is_latched(offered: Collection[Qos]) -> bool:
 def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
     """Refuse bytes that were recorded with another definition than the installed one."""
     if not topic.type_hash.startswith('RIHS01_'):
-        return  # not recorded before Iron
+        return  # recorded before Iron, which introduced the hash
     for endpoint in node.get_publishers_info_by_topic(name):
         if endpoint.node_name == node.get_name() and str(endpoint.topic_type_hash) not in (
             topic.type_hash, 'INVALID'
         ):
             raise DatasetError(
                 f'{topic.name} was recorded with another definition of {topic.msgtype} than the '
-                f'one installed; leave it out: --exclude {topic.name}'
+                f'installed one; leave it out: --exclude {topic.name}'
             )

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publishing a recording: the recorded bytes, with recorded QoS, at their recorded times."""
+"""Publish a recording: the recorded bytes, with the recorded QoS, at the recorded times.
+
+Own code because `ros2 bag play` comes with neither PyPI's ROS nor a minimal robot image.
+"""
 
 import threading
 import time
@@ -17,15 +20,13 @@ from rosgraph_msgs.msg import Clock
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.ros.replay.bag_publisher import create_publisher, is_latched
+from cliploc_ros.units import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 CLOCK_TOPIC = '/clock'
 _POLL_S = 0.02
-#: Between a subscriber's appearance here and its readiness to receive: discovery has to
-#: complete in the other direction too, which no call of ROS tells.
+#: Wait this long after a subscriber appears here: it must discover this publisher too, and ROS
+#: does not report that.
 _DISCOVERY_S = 0.2
-#: At the end, acknowledgements take up to Fast DDS's heartbeat of 3 s, what was sent only this.
-DEFAULT_LINGER_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,6 @@ class PlayOptions:
         Publish the recording's time on /clock this often per second of real time.
     loop : bool
         Begin again at the end, until stopped.
-    linger_s : float
-        At the end, wait this long at most until all reliable subscribers have acknowledged
-        all messages [s].
     """
 
     rate: float = 1.0
@@ -60,10 +58,9 @@ class PlayOptions:
     remap: Mapping[str, str] = field(default_factory=dict)
     clock_hz: float | None = None
     loop: bool = False
-    linger_s: float = DEFAULT_LINGER_S
 
 
-@dataclass
+@dataclass(frozen=True)
 class PlayReport:
     """What was published.
 
@@ -74,12 +71,12 @@ class PlayReport:
     passes : int
         How often the recording was played to its end.
     unread : int
-        Messages that the recording claims to hold but that were not found in it.
+        Messages that the recording lists but that were not found in it.
     worst_lateness_s : float
         The longest that a message was published after its time [s].
     """
 
-    counts: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str]
     passes: int = 0
     unread: int = 0
     worst_lateness_s: float = 0.0
@@ -97,7 +94,7 @@ class Player:
     options : PlayOptions
         How to play it.
     stop : threading.Event
-        Ends whatever goes on, within milliseconds.
+        Ends every wait and the playback within milliseconds.
 
     Raises
     ------
@@ -131,14 +128,14 @@ class Player:
         Parameters
         ----------
         topics : iterable of str
-            Recorded names; all that are played if empty.
+            Recorded names; if empty, all topics that are played.
         timeout_s : float
             How long to wait at most [s].
 
         Raises
         ------
         DatasetError
-            If a topic is not played, or still has no subscriber; it is named.
+            If a topic is not played, or has no subscriber in time; the message names it.
         """
         publishers = self._named_publishers(list(topics) or list(self._publishers))
         deadline = time.monotonic() + timeout_s
@@ -151,12 +148,12 @@ class Player:
         self._stop.wait(_DISCOVERY_S)
 
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
-        """Publish the messages, each when its time has come.
+        """Publish the messages, each at its time.
 
         Parameters
         ----------
         on_message : callable
-            Called after each publication, to show how far it is.
+            Called after each publication, to show progress.
 
         Returns
         -------
@@ -165,27 +162,53 @@ class Player:
         Raises
         ------
         DatasetError
-            Where the recording turns out to be broken.
+            Where the recording is damaged.
         """
-        report = PlayReport()
-        self._publish_latched(report)
+        counts = self._publish_latched()
         messages = self._read_ahead()
         origin_ns = time.monotonic_ns()
+        passes, unread, worst_s = 0, 0, 0.0
         while not self._stop.is_set():
-            played = self._play_once(messages, origin_ns, report, on_message)
+            played, late_s = self._play_once(messages, origin_ns, on_message)
+            counts += played
+            worst_s = max(worst_s, late_s)
             if self._stop.is_set():
                 break
-            report.passes += 1
-            report.unread = self._count_unread(played)
+            passes += 1
+            unread = self._count_unread(played.total())
             if not self._options.loop:
-                self._wait_until_received()
                 break
-            # go on as if a next message followed at the mean distance, and never spin
+            # The next pass follows at the mean distance of messages, and never at once.
             length_ns = self.end_ns - self.start_ns
-            gap_ns = length_ns // max(played - 1, 1) or NS_PER_S
+            gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
             origin_ns += round((length_ns + gap_ns) / self._options.rate)
             messages = self._read_ahead()
-        return report
+        return PlayReport(counts, passes, unread, worst_s)
+
+    def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
+        """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
+
+        The middleware resends lost messages only while their publisher exists: a process that
+        ends right after its last message loses it under load.
+
+        Parameters
+        ----------
+        timeout_s : float
+            How long to wait at most [s]. Fast DDS requests acknowledgements every 3 s.
+
+        Returns
+        -------
+        tuple of str
+            Topics with a subscriber that did not acknowledge all messages in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        waiting = list(self._publishers.values())
+        while not self._stop.is_set():
+            waiting = [one for one in waiting if not one.wait_for_all_acked(Duration())]
+            if not waiting or time.monotonic() >= deadline:
+                return tuple(publisher.topic_name for publisher in waiting)
+            self._stop.wait(_POLL_S)
+        return ()
 
     def _read_ahead(self) -> Iterator[BagMessage]:
         """Read the first message already, so that opening files makes no message late."""
@@ -196,59 +219,52 @@ class Player:
         self,
         messages: Iterator[BagMessage],
         origin_ns: int,
-        report: PlayReport,
         on_message: Callable[[BagMessage], None],
-    ) -> int:
+    ) -> tuple[Counter[str], float]:
+        """Publish messages; return how many on each topic, and the greatest lateness [s]."""
         timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
         ticker = None
         if self._clock is not None and self._options.clock_hz:
             ticker = _Ticker(self._clock, timeline, self._options.clock_hz)
-        played = 0
+        counts: Counter[str] = Counter()
+        worst_lateness_s = 0.0
         for message in messages:
             if not self._wait_for(message.stamp_ns, timeline, ticker):
                 break
-            report.worst_lateness_s = max(
-                report.worst_lateness_s, timeline.lateness_s(message.stamp_ns)
-            )
+            worst_lateness_s = max(worst_lateness_s, timeline.lateness_s(message.stamp_ns))
             self._publishers[message.topic].publish(message.data)
-            report.counts[message.topic] += 1
-            played += 1
+            counts[message.topic] += 1
             on_message(message)
-        return played
+        return counts, worst_lateness_s
 
     def _wait_for(self, stamp_ns: int, timeline: '_Timeline', ticker: '_Ticker | None') -> bool:
-        """Wait until a stamp's time, ticking meanwhile; False if stopped instead."""
+        """Wait until a stamp's time, ticking meanwhile; return False if stopped instead."""
         while ticker is not None and ticker.next_ns <= stamp_ns:
             if not timeline.wait_for(ticker.next_ns):
                 return False
             ticker.tick()
         return timeline.wait_for(stamp_ns)
 
-    def _publish_latched(self, report: PlayReport) -> None:
-        """Publish what a subscriber would still have got from before the start offset."""
+    def _publish_latched(self) -> Counter[str]:
+        """Publish what a late subscriber would still receive from before the start offset."""
+        counts: Counter[str] = Counter()
         latched = [topic.name for topic in self.topics if is_latched(topic.offered_qos)]
         if self.start_ns == self._reader.start_ns or not latched:
-            return
+            return counts
         for message in self._reader.messages(latched, stop_ns=self.start_ns):
             self._publishers[message.topic].publish(message.data)
-            report.counts[message.topic] += 1
+            counts[message.topic] += 1
+        return counts
 
     def _count_unread(self, played: int) -> int:
         if self.start_ns > self._reader.start_ns:
-            return 0  # the recording does not say how many messages it holds from there on
+            return 0  # a recording does not list how many messages follow a start offset
         return max(sum(topic.message_count for topic in self.topics) - played, 0)
-
-    def _wait_until_received(self) -> None:
-        deadline = time.monotonic() + self._options.linger_s
-        while not self._stop.is_set() and time.monotonic() < deadline:
-            if all(one.wait_for_all_acked(Duration()) for one in self._publishers.values()):
-                return
-            self._stop.wait(_POLL_S)
 
     def _named_publishers(self, names: Collection[str]) -> list[Publisher]:
         if unknown := [name for name in names if name not in self._publishers]:
-            there = ', '.join(self._publishers)
-            raise DatasetError(f'{unknown[0]} is not among the topics played: {there}')
+            played = ', '.join(self._publishers)
+            raise DatasetError(f'{unknown[0]} is not among the topics played: {played}')
         return [self._publishers[name] for name in names]
 
 
@@ -260,12 +276,12 @@ class _Timeline:
         self._origin_ns, self._stop = origin_ns, stop
 
     def wait_for(self, stamp_ns: int) -> bool:
-        """Sleep until a stamp's time has come; False if stopped instead."""
+        """Sleep until a stamp's time; return False if stopped instead."""
         left_s = -self.lateness_s(stamp_ns)
         return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
 
     def lateness_s(self, stamp_ns: int) -> float:
-        """Return by how much a stamp's time has passed [s]; negative if it is to come."""
+        """Return how long ago a stamp's time was [s]; negative for the future."""
         due_ns = self._origin_ns + (stamp_ns - self.start_ns) / self.rate
         return (time.monotonic_ns() - due_ns) / NS_PER_S
 

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable build_map, as a user starts it."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations, save_observations
+
+
+@pytest.fixture(scope='module')
+def observations(shared_data, tmp_path_factory):
+    """Every eighth frame of the office: enough for a map, and quick."""
+    whole = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
+    path = tmp_path_factory.mktemp('office') / 'office.npz'
+    save_observations(path, whole.select_frames(range(0, len(whole), 8)))
+    return path
+
+
+def build_map(*args):
+    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.build_map', *map(str, args)],
+                          capture_output=True, text=True, timeout=300)
+
+
+def test_builds_a_map_and_a_report(observations, tmp_path):
+    out, report = tmp_path / 'office.yaml', tmp_path / 'office.json'
+    done = build_map('--observations', observations, '--out', out, '--report', report,
+                     '--frame-id', 'world')
+    assert done.returncode == 0, done.stderr
+    built = LandmarkMap.from_file(out)
+    assert built.frame_id == 'world'
+    assert len(built) > 30
+    assert all(details.support >= 3 for details in built.details)
+    found = json.loads(report.read_text())
+    assert found['landmarks'] == len(built)
+    assert found['explained'] > 0.85
+    assert f'{len(built)} landmarks from 323 frames' in done.stdout
+    assert 'left out:' in done.stdout
+    assert f'wrote {out}' in done.stdout
+
+
+def test_refines_poses_when_they_have_noise(observations, tmp_path):
+    done = build_map('--observations', observations, '--out', tmp_path / 'm.yaml', '--every', 2,
+                     '--pose-noise', 0.02, 0.5)
+    assert done.returncode == 0, done.stderr
+    assert 'poses refined by' in done.stdout
+    assert 'from 162 frames' in done.stdout
+
+
+def test_an_existing_map_stays_when_building_fails(observations, tmp_path):
+    old = tmp_path / 'old.yaml'
+    old.write_text('precious')
+    cut = tmp_path / 'cut.npz'
+    cut.write_bytes(observations.read_bytes()[:20_000])
+    done = build_map('--observations', cut, '--out', old)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f'error: {cut}: is no complete npz file')
+    done = build_map('--observations', observations, '--out', old, '--every', 400)
+    assert done.returncode == 1
+    assert 'viewpoints, at least 3 are needed' in done.stderr
+    assert old.read_text() == 'precious'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['cut.npz', 'old.yaml']
+
+
+@pytest.mark.parametrize(('args', 'message'), [
+    (('--out', 'missing/map.yaml'), 'there is no folder missing; create it'),
+    (('--out', '.'), 'is a folder; name the map file to write'),
+    (('--out', 'm.yaml', '--no-joint', '--pose-noise', 1, 1), '--pose-noise is for --joint'),
+])
+def test_wrong_options_are_named_at_once(observations, args, message):
+    done = build_map('--observations', observations, *args)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert 'Traceback' not in done.stderr

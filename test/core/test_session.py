@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frame after frame of one camera: which frames are fused, and which looks have to agree."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.session import KeptFrame, Session, frames_to_fuse
+from cliploc_ros.errors import OptionsError
+
+ROOM = make_room()
+SEEN = see_room(ROOM)
+ONE = SEEN.select(np.array([0]))
+NOTHING = SEEN.select(np.array([], dtype=np.int64))
+RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class'))
+
+
+def pose(degrees=0.0, metres=0.0):
+    turn = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return make_transform(turn, np.array([metres, 0.0, 0.0]))
+
+
+def frame(seconds, degrees=0.0, metres=0.0, detections=SEEN):
+    return Observation(CAMERA, detections, stamp_ns=round(seconds * 1e9),
+                       odom_from_camera=pose(degrees, metres))
+
+
+class Window:
+    """The frames that are fused, and their stamps [s]."""
+
+    def __init__(self):
+        self.frames = []
+
+    def join(self, seconds, degrees=0.0, metres=0.0, detections=ONE, limit=5, length_s=5.0):
+        new = frame(seconds, degrees, metres, detections)
+        earlier, anchor = frames_to_fuse(self.frames, new, limit, length_s)
+        self.frames = [*earlier, KeptFrame(RELOCALIZER.search(new), anchor)]
+        return [one.searched.observation.stamp_ns / 1e9 for one in self.frames]
+
+
+@pytest.fixture
+def window():
+    return Window()
+
+
+def test_a_standing_camera_is_localized_with_its_newest_frame(window):
+    for number in range(20):
+        assert window.join(number / 10, degrees=0.1 * number) == [number / 10]
+
+
+@pytest.mark.parametrize('step', [{'degrees': 4.0}, {'metres': 0.06}])
+def test_frames_of_a_moving_camera_are_fused(window, step):
+    for number in range(3):
+        fused = window.join(number, **{name: number * size for name, size in step.items()})
+    assert fused == [0.0, 1.0, 2.0]
+
+
+def test_a_camera_that_creeps_moves_away_from_its_anchor(window):
+    for number in range(31):
+        fused = window.join(number / 10, degrees=0.4 * number)
+    # each as far from the one before as a new frame must be
+    assert fused == [0.7, 1.5, 2.3, 3.0]
+
+
+def test_of_too_many_frames_those_furthest_apart_remain(window):
+    for number in range(31):
+        fused = window.join(number / 10, degrees=6.0 * number)
+        assert len(fused) <= 5
+    assert fused[0] == 0.0 and fused[-1] == 3.0
+    assert np.diff(fused).max() <= 1.6, 'all of the way'
+
+
+def test_the_newest_frame_always_remains(window):
+    for number in range(10):
+        for limit in (5, 2, 1, 3):
+            fused = window.join(number + limit / 10, 10.0 * number, limit=limit)
+            assert fused[-1] == number + limit / 10 and len(fused) <= limit
+
+
+def test_old_frames_are_dropped(window):
+    for number in range(4):
+        window.join(number, 10.0 * number)
+    assert window.join(7.5, 90.0) == [3.0, 7.5]
+    assert window.join(60.0, 0.0) == [60.0]
+
+
+def test_frames_without_detections_are_dropped(window):
+    window.join(0.0, 0.0)
+    assert window.join(1.0, 10.0, detections=NOTHING) == [0.0, 1.0]
+    assert window.join(2.0, 20.0) == [0.0, 2.0]
+
+
+@pytest.fixture
+def session():
+    return Session(RELOCALIZER)
+
+
+TRIED = RELOCALIZER.relocalize([frame(0.0)]).tried
+
+
+def fused(session, observation, run=0):
+    """The number of frames that a session fuses; each is searched with as many samples."""
+    found = session.localize(observation, run, limit=5, length_s=5.0)
+    assert found.tried % TRIED == 0
+    return found.tried // TRIED
+
+
+def test_a_session_finds_what_the_relocalizer_finds(session):
+    observations = [frame(number, 4.0 * number) for number in range(3)]
+    for one in observations:
+        found = session.localize(one, 0, 5, 5.0)
+    at_once = RELOCALIZER.relocalize(observations)
+    np.testing.assert_array_equal(found.map_from_camera, at_once.map_from_camera)
+    assert found.covariance == pytest.approx(at_once.covariance)
+    assert (found.confidence, found.tried) == (at_once.confidence, at_once.tried)
+
+
+def test_a_frame_that_was_searched_leaves_all_of_the_time_to_the_new_one():
+    options = RelocalizerOptions(matching='class', algorithm='bf')
+    searched = [Relocalizer(ROOM, options).search(frame(0.0))]
+    impatient = Relocalizer(ROOM, replace(options, time_budget_s=1e-6))
+    assert impatient.relocalize([frame(0.0)]).coverage < 1.0
+    assert impatient.locate(searched).coverage == 1.0
+
+
+def test_time_that_goes_back_forgets_all_frames(session):
+    assert [fused(session, frame(100 + number, 10.0 * number)) for number in range(3)] == [1, 2, 3]
+    assert fused(session, frame(3.0, 50.0)) == 1
+    assert fused(session, frame(3.5, 90.0)) == 2
+
+
+def test_another_run_of_odometry_forgets_all_frames(session):
+    assert [fused(session, frame(number, 10.0 * number), 1) for number in range(3)] == [1, 2, 3]
+    assert fused(session, frame(4.0, 50.0), 2) == 1
+    assert fused(session, frame(5.0, 90.0), 2) == 2
+
+
+def test_a_frame_without_odometry_is_localized_alone(session):
+    for number in range(3):
+        fused(session, frame(number, 10.0 * number))
+    assert fused(session, replace(frame(3.0), odom_from_camera=None)) == 1
+    assert fused(session, frame(4.0, 40.0)) == 4, 'and does not change the session'
+
+
+def test_a_frame_that_cannot_be_searched_is_dropped(session):
+    assert fused(session, frame(0.0)) == 1
+    with pytest.raises(OptionsError, match='unit vector'):
+        session.localize(replace(frame(1.0, 10.0), up_in_camera=np.zeros(3)), 0, 5, 5.0)
+    assert fused(session, frame(2.0, 20.0)) == 2
+
+
+def drive(session, seconds, metres, run=0):
+    """Localize with a view that never changes, although odometry says that the robot drives."""
+    return session.localize(frame(seconds, metres=metres), run, limit=1, length_s=5.0)
+
+
+def test_a_pose_that_earlier_looks_contradict_is_refused(session):
+    found = drive(session, 0.0, 0.0)
+    assert found.accepted
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
+    for number in range(1, 7):
+        found = drive(session, number, 1.0 * number)
+        assert not found.accepted and found.hypotheses
+    assert found.reason.startswith('1 of the last 7 frames lead to this pose')
+
+
+def test_looks_persist_across_requests_while_odometry_links_them(session):
+    """Frames are dropped after five seconds, looks are not."""
+    drive(session, 0.0, 0.0)
+    assert not drive(session, 1000.0, 3.0).accepted
+    assert drive(session, 2000.0, 3.0, run=1).accepted, 'another run'
+    assert not drive(session, 2001.0, 6.0, run=1).accepted
+    assert drive(session, 1999.0, 9.0, run=1).accepted, 'time went back'
+
+
+def test_the_same_frame_again_is_no_further_look(session):
+    drive(session, 0.0, 0.0)
+    for _ in range(3):
+        assert not drive(session, 1.0, 3.0).accepted
+
+
+class Camera:
+    """Takes looks that need no search."""
+
+    def __init__(self):
+        self.looks = Looks()
+
+    def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0):
+        """Whether most looks agree with one that finds the camera at x_m, yaw_deg."""
+        self.looks = self.looks.with_look(frame(seconds, degrees, metres), pose(yaw_deg, x_m))
+        return 2 * self.looks.agreeing > len(self.looks)
+
+
+@pytest.fixture
+def camera():
+    return Camera()
+
+
+def test_looks_that_agree(camera):
+    assert camera.look(0.0, 0.0)
+    assert camera.look(0.1, 0.1)
+    assert camera.looks.agreeing == len(camera.looks) == 2
+
+
+def test_one_look_of_many_does_not_agree(camera):
+    for number in range(6):
+        camera.look(number / 10, 2.0 * number)
+    assert not camera.look(0.7, 3.1)
+    assert (camera.looks.agreeing, len(camera.looks)) == (1, 7)
+    assert not camera.look(0.8, 3.1, yaw_deg=30.0), 'turned by more than 20 degrees'
+    assert camera.looks.agreeing == 1
+
+
+def test_most_looks_agree(camera):
+    camera.look(0.0, 9.0)
+    assert not camera.look(0.1, 1.0)
+    assert camera.look(0.2, 1.2), 'two of three'
+
+
+@pytest.mark.parametrize(('turned_deg', 'driven_m'), [(0.0, 0.0), (10.0, 0.0), (10.0, 0.8)])
+def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
+    for number in range(10):
+        degrees, metres = number % 2 * turned_deg, number * driven_m
+        assert camera.look(number / 10, metres, degrees, degrees, metres)
+    stuck = [camera.look(1.0 + number / 10, 0.0, 0.0, 4.0 * number, 8.0 + number)
+             for number in range(1, 10)]
+    assert not any(stuck), 'poses that do not move although the robot does'
+
+
+def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
+    for number in range(100):
+        camera.look(number / 10, 9.0)
+    agree = [camera.look(10.0 + number / 10, 1.0) for number in range(15)]
+    assert agree == [False] * 10 + [True] * 5
+
+
+def test_a_look_without_odometry_stands_alone(camera):
+    camera.look(0.0, 9.0)
+    alone = camera.looks.with_look(replace(frame(1.0), odom_from_camera=None), pose())
+    assert (alone.agreeing, len(alone)) == (1, 1)

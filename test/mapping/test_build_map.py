@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps built from a simulated walk, whose landmarks are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around
+
+from cliploc_ros.errors import MappingError
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+
+
+def test_every_landmark_is_found_where_it_is():
+    table = make_table()
+    built = build_map(see(table, walk_around()))
+    assert len(built.landmark_map) == len(table)
+    assert nearest_errors(built.landmark_map, table).max() < 0.003
+    assert built.report.explained == 1.0
+    assert built.report.median_iou > 0.97
+    assert built.report.left_out == ()
+    assert set(np.unique(built.shown)) == set(range(len(table)))
+
+
+def test_shapes_are_recovered():
+    table = make_table()
+    built = build_map(see(table, walk_around())).landmark_map
+    for center, axes in zip(table.centers, table.semi_axes, strict=True):
+        row = np.linalg.norm(built.centers - center, axis=1).argmin()
+        assert np.sort(built.semi_axes[row]) == pytest.approx(np.sort(axes), abs=0.015)
+
+
+def test_noise_and_missed_boxes_cost_little():
+    table = make_table()
+    built = build_map(see(table, walk_around(), noise_px=3.0, missed=0.4))
+    assert len(built.landmark_map) == len(table)
+    assert nearest_errors(built.landmark_map, table).max() < 0.01
+    for details in built.landmark_map.details:
+        assert 0.3 < details.seen_ratio < 0.9
+        assert details.baseline_deg > 90.0
+        assert details.position_sigma < 0.02
+
+
+def test_equal_seed_and_input_give_an_equal_map():
+    detections = see(make_table(), walk_around(), noise_px=3.0)
+    first, second = build_map(detections), build_map(detections)
+    assert (first.landmark_map.centers == second.landmark_map.centers).all()
+    assert (first.shown == second.shown).all()
+    assert first.report == second.report
+
+
+def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():
+    poses = walk_around(frames=12, turn_deg=12.0)
+    with pytest.raises(MappingError, match=r'no landmark is good enough.*seen from one side only'):
+        build_map(see(make_table(), poses))
+    eager = MappingOptions(min_baseline_deg=8.0, max_position_sigma_m=1.0)
+    built = build_map(see(make_table(), poses), eager)
+    assert nearest_errors(built.landmark_map, make_table()).max() < 0.05
+
+
+def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
+    table, poses = make_table(), walk_around(frames=120)
+    rare = see(table, poses)
+    cup = np.argmin(np.linalg.norm(table.centers - table.centers[2], axis=1))
+    start = np.array([frame for frame in range(len(poses)) if frame < 30])
+    without = see(replace(table, landmark_ids=table.landmark_ids[:2] + table.landmark_ids[3:],
+                          labels=table.labels[:2] + table.labels[3:],
+                          class_ids=table.class_ids[:2] + table.class_ids[3:],
+                          centers=np.delete(table.centers, cup, 0),
+                          semi_axes=np.delete(table.semi_axes, cup, 0),
+                          quats_xyzw=np.delete(table.quats_xyzw, cup, 0)), poses)
+    first = rare.select_frames(start)
+    rest = without.select_frames(np.arange(30, 120))
+    both = replace(
+        rare, frame_offsets=np.concatenate([first.frame_offsets,
+                                            first.frame_offsets[-1] + rest.frame_offsets[1:]]),
+        bboxes_xyxy=np.concatenate([first.bboxes_xyxy, rest.bboxes_xyxy]),
+        classes=np.concatenate([first.classes, rest.classes]),
+        scores=np.concatenate([first.scores, rest.scores]))
+    built = build_map(both, MappingOptions(min_seen_ratio=0.4))
+    assert len(built.landmark_map) == len(table) - 1
+    (left_out,) = built.report.left_out
+    assert left_out.class_id == table.class_ids[cup]
+    assert left_out.center == pytest.approx(table.centers[cup], abs=0.02)
+    assert 'rarely detected, or moved' in left_out.reason
+    assert built.report.lines()[-2] == 'left out: 1'
+
+
+def slow_errors(count, sigma_m, sigma_deg, seed=1):
+    """Return pose errors (F, 6) that change over about three seconds."""
+    rng = np.random.default_rng(seed)
+    errors, keep = np.zeros((count, 6)), np.exp(-0.2 / 3.0)
+    for frame in range(count):
+        errors[frame] = (keep * errors[frame - 1] + np.sqrt(1 - keep**2) * rng.normal(size=6)
+                         if frame else rng.normal(size=6))
+    return errors * np.repeat([sigma_m, np.radians(sigma_deg)], 3)
+
+
+def test_joint_refinement_corrects_poses_and_landmarks():
+    table, poses = make_table(), walk_around(frames=150)
+    errors = slow_errors(len(poses), 0.05, 1.0)
+    wrong = poses.copy()
+    wrong[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    wrong[:, :3, 3] += errors[:, :3]
+    detections = see(table, poses, noise_px=2.0).with_poses(wrong)
+    plain = build_map(detections)
+    joint = build_map(detections, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
+
+    def relative_error(built):
+        """Compare distances between landmarks, which the errors' mean does not touch."""
+        rows = [np.linalg.norm(built.landmark_map.centers - center, axis=1).argmin()
+                for center in table.centers]
+        centers = built.landmark_map.centers[rows]
+        distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+        truth = np.linalg.norm(table.centers[:, None] - table.centers[None], axis=2)
+        return float(np.abs(distances - truth).mean())
+
+    assert len(joint.landmark_map) == len(table)
+    assert relative_error(joint) < 0.4 * relative_error(plain)
+    assert relative_error(joint) < 0.01
+    left = joint.map_from_camera[:, :3, 3] - poses[:, :3, 3]
+    assert left.std(axis=0).mean() < 0.6 * errors[:, :3].std(axis=0).mean()
+    assert joint.report.pose_change_m > 0.03
+    assert plain.report.pose_change_m == 0.0
+
+
+def test_true_poses_stay_where_they_are():
+    table, poses = make_table(), walk_around()
+    joint = build_map(see(table, poses), MappingOptions(pose_errors=PoseErrors(0.02, 0.5)))
+    assert np.abs(joint.map_from_camera[:, :3, 3] - poses[:, :3, 3]).max() < 2e-3
+    assert nearest_errors(joint.landmark_map, table).max() < 0.004
+
+
+def test_objects_behind_one_another_do_not_confuse_it():
+    table = make_table()
+    low = np.array([look_at(np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 0.9]))
+                    for a in np.linspace(0, 5, 80)])
+    built = build_map(see(table, low, noise_px=1.0))
+    assert len(built.landmark_map) == len(table)
+    assert nearest_errors(built.landmark_map, table).max() < 0.02
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda one: one.select_frames([3]), 'took 1 viewpoints, at least 3 are needed; move it'),
+    (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
+     'check that the poses are those of the images'),
+    (lambda one: replace(one, frame_offsets=np.zeros(len(one) + 1, dtype=np.int64),
+                         bboxes_xyxy=np.empty((0, 4)), classes=np.empty(0, dtype=np.int64),
+                         scores=np.empty(0)), 'have no detections; check the detector'),
+    # a base whose x axis looks forward instead of the camera's z
+    (lambda one: one.with_poses(one.map_from_camera @ np.array(
+        [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
+     'check that poses and stamps belong to these images|no landmark is good enough'),
+])
+def test_input_without_a_map_says_what_to_correct(change, message):
+    with pytest.raises(MappingError, match=message):
+        build_map(change(see(make_table(), walk_around())))
+
+
+def test_doubtful_input_is_noted():
+    detections = see(make_table(), walk_around())
+    poses = detections.map_from_camera.copy()
+    poses[20, :3, 3] += (50.0, 0.0, 0.0)
+    built = build_map(detections.with_poses(poses))
+    assert any('the poses jump 2 times, first at 4.00 s' in note for note in built.report.notes)
+    only = replace(detections, class_names=('cup',), classes=np.zeros_like(detections.classes))
+    assert any("of the class 'cup'" in note for note in build_map(only).report.notes)
+
+
+def test_frames_without_boxes_do_no_harm():
+    table = make_table()
+    detections = see(table, walk_around())
+    away = see(table, [look_at(np.array([3.0, 0.0, 1.0]), (9.0, 0.0, 1.0))] * 3)
+    assert len(away.classes) == 0
+    joined = replace(
+        detections, map_from_camera=np.concatenate([detections.map_from_camera,
+                                                    away.map_from_camera]),
+        stamps_s=np.concatenate([detections.stamps_s, 100.0 + away.stamps_s]),
+        frame_offsets=np.concatenate([detections.frame_offsets,
+                                      np.repeat(detections.frame_offsets[-1], 3)]))
+    assert len(build_map(joined).landmark_map) == len(table)
+
+
+def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
+    table = make_table(count=1)
+    table = replace(table, semi_axes=np.array([[0.3, 0.3, 0.3]]))
+    # the object lies half outside the image in most frames
+    poses = np.array([look_at(np.array([1.6 * np.cos(a), 1.6 * np.sin(a), 1.2]),
+                              (0.45 * np.sin(7 * a), -0.45 * np.sin(5 * a), 0.8))
+                      for a in np.linspace(0.0, 5.0, 60)])
+    detections = see(table, poses)
+    cut = ((detections.bboxes_xyxy <= 0.0)
+           | (detections.bboxes_xyxy >= [CAMERA.width, CAMERA.height] * 2)).any(axis=1)
+    assert cut.mean() > 0.3
+    built = build_map(detections).landmark_map
+    assert len(built) == 1
+    assert built.semi_axes[0] == pytest.approx(np.full(3, 0.3), abs=0.01)
+    assert CLASSES[detections.classes[0]] == built.class_ids[0]
+
+
+def test_one_object_under_two_names_becomes_class_weights():
+    table = make_table()
+    detections = see(table, walk_around(frames=90))
+    built = build_map(detections)
+    row = int(np.flatnonzero(np.array(built.landmark_map.class_ids) == 'bottle')[0])
+    classes = detections.classes.copy()
+    boxes = np.flatnonzero(built.shown == row)
+    classes[boxes[::4]] = CLASSES.index('cup')
+    renamed = build_map(replace(detections, classes=classes))
+    assert len(renamed.landmark_map) == len(table)
+    same = np.linalg.norm(renamed.landmark_map.centers - built.landmark_map.centers[row],
+                          axis=1).argmin()
+    assert renamed.landmark_map.class_ids[same] == 'bottle'
+    assert dict(renamed.landmark_map.details[same].class_weights) == pytest.approx(
+        {'bottle': 0.75, 'cup': 0.25}, abs=0.02)
+    others = [one for number, one in enumerate(renamed.landmark_map.details) if number != same]
+    assert all(one.class_weights is None for one in others)
+    assert renamed.report.explained == 1.0

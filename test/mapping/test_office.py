@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of a real office, held to test/thresholds.yaml."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.landmarks import landmarks_of_map
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.report import explained_boxes
+from cliploc_ros.mapping.views import make_views
+
+
+@pytest.fixture(scope='module')
+def office(shared_data) -> Path:
+    return shared_data / 'tum_fr3_office'
+
+
+@pytest.fixture(scope='module')
+def observations(office):
+    return load_observations(office / 'observations.npz')
+
+
+@pytest.fixture(scope='module')
+def splits(office) -> dict:
+    return json.loads((office / 'splits.json').read_text())
+
+
+@pytest.fixture(scope='module')
+def even(observations, splits):
+    return observations.select_frames(splits['even']['map'])
+
+
+@pytest.fixture(scope='module')
+def even_map(even):
+    return build_map(even).landmark_map
+
+
+@pytest.fixture(scope='session')
+def required() -> dict:
+    path = Path(__file__).parents[1] / 'thresholds.yaml'
+    return yaml.safe_load(path.read_text())['mapping']
+
+
+def held_out(observations, split, landmark_map):
+    frames = sorted({frame for _, _, frame in split['queries']})
+    views = make_views(observations.select_frames(frames), MappingOptions())
+    return explained_boxes(views, landmarks_of_map(landmark_map, observations.class_names))
+
+
+def test_even_frames_explain_the_odd_ones(observations, splits, even_map, required):
+    explained, iou = held_out(observations, splits['even'], even_map)
+    print(f'even: {len(even_map)} landmarks, explained {explained:.3f}, median IoU {iou:.3f}')
+    assert explained >= required['even']['explained']
+    assert iou >= required['even']['median_iou']
+
+
+@pytest.mark.parametrize('name', ['block0', 'block1'])
+def test_other_seconds_are_explained(observations, splits, required, name):
+    built = build_map(observations.select_frames(splits[name]['map'])).landmark_map
+    explained, iou = held_out(observations, splits[name], built)
+    print(f'{name}: {len(built)} landmarks, explained {explained:.3f}, median IoU {iou:.3f}')
+    assert explained >= required[name]['explained']
+    assert iou >= required[name]['median_iou']
+
+
+def test_the_map_relocalizes(office, shared_data, even_map, required, tmp_path):
+    tool = shared_data.parent / 'tools' / 'simulate_queries.py'
+    if not tool.is_file():
+        pytest.skip(f'needs {tool}, which makes queries for a map')
+    write_map(tmp_path / 'map.yaml', even_map)
+    for command in (
+            [tool, '--observations', office / 'observations.npz', '--splits',
+             office / 'splits.json', '--split', 'even', '--map', 'map.yaml', '--seed', '1',
+             '--out', 'q.npz'],
+            ['-m', 'cliploc_ros.cli.evaluate', '--queries', 'q.npz', '--map', 'map.yaml',
+             '--methods', 'auto', '--trials', '1', '--no-figures', '--workers', '1', '--sweep',
+             '--out', 'result']):
+        done = subprocess.run([sys.executable, *map(str, command)], cwd=tmp_path, timeout=300,
+                              capture_output=True, text=True,
+                              env={**os.environ,
+                                   'PYTHONPATH': str(Path(__file__).parents[2])})
+        assert done.returncode == 0, done.stderr
+    results = json.loads((tmp_path / 'result' / 'results.json').read_text())
+    errors_m = np.array([np.inf if one['error_m'] is None else one['error_m']
+                         for one in results])
+    accepted = np.array([one['accepted'] for one in results])
+    success = [float(np.mean(errors_m < limit)) for limit in (0.25, 0.5, 1.0)]
+    print(f'success at .25 / .5 / 1 m: {" ".join(f"{one:.2f}" for one in success)}; accepted '
+          f'{accepted.mean():.2f}, of these wrong {np.sum(accepted & (errors_m >= 1.0))}')
+    assert (np.array(success) >= required['even']['success']).all()
+    assert np.sum(accepted & (errors_m >= 1.0)) <= required['even']['false_accepts']
+
+
+def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required):
+    rng = np.random.default_rng(0)
+    keep = np.exp(-np.diff(even.stamps_s) / 3.0)
+    errors = rng.normal(size=(len(even), 6))
+    for frame in range(1, len(even)):
+        errors[frame] = (keep[frame - 1] * errors[frame - 1]
+                         + np.sqrt(1 - keep[frame - 1]**2) * errors[frame])
+    errors *= np.repeat([0.05, np.radians(1.0)], 3)
+    poses = even.map_from_camera.copy()
+    poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    poses[:, :3, 3] += errors[:, :3]
+    noisy = even.with_poses(poses)
+
+    def median_offset(built):
+        """Return how far landmarks lie from those of true poses [m]."""
+        found = built.landmark_map
+        names = np.array(found.class_ids)
+        return float(np.median([
+            np.linalg.norm(found.centers[names == name] - center, axis=1).min(initial=np.inf)
+            for center, name in zip(even_map.centers, even_map.class_ids, strict=True)]))
+
+    plain = build_map(noisy)
+    joint = build_map(noisy, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
+    print(f'plain: {len(plain.landmark_map)} landmarks, off by {median_offset(plain):.3f} m; '
+          f'joint: {len(joint.landmark_map)}, off by {median_offset(joint):.3f} m')
+    assert median_offset(joint) <= required['joint_share'] * median_offset(plain)
+    assert len(joint.landmark_map) < len(plain.landmark_map)

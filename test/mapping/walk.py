@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A walk around a table of known ellipsoids, as a perfect detector sees it: simulated."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.mapping.posed_detections import PosedDetections
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+CLASSES = ('book', 'bottle', 'cup')
+
+
+def make_table(count=9) -> LandmarkMap:
+    """Ellipsoids of three classes, at least 40 cm apart, about the origin."""
+    rng = np.random.default_rng(3)
+    places = [(0.5 * x, 0.5 * y) for x in (-1, 0, 1) for y in (-1, 0, 1)][:count]
+    centers = np.c_[np.array(places), np.full(count, 0.8)] + rng.uniform(-0.05, 0.05, (count, 3))
+    quats = Rotation.from_euler('z', rng.uniform(0, np.pi, (count, 1))).as_quat()
+    names = tuple(CLASSES[i % 3] for i in range(count))
+    return LandmarkMap('map', tuple(f'thing_{i}' for i in range(count)), names, names, centers,
+                       rng.uniform(0.06, 0.15, (count, 3)), quats)
+
+
+def look_at(position, target=(0.0, 0.0, 0.8)):
+    """Return map_from_camera of a camera that looks at a point, upright."""
+    forward = np.asarray(target) - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return make_transform(np.stack([right, np.cross(forward, right), forward], axis=1),
+                          np.asarray(position, dtype=float))
+
+
+def walk_around(frames=60, turn_deg=300.0, radius=2.2):
+    """Return poses (F, 4, 4) on an arc about the table, at changing height."""
+    angles = np.radians(np.linspace(0.0, turn_deg, frames))
+    return np.array([look_at(np.array([radius * np.cos(a), radius * np.sin(a),
+                                       1.5 + 0.3 * np.sin(2 * a)])) for a in angles])
+
+
+def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDetections:
+    """Return what a detector sees: boxes with noise, clipped to the image; some are missed."""
+    rng = np.random.default_rng(seed)
+    size = np.array([640.0, 480.0, 640.0, 480.0])
+    classes, boxes, counts = [], [], []
+    for pose in poses:
+        outlines = project_ellipsoids(invert_transform(pose), table.centers, table.shapes)
+        full = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+        full = full + rng.normal(scale=noise_px, size=full.shape) if noise_px else full
+        clipped = np.clip(full, 0.0, size)
+        seen = (clipped[:, 2:] - clipped[:, :2] > 8.0).all(axis=1)
+        seen &= rng.random(len(seen)) >= missed
+        boxes.append(clipped[seen])
+        classes += [CLASSES.index(name) for name, one in zip(table.class_ids, seen, strict=True)
+                    if one]
+        counts.append(int(seen.sum()))
+    bboxes = np.concatenate(boxes)
+    return PosedDetections(
+        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum([0, *counts]), bboxes,
+        CLASSES, np.array(classes, dtype=np.int64), np.full(len(bboxes), 0.9))
+
+
+def nearest_errors(built: LandmarkMap, table: LandmarkMap):
+    """Return the distance [m] from each true landmark to the nearest built one of its class."""
+    errors = []
+    for center, name in zip(table.centers, table.class_ids, strict=True):
+        same = np.array([one == name for one in built.class_ids])
+        errors.append(np.linalg.norm(built.centers[same] - center, axis=1).min(initial=np.inf))
+    return np.array(errors)
