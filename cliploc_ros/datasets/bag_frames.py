@@ -96,6 +96,8 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     DatasetError
         A topic is missing, of another type, or empty, or the poses are of another time.
     """
+    if topics.depth == topics.image:
+        raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')
     with BagReader(bag) as reader:
         for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
                             *([(topics.depth, (_IMAGE,))] if topics.depth else [])):
