@@ -87,7 +87,7 @@ def test_a_deadly_task_is_given_up_alone(caplog):
 
 def test_without_dask():
     if importlib.util.find_spec('distributed'):
-        with pytest.raises(WorkersError, match='no Dask scheduler answers at tcp://127.0.0.1:9'):
+        with pytest.raises(WorkersError, match='no Dask scheduler answers'):
             results(Square(), scheduler='tcp://127.0.0.1:9')
     else:
         with pytest.raises(OptionsError, match='--scheduler needs Dask: pip install distributed'):

@@ -3,7 +3,6 @@
 """Maps built with measured depth: simulated walks, and the real kitchen."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
