@@ -36,6 +36,7 @@ setup(
             'open_clip_torch', 'safetensors', 'torch', 'torchvision',
             'ultralytics-opencv-headless',
         ],
+        'cluster': ['distributed'],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
         'test': ['hypothesis', 'pytest', 'pytest-xdist'],

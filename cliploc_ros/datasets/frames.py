@@ -19,6 +19,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.depth import DepthCamera, DepthImage, depth_from_counts
 from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.units import NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,10 @@ class RawFrame:
     map_from_camera: NDArray[np.float64] | None
     color: Callable[[], tuple[NDArray[np.uint8], Camera]]
     depth: Callable[[], DepthImage] | None = None
+
+    def __str__(self) -> str:
+        """Name the frame in messages."""
+        return f'image {self.place} at {self.stamp_ns / NS_PER_S:.6f} s'
 
     def decode(self) -> Frame:
         """Return the frame.
