@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How colcon installs the package. script/setup brings the environment that it runs in."""
+"""Build and install the package with colcon; script/setup makes the Python environment."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ PACKAGE = 'cliploc_ros'
 
 
 def files(folder: str, pattern: str) -> list[str]:
-    """List what is to be installed from a folder, which may be absent."""
+    """List the files of a folder to install; the folder may be absent."""
     return [str(path) for path in sorted(Path(folder).glob(pattern))]
 
 
@@ -29,11 +29,12 @@ setup(
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',
-    # Without version numbers: script/requirements.txt is the one place for those.
+    # script/requirements*.txt hold the versions. OpenCV is missing here: pip's and apt's packages
+    # of it have different names.
     install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
     extras_require={
         'models': [
-            'open_clip_torch', 'safetensors', 'torch', 'torchvision',
+            'huggingface_hub', 'open_clip_torch', 'pillow', 'safetensors', 'torch', 'torchvision',
             'ultralytics-opencv-headless',
         ],
         'cluster': ['distributed'],
@@ -44,7 +45,7 @@ setup(
     zip_safe=False,
     maintainer='the cliploc_ros authors',
     maintainer_email='cliploc-ros@example.org',
-    description='Global localization in a map of labelled objects, from one image.',
+    description='Global localization from one image in a map of labelled objects (CLIP-Loc).',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

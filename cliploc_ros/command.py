@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables share: errors as one line, and an end on Ctrl-C or SIGTERM."""
+"""Shared by the executables: errors in one line, and a clean end on Ctrl-C or SIGTERM."""
 
 import signal
 import sys
@@ -9,7 +9,7 @@ from types import FrameType
 
 from cliploc_ros.errors import CliplocError
 
-#: What a shell reports for a command ended by Ctrl-C.
+#: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
 
 
@@ -24,7 +24,7 @@ def run_command(command: Callable[[], int]) -> int:
     Returns
     -------
     int
-        The exit code: 1 after one line on stderr for input that the user can mend, 130
+        The exit code: 1 after a CliplocError, which it prints in one line on stderr, and 130
         when interrupted. Other exceptions keep their traceback.
     """
     try:
@@ -40,7 +40,7 @@ def run_command(command: Callable[[], int]) -> int:
 def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
     """Split off the arguments from each ``--ros-args`` to its ``--``, which launch appends.
 
-    rclpy's own function would also take any OLD:=NEW away, a notation of ROS 2's beginnings.
+    rclpy's own function also removes every OLD:=NEW, an early notation of ROS 2.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def interrupt_on_sigterm() -> None:
-    """Let SIGTERM end the process as Ctrl-C does, so that half-written output is removed."""
+    """Make SIGTERM raise KeyboardInterrupt as Ctrl-C does, so that partial output is removed."""
     signal.signal(signal.SIGTERM, _interrupt)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the objects look like, and the words that say so."""
+"""The looks of objects, and the labels that describe them."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ COLORS = {
     'black': (28, 28, 30),
     'white': (236, 236, 232),
 }
-#: Ornaments in a second colour, and how a label names them.
+#: Patterns in a second colour, and how a label names them.
 PATTERNS = {
     'plain': '',
     'dots': 'with {color} dots',
@@ -31,7 +31,7 @@ PATTERNS = {
     'checks': 'with {color} checks',
     'label': 'with a {color} label',
 }
-#: Words printed on the label of an object of a class.
+#: Words printed on objects, by class.
 WORDS = {
     'mug': ('TEA', 'JOE', 'HOT'),
     'bottle': ('OIL', 'WINE', 'MILK'),
@@ -44,7 +44,7 @@ SIZES = {'small': 0.8, 'medium': 1.0, 'large': 1.2}
 
 @dataclass(frozen=True)
 class Appearance:
-    """What tells an object apart.
+    """What distinguishes an object.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Appearance:
     second_color : str
         Colour of the pattern.
     word : str
-        What is printed on it, '' for nothing.
+        The printed word, '' for none.
     size : str
         A key of `SIZES`.
     """
@@ -71,7 +71,7 @@ class Appearance:
 
     @property
     def label(self) -> str:
-        """The description in plain words, as a person who makes a map would write it."""
+        """The label, as a person would write it for a map."""
         size = {'large': 'tall' if self.class_id == 'bottle' else 'large'}.get(
             self.size, self.size)
         adjectives = ([] if size == 'medium' else [size])
@@ -91,7 +91,7 @@ def _article(word: str) -> str:
 
 
 def draw_appearance(class_id: str, rng: np.random.Generator) -> Appearance:
-    """Draw what an object of a class looks like."""
+    """Draw the look of an object of a class at random."""
     color, second = rng.choice(list(COLORS), 2, replace=False)
     pattern = str(rng.choice(list(PATTERNS), p=(0.2, 0.16, 0.16, 0.16, 0.16, 0.16)))
     word = ''
@@ -102,7 +102,7 @@ def draw_appearance(class_id: str, rng: np.random.Generator) -> Appearance:
 
 
 def draw_lookalike(original: Appearance, rng: np.random.Generator) -> Appearance:
-    """Draw an object that is nearly identical: it differs in the second colour alone."""
+    """Draw a nearly identical look, which differs in the second colour only."""
     others = [c for c in COLORS if c not in (original.color, original.second_color)]
     pattern = 'dots' if original.pattern == 'plain' else original.pattern
     return Appearance(original.class_id, original.color, pattern, str(rng.choice(others)),

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's claim, with real networks: ``python -m demo_world.class_growth --out DIR``.
+"""Measure growing classes with real networks: ``python -m demo_world.class_growth --out DIR``.
 
-Rooms of 48 objects each: of eight classes, then of four, of two, of one. What is seen stays as
-much, but more and more of it is of the same class. Matching by class must then try ever more
-correspondences, and finds the right ones ever more rarely; labels tell them apart.
+Each room holds 48 objects: of eight classes, then of four, of two, of one. The camera sees as many
+objects in each, but more of them share a class. Matching by class then has more candidates and
+finds the right ones less often. Labels still distinguish the objects.
 """
 
 import argparse
@@ -29,19 +29,19 @@ from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import make_queries
 from demo_world.compare import record
 
-#: Objects of each class; the fewer the classes, the more.
+#: Objects of each class in the four rooms.
 COUNTS = (6, 12, 24, 48)
 _TOTAL = 48
 _CLASSES = ('book', 'box', 'bottle', 'plant', 'mug', 'can', 'bowl', 'clock')
 METHODS = ('class_ransac', 'class_bf', 'hybrid_ransac', 'hybrid_b-prosac', 'auto')
 _SUCCESS_M = 0.5
 _TRIALS = 5
-# A search is cut short after two seconds: whole, exhaustive ones would take hours.
+# A search ends after two seconds: complete exhaustive searches would take hours.
 _OPTIONS = RelocalizerOptions(iterations=500, time_budget_s=2.0)
 
 
 def render(folder: Path, count: int, images: int, seed: int) -> None:
-    """Render a room with so many objects of each class, all of them in the map."""
+    """Render a room with `count` objects of each class, all of them in the map."""
     from demo_world.recording import record as record_walk
     from demo_world.recording import write_true_map
     from demo_world.renderer import Light, Renderer
@@ -55,20 +55,20 @@ def render(folder: Path, count: int, images: int, seed: int) -> None:
 
 
 def _whole_search_s(one: Summary) -> float:
-    """Return the mean time of a search [s]; of bf cut short, what all of it would take."""
+    """Return the mean time of a search [s], extrapolated to the whole search for bf."""
     share = np.maximum(one.coverage, 1e-9) if one.method.endswith('_bf') else 1.0
     return float((one.search_ms / share).mean()) / 1e3
 
 
 def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
-    """Draw success and time over the number of objects of a class, the key of the summaries."""
+    """Draw success and time over the objects of each class, the key of the summaries."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.8), layout='constrained')
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    # Okabe and Ito's colours, which the colour-blind tell apart.
+    # Okabe and Ito's colours, which colour-blind readers can distinguish.
     styles = dict(zip(METHODS, (('#D55E00', 'o-'), ('#E69F00', 's--'), ('#56B4E9', '^-.'),
                                 ('#0072B2', 'D-'), ('#000000', 'v-')), strict=True))
     for method, (color, style) in styles.items():
@@ -101,7 +101,7 @@ def run(arguments: list[str]) -> int:
     summaries: dict[int, list[Summary]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
         rooms = {count: Path(name) / str(count) for count in COUNTS}
-        # In processes of its own: the LLVMs of Mesa and of PyTorch do not bear each other.
+        # In other processes: Mesa and PyTorch each load an LLVM, and the two conflict.
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
             made = [pool.submit(render, folder, count, options.images, options.seed)
                     for count, folder in rooms.items()]

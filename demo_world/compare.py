@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's table in the demo's world: ``python -m demo_world.compare --out DIR``.
+"""Compare the paper's methods in the demo's world: ``python -m demo_world.compare --out DIR``.
 
-Scores the small networks on the walk they were never trained on, records what they say of it
-once, and runs the paper's ten methods on that.
+This scores the small networks on the demo's walk, which they were not trained on, records their
+output once, and runs the paper's ten methods on the recording.
 """
 
 import argparse
@@ -60,10 +60,10 @@ def score_detector(sequence: Path) -> float:
 
 def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
                landmark_ids: Sequence[str]) -> tuple[float, float, int]:
-    """Return how often a detected object's own label is the most similar, and of the top 3.
+    """Return CLIP's top-1 and top-3 accuracy, and the number of detected objects.
 
-    Detections that overlap a true box by more than half, of objects in the map, are counted;
-    their number comes third.
+    An object counts if it is in the map and a detection overlaps its true box by an IoU of more
+    than .5.
     """
     ranks = []
     for frame, true_frame in zip(frames, truth, strict=True):
@@ -92,11 +92,11 @@ def run(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog='compare', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')
-    parser.add_argument('--trials', type=int, default=5, help='with other seeds (%(default)s)')
+    parser.add_argument('--trials', type=int, default=5, help='number of seeds (%(default)s)')
     parser.add_argument('--iterations', type=int, default=500, help="the paper's %(default)s")
     parser.add_argument('--budget', type=float, default=2.0, metavar='S',
-                        help='a search is cut short after so long [s] (%(default)s); some '
-                        'exhaustive ones are')
+                        help='time limit of a search [s] (%(default)s), which some exhaustive '
+                        'searches reach')
     parser.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args(arguments)
     make_folder(options.out)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the world of the demo: ``python -m demo_world.make_demo_world DIR``.
+"""Make the world of the demo: ``python -m demo_world.make_demo_world DIR``.
 
-A room no model was trained on. The map is made on a walk round its middle; then objects are moved
-and the lamp is changed, and on another walk the images are taken in which the robot wakes up.
+No model was trained on this room. The map comes from a walk around its centre. Then some objects
+move and the light changes, and another walk yields the images of the wake-ups.
 """
 
 import argparse
@@ -17,14 +17,14 @@ from demo_world.renderer import Light, Renderer
 from demo_world.room import make_room, move_objects
 from demo_world.trajectories import CAMERA, mapping_walk, query_walk
 
-#: Far from the seeds of the worlds to train on, which start at 1000.
+#: Not among the seeds of the training worlds, which start at 1000.
 SEED = 7
 _MAPPING_LIGHT = Light()
 _QUERY_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 
 
 def make_demo_world(folder: Path, images: int, seed: int = SEED) -> None:
-    """Write a map (map.yaml) and the images of the other walk (sequence/) into a folder."""
+    """Write the map (map.yaml) and the images of the wake-ups (sequence/) to a folder."""
     room = make_room(seed, dict.fromkeys(CLASSES, 8))
     folder.mkdir(parents=True, exist_ok=True)
     mapping = mapping_walk(120)
@@ -42,7 +42,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='make_demo_world', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folder', type=Path, metavar='DIR')
-    parser.add_argument('--images', type=int, default=48, help='of the other walk (%(default)s)')
+    parser.add_argument('--images', type=int, default=48,
+                        help='images of the second walk (%(default)s)')
     parser.add_argument('--seed', type=int, default=SEED)
     options = parser.parse_args()
     make_demo_world(options.folder, options.images, options.seed)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes worlds to train on: ``python -m demo_world.make_worlds DIR --count 100``."""
+"""Make worlds for training: ``python -m demo_world.make_worlds DIR --count 100``."""
 
 import argparse
 import multiprocessing
@@ -17,10 +17,7 @@ from demo_world.trajectories import CAMERA, draw_views
 
 
 def make_world(folder: Path, seed: int, frames: int) -> None:
-    """Make one world with views from anywhere in it, and write it as a TUM folder.
-
-    A world that is already whole there is left as it is.
-    """
+    """Render one world from random views and write it as a TUM folder, unless it exists."""
     if (folder / 'map.yaml').exists():  # written last
         return
     rng = np.random.default_rng(seed)
@@ -31,14 +28,14 @@ def make_world(folder: Path, seed: int, frames: int) -> None:
 
 
 def main() -> None:
-    """Make worlds, several at once, each from its own seed."""
+    """Make worlds in parallel, each from its own seed."""
     parser = argparse.ArgumentParser(prog='make_worlds', description=__doc__)
     parser.add_argument('folder', type=Path, metavar='DIR')
     parser.add_argument('--count', type=int, default=90, help='number of worlds (%(default)s)')
-    parser.add_argument('--frames', type=int, default=10, help='images of each (%(default)s)')
-    parser.add_argument('--seed', type=int, default=1000, help='of the first (%(default)s)')
+    parser.add_argument('--frames', type=int, default=10, help='images each (%(default)s)')
+    parser.add_argument('--seed', type=int, default=1000, help='seed of the first (%(default)s)')
     parser.add_argument('--jobs', type=int, default=multiprocessing.cpu_count(),
-                        help='worlds made at once (%(default)s)')
+                        help='parallel processes (%(default)s)')
     options = parser.parse_args()
     # VTK's contexts do not survive a fork.
     context = multiprocessing.get_context('spawn')

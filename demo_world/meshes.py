@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes of the objects and the furniture: boxes and surfaces of revolution."""
+"""Meshes of objects and furniture: boxes and surfaces of revolution."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from demo_world.appearance import SIZES, Appearance
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with texture coordinates, standing on z = 0, x to the front.
+    """Triangles with texture coordinates; they stand on z = 0 with x to the front.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ class Mesh:
 
     @property
     def half_extents(self) -> npt.NDArray[np.float64]:
-        """Half lengths of the box around it, shape (3,), [m]."""
+        """Half the side lengths of the bounding box, shape (3,), [m]."""
         return (self.vertices.max(0) - self.vertices.min(0)) / 2
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Put meshes into one."""
+    """Join meshes into one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]),
                 np.concatenate([mesh.uv for mesh in meshes]),
@@ -45,9 +45,9 @@ def join(*meshes: Mesh) -> Mesh:
 
 def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0),
         uv_m: float | None = None) -> Mesh:
-    """Make a box of a size [m] that stands with the middle of its bottom at a point.
+    """Make a box of a size [m] with the centre of its bottom at a point [m].
 
-    With `uv_m` a texture covers so many metres; without, each face shows it once.
+    With `uv_m` the texture repeats after this many metres; without, each face shows it once.
     """
     vertices: list[npt.NDArray[np.float64]] = []
     uv, triangles = [], []
@@ -61,7 +61,7 @@ def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0
                 corner = np.zeros(3)
                 corner[axis], corner[across], corner[up] = sign, a, b
                 vertices.append(corner * half + (0, 0, half[2]) + np.array(at))
-                mirror = sign * (1 if axis != 1 else -1)  # read from outside, left to right
+                mirror = sign * (1 if axis != 1 else -1)  # text reads correctly from outside
                 cell = np.array([(a * mirror + 1) / 2, (b + 1) / 2])
                 uv.append(cell * 2 * half[[across, up]] / uv_m if uv_m else cell)
             triangles += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
@@ -69,7 +69,7 @@ def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0
 
 
 def revolve(profile: list[tuple[float, float]], sides: int = 28) -> Mesh:
-    """Turn a profile of (radius, height) [m] about the vertical; the texture goes round it."""
+    """Revolve a profile of (radius, height) [m] about the vertical; the texture wraps around."""
     radii, heights = np.array(profile).T
     angles = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -86,7 +86,7 @@ def revolve(profile: list[tuple[float, float]], sides: int = 28) -> Mesh:
 
 
 def _ring(radius: float, thickness: float, at: tuple[float, float]) -> Mesh:
-    """Make a ring in the plane y = 0: the handle of a mug; `at` is its centre (x, z)."""
+    """Make the handle of a mug: a ring in the plane y = 0 with centre (x, z) `at`."""
     u, w = np.meshgrid(np.linspace(0, 2 * np.pi, 17), np.linspace(0, 2 * np.pi, 9), indexing='ij')
     reach = radius + thickness * np.cos(w)
     vertices = np.stack([at[0] + reach * np.cos(u), thickness * np.sin(w),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a cheap camera does to an image: motion blur, exposure, noise."""
+"""Degrade an image as a cheap camera does: motion blur, exposure, noise."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 def expose(image: npt.NDArray[np.uint8], rng: np.random.Generator,
            blur_px: float = 2.0) -> npt.NDArray[np.uint8]:
-    """Take a photograph of a perfect image.
+    """Add motion blur, exposure error and noise to an image.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def expose(image: npt.NDArray[np.uint8], rng: np.random.Generator,
 
 def _move(image: npt.NDArray[np.uint8], length_px: float, angle: float) -> \
         npt.NDArray[np.uint8]:
-    """Average the image along a line, as a turning camera does."""
+    """Blur the image along a line, as a turning camera does."""
     if length_px < 1:
         return image
     half = int(np.ceil(length_px / 2))

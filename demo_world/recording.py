@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recording a walk through a world: a TUM folder with its truth, and the map made from a walk."""
+"""Record a walk through a world as a TUM folder with ground truth, and write maps."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -27,32 +27,32 @@ from demo_world.renderer import Renderer
 from demo_world.room import Room, WorldObject
 from demo_world.trajectories import CAMERA
 
-#: Objects of which fewer pixels are seen are not labelled.
+#: An object with fewer visible pixels gets no box.
 _FEWEST_PX = 40
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 88]
-#: Centre [m] and logarithms of the axes of an object differ so much from those of its kind.
+#: Prior spread of an object's centre [m] and of the logarithms of its axes.
 _USUAL_SPREAD = np.array([0.03, 0.03, 0.03, 0.2, 0.2, 0.2])
 Box = dict[str, Any]
 
 
 def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.float64], *,
            seed: int, rate_hz: float = 1.0, advance: Callable[[], object] = lambda: None) -> None:
-    """Render the images of a walk and write them with their truth as a TUM folder.
+    """Render a walk and write its images and ground truth as a TUM folder.
 
     Parameters
     ----------
     folder : Path
-        Made if need be.
+        Made if it does not exist.
     room : Room
-        What stands where.
+        The room.
     renderer : Renderer
-        Of the room.
+        Renderer of the room.
     poses : (n, 4, 4) array
         map_from_camera of each image.
     seed : int
-        For what the camera does to the images.
+        Seed of the camera's errors.
     rate_hz : float
-        Images a second in their stamps.
+        Rate of the stamps [Hz].
     advance : callable, optional
         Called after each image.
     """
@@ -80,7 +80,7 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
 
 def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.float64]) -> \
         list[Box]:
-    """Find the boxes about the visible pixels of each object, and how much of it they show."""
+    """Find the box around the visible pixels of each object, and the visible share."""
     index = renderer.render_index(map_from_camera)
     boxes = []
     for number in np.unique(index[index >= 0]):
@@ -88,7 +88,7 @@ def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.f
         outline = _outline_px(room.objects[number], map_from_camera)
         if len(rows) < _FEWEST_PX or outline == 0:
             continue
-        # Pixel centres are whole numbers, so that a pixel reaches half of one further.
+        # Pixel centres have integer coordinates: a pixel extends by half a pixel.
         bbox = [columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5]
         boxes.append({'object': room.objects[number].name, 'bbox_xyxy': [float(x) for x in bbox],
                       'visibility': round(min(1.0, len(rows) / outline), 3)})
@@ -96,9 +96,9 @@ def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.f
 
 
 def _outline_px(item: WorldObject, map_from_camera: npt.NDArray[np.float64]) -> int:
-    """Count the pixels that an object would cover if it stood alone in a boundless image.
+    """Count the pixels that an object would cover alone in an unbounded image.
 
-    0 for one that reaches the camera or is too near to be seen as a whole.
+    The result is 0 for an object that reaches the camera or is too near to be seen whole.
     """
     camera_from_object = invert_transform(map_from_camera) @ item.map_from_object
     hulls = []
@@ -119,7 +119,7 @@ def _outline_px(item: WorldObject, map_from_camera: npt.NDArray[np.float64]) -> 
 
 
 def write_true_map(path: Path, room: Room) -> None:
-    """Write the map that knows the ellipsoids of its objects exactly."""
+    """Write the map with the exact ellipsoids of its objects."""
     _write_map(path, {o.name: o.landmark() for o in room.objects if o.in_map})
 
 
@@ -128,8 +128,8 @@ def write_fitted_map(path: Path, room: Room, renderer: Renderer,
                      advance: Callable[[], object] = lambda: None) -> None:
     """Write a map as a mapping run makes it: ellipsoids fitted to the boxes of many views.
 
-    Whole and little covered objects alone are used; their boxes are scattered by a pixel, as a
-    detector's are. Objects seen whole fewer than three times keep the ellipsoid about them.
+    The fit uses views that show an object whole and hardly covered, with boxes perturbed by a
+    pixel like a detector's. An object with fewer than three such views keeps its exact ellipsoid.
     """
     rng = np.random.default_rng(seed)
     views: dict[str, list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]] = {}
@@ -148,7 +148,7 @@ def write_fitted_map(path: Path, room: Room, renderer: Renderer,
 
 def _fit(entry: dict[str, Any], views: Iterable[tuple[npt.NDArray[np.float64], ...]]) -> \
         dict[str, Any]:
-    """Fit centre and axes of an ellipsoid so that its outlines fill its boxes."""
+    """Fit centre and axes of an ellipsoid to its boxes."""
     views = list(views)
     if len(views) < 3:
         return entry
@@ -159,7 +159,7 @@ def _fit(entry: dict[str, Any], views: Iterable[tuple[npt.NDArray[np.float64], .
 
     def residuals(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         outlines = _outline_boxes(x[:3], np.exp(x[3:]), quats, poses)
-        # Views from one side alone leave the depth open: then the usual form decides.
+        # Views from one side leave the depth undetermined: then the prior decides.
         return np.concatenate([(outlines - bboxes).ravel(), (x - start) / _USUAL_SPREAD])
 
     found = least_squares(residuals, start, loss='soft_l1', f_scale=3.0).x
@@ -169,10 +169,10 @@ def _fit(entry: dict[str, Any], views: Iterable[tuple[npt.NDArray[np.float64], .
 def _outline_boxes(center: npt.NDArray[np.float64], semi_axes: npt.NDArray[np.float64],
                    quats_xyzw: npt.NDArray[np.float64], poses: npt.NDArray[np.float64]) -> \
         npt.NDArray[np.float64]:
-    """Return the boxes (n, 4) [px] about the outlines of an ellipsoid in n views."""
+    """Return the boxes (n, 4) [px] around the outlines of an ellipsoid in n views."""
     shape = shape_matrices(semi_axes[None], quats_xyzw[:1])
     outlines = np.concatenate([project_ellipsoids(pose, center[None], shape) for pose in poses])
-    # An ellipsoid that reaches the camera has no outline: as wrong as can be, but a number.
+    # An ellipsoid that reaches the camera has no outline: a large finite residual.
     return np.nan_to_num(ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA)), nan=1e4)
 
 

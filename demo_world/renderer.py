@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering with VTK, off screen, on a GPU or (through Mesa) without one."""
+"""Render off screen with VTK, on a GPU or with Mesa's software renderer."""
 
 import colorsys
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _SUPERSAMPLING = 2
 
 @dataclass(frozen=True)
 class Light:
-    """The light in a room: how bright the lamp and the rest are, and where the lamp hangs [m]."""
+    """The light in a room: brightness of lamp and surroundings, position of the lamp [m]."""
 
     lamp: float = 0.7
     ambient: float = 0.4
@@ -31,23 +31,23 @@ class Light:
 
     @staticmethod
     def draw(rng: np.random.Generator) -> 'Light':
-        """Draw a light."""
+        """Draw a light at random."""
         position = (LENGTH_M * rng.uniform(0.3, 0.7), WIDTH_M * rng.uniform(0.3, 0.7))
         return Light(rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.5), position,
                      rng.uniform(-0.06, 0.12))
 
 
 class Renderer:
-    """Renders a room: its image, and which object each pixel shows.
+    """Renders the image of a room, and the index of the object at each pixel.
 
     Parameters
     ----------
     room : Room
-        What to render.
+        The room.
     camera : Camera
         Pinhole, without distortion.
     light : Light
-        How it is lit.
+        Its light.
 
     Raises
     ------
@@ -63,8 +63,8 @@ class Renderer:
         self._vtk: Any = vtk
         vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_ERROR)
         self._camera = camera
-        # Edges are smoothed by rendering larger: with multisampling and mipmaps together Mesa's
-        # software rasterizer needs minutes for some views (measured with Mesa 22.3).
+        # Smooth edges by rendering larger images: with multisampling and mipmaps together, Mesa's
+        # software renderer takes minutes for some views (measured with Mesa 22.3).
         self._image = self._window(_SUPERSAMPLING)
         self._index = self._window()
         self._light(light)
@@ -77,7 +77,7 @@ class Renderer:
         return np.asarray(cv2.resize(large, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def render_index(self, map_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Render which object each pixel shows: its index in the room, -1 for none."""
+        """Render the index of the object at each pixel, -1 for none."""
         rgb = self._read(self._index, map_from_camera).astype(np.int64)
         return (rgb[..., 0] * 65536 + rgb[..., 1] * 256 + rgb[..., 2]) - 1
 
@@ -92,7 +92,7 @@ class Renderer:
         return window
 
     def _light(self, light: Light) -> None:
-        """Hang a lamp that throws shadows under the ceiling, and lift the shadows."""
+        """Add a lamp with shadows under the ceiling, and a fill light that brightens shadows."""
         vtk, renderer = self._vtk, self._image.GetRenderers().GetFirstRenderer()
         color = 1.0, 1.0 - light.warmth / 2, 1.0 - light.warmth
         lamp = vtk.vtkLight()
@@ -104,7 +104,7 @@ class Renderer:
         lamp.SetIntensity(light.lamp)
         lamp.SetColor(*color)
         renderer.AddLight(lamp)
-        fill = vtk.vtkLight()  # what walls and ceiling throw back, and throws no shadow
+        fill = vtk.vtkLight()  # light from walls and ceiling, without shadows
         fill.SetLightTypeToHeadlight()
         fill.SetIntensity(light.ambient)
         fill.SetColor(*color)
@@ -215,7 +215,7 @@ class Renderer:
 
 
 def _paint_surfaces(rng: np.random.Generator) -> dict[str, npt.NDArray[np.uint8]]:
-    """Paint what the room is made of."""
+    """Paint the surfaces of the room."""
     def pale(low: float = 0.75) -> tuple[int, int, int]:
         rgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.02, 0.14), rng.uniform(low, 0.92))
         return int(rgb[0] * 255), int(rgb[1] * 255), int(rgb[2] * 255)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A furnished room: shelves and tables, and which object stands where."""
+"""Furnish a room with shelves and tables, and place objects on them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,13 +15,13 @@ from demo_world.meshes import Mesh, box, join, make_object
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.7
 _SLOT_M = 0.31
-#: An ellipsoid inside a box of the object's size looks too small from its corners.
+#: An ellipsoid inscribed in the object's box looks too small from the corners.
 _ELLIPSOID_SCALE = 1.1
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A place for an object: a point on a board [m], and where its front looks [rad]."""
+    """A place for an object: a point on a board [m], and the yaw of its front [rad]."""
 
     position: tuple[float, float, float]
     yaw: float
@@ -29,20 +29,20 @@ class Slot:
 
 @dataclass(frozen=True)
 class WorldObject:
-    """An object that stands somewhere.
+    """An object at a place.
 
     Parameters
     ----------
     name : str
-        Its landmark id.
+        Landmark id.
     look : Appearance
-        What it looks like.
+        Its look.
     slot : Slot
-        Where it stands.
+        Its place.
     in_map : bool
-        Whether whoever made the map knew it.
+        Whether the map contains it.
     moved : bool
-        Whether it has been moved since the map was made.
+        Whether it was moved after mapping.
     """
 
     name: str
@@ -60,7 +60,7 @@ class WorldObject:
         return transform
 
     def landmark(self) -> dict[str, Any]:
-        """Return the ellipsoid about it with its label, as a map file holds them."""
+        """Return its entry in a map file: ellipsoid, label and class."""
         mesh = join(*(part for part, _ in make_object(self.look)))
         middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
         pose = self.map_from_object
@@ -80,11 +80,11 @@ class Room:
     Parameters
     ----------
     seed : int
-        What its surfaces are painted from.
+        Seed of its surfaces.
     furniture : tuple of (Mesh, str)
-        Each piece in map coordinates [m], and what it is made of.
+        Each piece in map coordinates [m], and its surface.
     objects : tuple of WorldObject
-        What stands in it.
+        The objects.
     """
 
     seed: int
@@ -98,11 +98,11 @@ def make_room(seed: int, counts: Mapping[str, int] | None = None, unknown: int =
     Parameters
     ----------
     seed : int
-        Equal seeds make equal rooms.
+        Equal seeds give equal rooms.
     counts : mapping of str to int, optional
-        How many objects of a class; by default 7 or 8 of each.
+        Number of objects by class; by default 7 or 8 of each.
     unknown : int
-        How many objects are not in the map.
+        Number of objects that are not in the map.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def make_room(seed: int, counts: Mapping[str, int] | None = None, unknown: int =
 
 
 def move_objects(room: Room, count: int, seed: int) -> Room:
-    """Let some mapped objects of the room change places, each with one of another class."""
+    """Swap some mapped objects of the room in pairs."""
     rng = np.random.default_rng(seed)
     objects = list(room.objects)
     mapped = [i for i, o in enumerate(objects) if o.in_map]
@@ -141,7 +141,7 @@ def move_objects(room: Room, count: int, seed: int) -> Room:
 
 
 def _draw_looks(class_id: str, count: int, rng: np.random.Generator) -> list[Appearance]:
-    """Draw different looks; one in six is nearly that of another."""
+    """Draw different looks; one in six nearly equals another."""
     looks: list[Appearance] = []
     while len(looks) < count:
         similar = looks and len(looks) % 6 == 5
@@ -159,7 +159,7 @@ def _jitter(slot: Slot, rng: np.random.Generator) -> Slot:
 
 
 def _furnish(rng: np.random.Generator) -> tuple[tuple[tuple[Mesh, str], ...], list[Slot]]:
-    """Put two shelves and three tables along the walls and into the room."""
+    """Place two shelves and three tables along the walls."""
     x, y = LENGTH_M, WIDTH_M
     pieces = [(box((x, y, 0.02), (x / 2, y / 2, -0.02), uv_m=1.2), 'floor'),
               (box((x, y, 0.02), (x / 2, y / 2, HEIGHT_M), uv_m=2.0), 'ceiling'),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Textures: what is painted onto objects, walls and furniture."""
+"""Paint textures for objects, walls and furniture."""
 
 import cv2
 import numpy as np
@@ -17,11 +17,11 @@ def paint(look: Appearance, repeats: int, rng: np.random.Generator) -> npt.NDArr
     Parameters
     ----------
     look : Appearance
-        What it looks like.
+        Its look.
     repeats : int
-        How often a label stands around the object: a round thing shows it on every side.
+        Number of labels around the object: a round object shows one on every side.
     rng : numpy.random.Generator
-        For the small irregularities of paint.
+        For the irregularities of the paint.
 
     Returns
     -------

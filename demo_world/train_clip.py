@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the demo's CLIP: ``python -m demo_world.train_clip WORLDS --out clip.safetensors``.
+"""Train the demo's CLIP: ``python -m demo_world.train_clip WORLDS --out clip.safetensors``.
 
-A small open_clip model from scratch, on crops of rendered worlds and the labels of what they
-show. Equal labels in a batch are all right answers, not each other's mistakes.
+This trains a small open_clip model from scratch on crops of rendered worlds and their labels. All
+crops of a batch with equal labels are positives of each other.
 """
 
 import argparse
@@ -27,14 +27,14 @@ from demo_world.worlds import find_worlds, hold_out
 
 CONFIG = ASSETS / 'clip.json'
 _SMALLEST_PX = 14
-#: Pixels kept around a box, as part of its size, so that a scattered box still lies inside.
+#: Margin kept around a box, as a share of its size: room for perturbed boxes.
 _MARGIN = 0.15
 Preprocess = Callable[[Image.Image], torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Crop:
-    """An object in an image with some of its surroundings, and the box [px] in that crop."""
+    """An object in an image with some margin, and its box [px] in that crop."""
 
     image: Image.Image
     bbox_xyxy: npt.NDArray[np.float64]
@@ -42,7 +42,7 @@ class Crop:
 
 
 def read_crops(world: Path) -> dict[str, list[Crop]]:
-    """Cut the objects of a world out of its images, by object."""
+    """Crop the objects of a world from its images; return the crops by object."""
     crops = defaultdict(list)
     for frame in read_frames(world):
         image = Image.open(frame.image).convert('RGB')
@@ -59,7 +59,7 @@ def read_crops(world: Path) -> dict[str, list[Crop]]:
 
 
 def scatter(crop: Crop, rng: np.random.Generator) -> Image.Image:
-    """Cut a crop along a box scattered like a detector's, under a slightly other light."""
+    """Cut a crop along a box perturbed like a detector's, and change its light slightly."""
     size = np.tile(crop.bbox_xyxy[2:] - crop.bbox_xyxy[:2], 2)
     bounds = crop.bbox_xyxy + rng.normal(0, 0.04, 4) * size
     x0, y0 = np.clip(np.floor(bounds[:2]), 0, None)
@@ -71,7 +71,7 @@ def scatter(crop: Crop, rng: np.random.Generator) -> Image.Image:
 
 def contrastive_loss(images: torch.Tensor, texts: torch.Tensor, scale: torch.Tensor,
                      labels: list[str]) -> torch.Tensor:
-    """Return the symmetric contrastive loss; all texts equal to a crop's label are right."""
+    """Return the symmetric contrastive loss; all texts equal to a crop's label are positives."""
     ids = torch.tensor(np.unique(labels, return_inverse=True)[1])
     right = (ids[:, None] == ids[None, :]).float()
     right /= right.sum(1, keepdim=True)
@@ -115,7 +115,7 @@ def train(objects: list[list[Crop]], model: Any, tokenizer: Any, preprocess: Pre
 @torch.no_grad()
 def score(worlds: Iterable[dict[str, list[Crop]]], model: Any, tokenizer: Any,
           preprocess: Preprocess) -> tuple[float, float]:
-    """Return how often a crop's own label is the most similar of its world's, and of the top 3."""
+    """Return top-1 and top-3 accuracy of each crop's label among all labels of its world."""
     model.eval()
     ranks = []
     for world in worlds:
@@ -145,7 +145,7 @@ def make_model(config: Path, seed: int) -> tuple[Any, Any, Preprocess]:
 
 
 def save(model: Any, path: Path) -> None:
-    """Write the weights in half precision, whole or not at all."""
+    """Write the weights atomically, in half precision."""
     from safetensors.torch import save_file
 
     state = {name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
@@ -156,14 +156,14 @@ def save(model: Any, path: Path) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Train, score on worlds held out, save."""
+    """Train, save, and score on held-out worlds."""
     parser = argparse.ArgumentParser(prog='train_clip', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('worlds', type=Path, metavar='WORLDS', help='folder of make_worlds')
     parser.add_argument('--out', type=Path, required=True, help='.safetensors file to write')
     parser.add_argument('--config', type=Path, default=CONFIG, help='open_clip model config')
     parser.add_argument('--steps', type=int, default=1500)
-    parser.add_argument('--batch', type=int, default=192, help='crops a step')
+    parser.add_argument('--batch', type=int, default=192, help='crops per step')
     parser.add_argument('--threads', type=int, default=2)
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args(arguments)

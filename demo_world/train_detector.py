@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the demo's detector: ``python -m demo_world.train_detector WORLDS --out yolo.pt``.
+"""Train the demo's detector: ``python -m demo_world.train_detector WORLDS --out yolo.pt``.
 
-A small YOLO of ultralytics from scratch, on images of rendered worlds.
+This trains a small YOLO of ultralytics from scratch on images of rendered worlds.
 """
 
 import argparse
@@ -26,14 +26,14 @@ ARCHITECTURE = Path(__file__).parent / 'yolo.yaml'
 
 
 def write_dataset(parts: dict[str, list[Path]], folder: Path) -> Path:
-    """Lay out worlds as ultralytics wants a data set; return its description.
+    """Lay out worlds as a data set of ultralytics; return its description file.
 
     Parameters
     ----------
     parts : dict of str to list of Path
-        Worlds by the name of the part: 'train', 'val'.
+        Worlds by part of the data set: 'train', 'val'.
     folder : Path
-        Where; images are linked, not copied.
+        Folder of the data set; it links the images.
     """
     for part, worlds in parts.items():
         (folder / 'images' / part).mkdir(parents=True)
@@ -51,7 +51,7 @@ def write_dataset(parts: dict[str, list[Path]], folder: Path) -> Path:
 
 
 def _label_rows(frame: TrueFrame) -> str:
-    """Write the boxes of an image as rows of class, centre and size, as parts of the image."""
+    """Write the boxes of an image as rows of class, centre and size, relative to the image."""
     rows = []
     for box in frame.boxes:
         low, high = box.bbox_xyxy[:2] + 0.5, box.bbox_xyxy[2:] + 0.5  # edges, not pixel centres
@@ -64,7 +64,7 @@ def _label_rows(frame: TrueFrame) -> str:
 
 def train(data: Path, desk: Path, *, architecture: Path, epochs: int, imgsz: int, batch: int,
           seed: int, threads: int) -> Any:
-    """Train with ultralytics' trainer; return its trained model."""
+    """Train with ultralytics' trainer; return the trained model."""
     ultralytics = import_ultralytics()
     import torch
 
@@ -89,13 +89,13 @@ def train(data: Path, desk: Path, *, architecture: Path, epochs: int, imgsz: int
 
 
 def score(model: Any, data: Path, desk: Path) -> Any:
-    """Score a model of ultralytics on the part 'val' of a data set; return its metrics."""
+    """Score a model on the part 'val' of a data set; return ultralytics' metrics."""
     return model.val(data=str(data), imgsz=CAMERA.width, batch=8, device='cpu', workers=0,
                      plots=False, verbose=False, project=str(desk), name='val')
 
 
 def save(model: Any, path: Path) -> None:
-    """Write the weights in half precision, whole or not at all, without paths of this machine."""
+    """Write the weights atomically, in half precision and without paths of this machine."""
     import torch
 
     checkpoint = {'model': model.model.half().cpu(), 'ema': None, 'epoch': -1,
@@ -110,7 +110,7 @@ def save(model: Any, path: Path) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Train, score on worlds held out, save."""
+    """Train, score on held-out worlds, and save."""
     parser = argparse.ArgumentParser(prog='train_detector', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('worlds', type=Path, metavar='WORLDS', help='folder of make_worlds')
@@ -118,7 +118,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--architecture', type=Path, default=ARCHITECTURE)
     parser.add_argument('--epochs', type=int, default=12)
     parser.add_argument('--imgsz', type=int, default=480, help='longer side in training [px]')
-    parser.add_argument('--batch', type=int, default=8, help='images a step')
+    parser.add_argument('--batch', type=int, default=8, help='images per step')
     parser.add_argument('--threads', type=int, default=2)
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args(arguments)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the cameras of the synthetic world stand and look."""
+"""Camera poses in the synthetic world."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,13 +9,13 @@ from scipy.interpolate import CubicSpline
 from cliploc_ros.core.geometry.camera import Camera
 from demo_world.room import LENGTH_M, WIDTH_M, Room
 
-#: Pixel centres have whole coordinates, as everywhere in the package.
+#: Pixel centres have integer coordinates, as everywhere in the package.
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob')
 
 
 def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],
             roll: float = 0.0) -> npt.NDArray[np.float64]:
-    """Return map_from_camera (4, 4), optical axes, of a camera [m] that looks at a point [m]."""
+    """Return ``map_from_camera`` (4, 4) of a camera at `eye` [m] that looks at `target` [m]."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -28,7 +28,7 @@ def look_at(eye: npt.NDArray[np.float64], target: npt.NDArray[np.float64],
 
 
 def draw_views(room: Room, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
-    """Draw poses that look at objects from anywhere in the room; (count, 4, 4)."""
+    """Draw random poses (count, 4, 4) in the room that look at objects."""
     views: list[npt.NDArray[np.float64]] = []
     while len(views) < count:
         target = np.array(room.objects[int(rng.integers(len(room.objects)))].slot.position)
@@ -42,14 +42,14 @@ def draw_views(room: Room, count: int, rng: np.random.Generator) -> npt.NDArray[
 
 def walk(count: int, way_points: npt.ArrayLike, targets: npt.ArrayLike) -> \
         npt.NDArray[np.float64]:
-    """Walk smoothly past points and look at others meanwhile; (count, 4, 4).
+    """Return poses (count, 4, 4) of a smooth walk through points, looking at others.
 
     Parameters
     ----------
     count : int
         Number of poses, spread evenly over the walk.
     way_points, targets : (n, 3) array_like
-        Where the camera passes, and where it looks then [m].
+        Points that the camera passes, and at which it looks there [m].
     """
     way_points = np.asarray(way_points, dtype=float)
     knots = np.linspace(0, 1, len(way_points))
@@ -60,7 +60,7 @@ def walk(count: int, way_points: npt.ArrayLike, targets: npt.ArrayLike) -> \
 
 
 def mapping_walk(count: int) -> npt.NDArray[np.float64]:
-    """Return the walk on which the map is made: slowly round the middle, looking outwards."""
+    """Return the mapping walk: slowly around the centre, looking outwards."""
     turn = np.linspace(0, 2 * np.pi, 13)
     eyes = np.c_[3.0 + 0.9 * np.cos(turn), 2.5 + 0.6 * np.sin(turn), np.full(13, 1.45)]
     gazes = np.c_[3.0 + 3.2 * np.cos(turn), 2.5 + 2.6 * np.sin(turn),
@@ -69,7 +69,7 @@ def mapping_walk(count: int) -> npt.NDArray[np.float64]:
 
 
 def query_walk(count: int) -> npt.NDArray[np.float64]:
-    """Return the walk on which the robot wakes up: lower, tilted, past a nearly empty wall."""
+    """Return the walk of the wake-ups: lower, tilted, past a nearly empty wall."""
     eyes = [(4.2, 3.6, 1.3), (3.6, 3.6, 1.35), (3.0, 3.0, 1.2), (2.8, 2.2, 1.1), (3.2, 2.0, 1.3),
             (3.0, 2.2, 1.25), (2.8, 1.8, 1.3), (2.6, 1.6, 1.3), (2.6, 1.5, 1.3), (2.4, 1.8, 1.3),
             (2.6, 2.0, 1.3), (3.0, 2.6, 1.3), (3.2, 3.2, 1.25)]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # shellcheck shell=bash
 #
-# What setup and test share: messages, stamps, and steps that name their cause when they fail.
+# Shared by setup and test: messages, stamps, and steps that explain their failures.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
@@ -11,7 +11,7 @@ logs=$root/build/setup
 say() { printf '==> %s\n' "$*"; }
 die() { printf '%s: %s\n' "script/$(basename "$0")" "$*" >&2; exit 1; }
 
-# One at a time in one tree; and pip unpacks its gigabytes beside the environment, because /tmp is
+# Only one setup runs in a tree. pip unpacks its gigabytes beside the environment, because /tmp is
 # often a small file system of its own.
 enter_build_folder() {
   mkdir -p "$logs" || die "cannot write to $root"
@@ -20,16 +20,16 @@ enter_build_folder() {
   flock --nonblock 9 || { say 'waiting for another script/setup in this folder'; flock 9; }
   export TMPDIR=$root/build/tmp
   trap 'rm -rf "$root/build/tmp"' EXIT
-  rm -rf "$TMPDIR" # what a killed run left
+  rm -rf "$TMPDIR" # left by a killed run
   mkdir "$TMPDIR"
 }
 
-# A step is done while its stamp holds the hash of the step's input. Written only on success.
+# A step is done if its stamp holds the hash of the step's input. It is written only on success.
 hash_of() { find "$@" -type f -not -path '*/__pycache__/*' -print0 | sort -z | xargs -0 sha256sum | sha256sum; }
 is_done() { [[ -f $1 && $(<"$1") == "$2" ]]; }
 set_done() { printf '%s\n' "$2" > "$1"; }
 
-# run_step NAME COMMAND...: the output goes to a log, large downloads to the terminal as well.
+# run_step NAME COMMAND...: log the output; show large downloads on the terminal too.
 run_step() {
   local log=$logs/$1.log
   shift
@@ -51,7 +51,7 @@ explain_failure() {
 
 free_mb() { df --output=avail -m "$root" | tail -n 1 | tr -d ' '; }
 
-# pip_install VENV REQUIREMENTS [PIP OPTION...]: once for each content of the file.
+# pip_install VENV REQUIREMENTS [PIP OPTION...]: install once for each content of the file.
 pip_install() {
   local prefix=$1 file=$2 name hash
   shift 2
@@ -64,7 +64,7 @@ pip_install() {
   set_done "$prefix/.$name.done" "$hash"
 }
 
-# make_venv PYTHON FOLDER [VENV OPTION...]: also mends one whose making was interrupted.
+# make_venv PYTHON FOLDER [VENV OPTION...]: also completes one that was interrupted.
 make_venv() {
   local python=$1 prefix=$2
   shift 2
@@ -72,7 +72,7 @@ make_venv() {
   say "making ${prefix#"$root/"} with $("$python" --version)"
   run_step "$(basename "$prefix")" "$python" -m venv "$@" "$prefix"
   touch "$prefix/COLCON_IGNORE"
-  # From pip 25.2 on, a download that breaks off is resumed within one run.
+  # From 25.2 on, pip resumes a broken download within one run.
   run_step "$(basename "$prefix")-pip" "$prefix/bin/python" -m pip install --upgrade 'pip>=25.2'
   set_done "$prefix/.venv.done" "$prefix"
 }

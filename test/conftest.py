@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all tests share: the data beside the project, a ROS domain of their own, the counts."""
+"""Shared by all tests: the data beside the project, one ROS domain a process, the summary."""
 
 import importlib.util
 import os
@@ -15,10 +15,10 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
-# pytest-xdist gives a file to a worker as a whole, in this order: the longest come first, so that
-# no worker is left with one of them at the end.
+# pytest-xdist hands whole files to its workers in this order. The folders with long files come
+# first, so that all workers end at about the same time.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'cli', 'core')
-#: Tests that a run leaves out, by the Python module that is missing.
+#: The tests that do not run here, by the Python module they need.
 NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 
 # Equal runs draw equal examples; the first call of a compiled kernel would break any deadline.
@@ -27,10 +27,10 @@ hypothesis.settings.load_profile('cliploc_ros')
 
 
 def reserve_ros_domain() -> tuple[int, socket.socket]:
-    """Find a domain (1 to 101) that no other test run on this machine uses.
+    """Find a domain (1 to 101) that no other test process on this machine uses.
 
-    The reservation is a bound port, as in ROS's own ``domain_coordinator``, whose port numbers
-    these are: it ends with this process, however that ends.
+    The reservation is a bound port, with the port numbers of ROS's own ``domain_coordinator``.
+    The system frees it when this process ends, even if it is killed.
     """
     for attempt in range(101):
         domain = (os.getpid() + attempt) % 101 + 1
@@ -41,7 +41,7 @@ def reserve_ros_domain() -> tuple[int, socket.socket]:
             reservation.close()
         else:
             return domain, reservation
-    raise RuntimeError('all ROS domains are taken by other test runs')
+    raise RuntimeError('other test processes use all ROS domains, 1 to 101')
 
 
 def pytest_addoption(parser):
@@ -49,22 +49,22 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Keep the tests' nodes, which inherit the environment, away from every other node."""
+    """Isolate the tests' nodes from all others; they inherit this environment."""
     config.stash[NOT_RUN] = {}
-    # A shell lets what it runs in the background ignore Ctrl-C, and so would our processes.
+    # A shell's background jobs ignore SIGINT, and the processes of the tests would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, config.ros_domain_reservation = reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    # The older name of the same; where both are set, ROS warns.
+    # The older variable for the same: ROS warns where both are set.
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
-    # As in the nodes: threads of PyTorch that wait for work leave the cores to others.
+    # As in the nodes: PyTorch's threads sleep while they wait for work, and do not spin.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Leave out the tests that need what is not installed here, and put the longest first."""
+    """Deselect tests that need a missing module; sort the rest by expected duration."""
     left_out = [item for item in items if missing_module(item)]
     for item in left_out:
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)
@@ -73,7 +73,7 @@ def pytest_collection_modifyitems(config, items):
 
 
 def missing_module(item: pytest.Item) -> str | None:
-    """Return the first Python module that the markers ``needs`` name and that is not here."""
+    """Return the first module of the test's ``needs`` markers that is not installed."""
     needed = [name for marker in item.iter_markers('needs') for name in marker.args]
     return next((name for name in needed if importlib.util.find_spec(name) is None), None)
 
@@ -85,7 +85,7 @@ def place(item: pytest.Item) -> int:
 
 def pytest_sessionfinish(session, exitstatus):
     config = session.config
-    if hasattr(config, 'workeroutput'):  # a worker of pytest-xdist, which reports to the run
+    if hasattr(config, 'workeroutput'):  # a worker of pytest-xdist: pytest_testnodedown reads this
         config.workeroutput['not_run'] = config.stash[NOT_RUN]
         return
     reporter = config.pluginmanager.get_plugin('terminalreporter')
@@ -96,7 +96,7 @@ def pytest_sessionfinish(session, exitstatus):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node, error):
-    """Take over what a worker of pytest-xdist left out; each has collected all tests."""
+    """Take over a worker's list of tests that do not run; every worker has the same."""
     node.config.stash[NOT_RUN] |= getattr(node, 'workeroutput', {}).get('not_run', {})
 
 
@@ -105,7 +105,7 @@ def count(reporter, *outcomes: str) -> int:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Print what tests measured, what was not run, and a line of counts for script/test."""
+    """Print measurements, the tests that did not run, and the counts for script/test."""
     measured = [report for report in terminalreporter.stats.get('passed', [])
                 if report.when == 'call' and report.capstdout.strip()]
     if measured:
@@ -115,7 +115,7 @@ def pytest_terminal_summary(terminalreporter, config):
         for line in report.capstdout.strip().splitlines():
             terminalreporter.write_line(f'    {line}')
     for module, tests in sorted(config.stash[NOT_RUN].items()):
-        terminalreporter.write_line(f'not run here, {module} is missing: {", ".join(tests)}')
+        terminalreporter.write_line(f'not run, {module} is not installed: {", ".join(tests)}')
     passed = count(terminalreporter, 'passed', 'xpassed')
     failed = count(terminalreporter, 'failed', 'error', 'xfailed')
     terminalreporter.write_line(
@@ -127,20 +127,20 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture(scope='session')
 def shared_data() -> Path:
-    """The folder of real recordings and weights beside the project."""
+    """The folder of recordings and weights beside the project."""
     if not SHARED_DATA.is_dir():
-        pytest.skip(f'needs the shared data folder, {SHARED_DATA} is absent')
+        pytest.skip(f'the shared data folder is missing: {SHARED_DATA}')
     return SHARED_DATA
 
 
 @pytest.fixture(scope='session')
 def executables() -> Path:
-    """The folder of the installed executables: of the sourced workspace, or what setup left."""
+    """The folder of the installed executables, in the sourced workspace or else in install/."""
     from ament_index_python import get_package_prefix
 
     try:
         prefix = Path(get_package_prefix('cliploc_ros'))
-    except (KeyError, OSError):  # not in any sourced workspace; none sourced
+    except (KeyError, OSError):  # no workspace is sourced, or none has the package
         prefix = PROJECT / 'install'
     folder = prefix / 'lib' / 'cliploc_ros'
     assert folder.is_dir(), f'{folder} is missing: run script/setup'

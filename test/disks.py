@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A disk of its own for one process: so small that it is full, and seen by nobody else."""
+"""A small disk that only one process sees."""
 
 import subprocess
 
@@ -11,10 +11,10 @@ _MOUNT = ['unshare', '--map-root-user', '--mount', 'sh', '-c',
 
 
 def small_disk(folder) -> list[str]:
-    """Return what runs a command with a disk of 64 KiB in place of a folder.
+    """Return the prefix of a command that runs it with a disk of 64 KiB mounted on a folder.
 
-    In a mount namespace of its own, which asks for no privileges; where the system forbids these
-    the test is skipped.
+    The command gets a mount namespace of its own, which needs no privileges; the test is skipped
+    where the system forbids that.
     """
     command = [*_MOUNT, str(folder)]
     tried = subprocess.run([*command, 'true'], capture_output=True, text=True, check=False)

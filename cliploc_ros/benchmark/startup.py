@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure what a start of CLIP costs: plain open_clip, a first start, a start with a warm cache.
+"""Measure time and memory of a start of CLIP: open_clip's own, a first one, one with a warm cache.
 
     python -m cliploc_ros.benchmark.startup --model ViT-L-14
 
@@ -28,7 +28,7 @@ _LABELS = tuple(f'a label of a map, number {number}' for number in range(40))
 
 @dataclass(frozen=True)
 class StartupResult:
-    """What one start cost.
+    """Time and memory of one start.
 
     Parameters
     ----------
@@ -37,11 +37,12 @@ class StartupResult:
     seconds : float
         From the imports done to labels embedded and crops ready to encode [s].
     peak_mib : float
-        Greatest resident memory of the process [MiB].
+        Greatest resident memory of the process [MiB]. It includes the pages of mapped files,
+        which the system can reclaim.
     imports_mib : float
         The same after the imports alone [MiB].
     weights_mib : float
-        Parameters alive in the end [MiB].
+        Parameters in memory at the end [MiB].
     holds_text_tower : bool
         Whether the table of token embeddings is among them.
     """
@@ -55,7 +56,7 @@ class StartupResult:
 
 
 def measure_startup(kind: str, options: ClipOptions) -> StartupResult:
-    """Start CLIP in a new process and return what it cost."""
+    """Start CLIP in a new process; return its time and memory."""
     command = [sys.executable, '-m', 'cliploc_ros.benchmark.startup', '--child', kind,
                '--options', json.dumps(asdict(options))]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True)
@@ -63,7 +64,7 @@ def measure_startup(kind: str, options: ClipOptions) -> StartupResult:
 
 
 def write_random_checkpoint(model: str, file: Path) -> None:
-    """Write the weights that open_clip draws for a model, the same each time."""
+    """Write random weights of a model, the same each time."""
     code = ('import sys, open_clip, torch; torch.manual_seed(0); '
             'torch.save(open_clip.create_model(sys.argv[1]).state_dict(), sys.argv[2])')
     subprocess.run([sys.executable, '-c', code, model, str(file)], check=True,
@@ -85,7 +86,7 @@ def format_results(results: list[StartupResult]) -> str:
 
 
 def _start_and_report(kind: str, options: ClipOptions) -> StartupResult:
-    import open_clip  # noqa: F401  (before the clock starts)
+    import open_clip  # noqa: F401  (before the measurement)
     import torch
 
     imports_mib = _peak_mib()
@@ -119,7 +120,7 @@ def _as_pair(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _peak_mib() -> float:
-    # Not ru_maxrss: through exec it keeps the peak of the process that started this one.
+    # Not ru_maxrss, which includes the peak of the parent process before exec.
     match = re.search(r'VmHWM:\s+(\d+) kB', Path('/proc/self/status').read_text())
     assert match
     return int(match[1]) / 1024

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``demo``: a robot wakes up in a synthetic room, offline, with shipped models."""
+"""The executable ``demo``: a robot wakes up in a synthetic room; offline, with shipped models."""
 
 import argparse
 import sys
@@ -12,9 +12,9 @@ from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import OptionsError
 
 EPILOG = """\
-The recording is played to the real detector and relocalizer, each in its own process. Where the
-robot wakes up it stands still, asks ~/relocalize, and goes on with the answer. In the end a page
-of pictures lies in the folder of --out.
+The demo plays a recording to the real detector and relocalizer, each in its own process. At each
+wake-up the robot stops, calls ~/relocalize, and goes on after the answer. At the end the demo
+writes a page of pictures to the folder of --out.
 """
 
 
@@ -30,35 +30,35 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='demo', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Let a robot wake up in a synthetic room, and draw what it saw.')
+        description='Let a robot wake up in a synthetic room, and draw the results.')
     parser.add_argument(
         '--out', type=Path, default=Path('demo_out'), metavar='DIR',
-        help='where the pictures go (default: ./%(default)s)')
+        help='folder for the pictures (default: ./%(default)s)')
     parser.add_argument(
         '--wake-ups', type=_at_least_one, default=10, metavar='N',
-        help='how often the robot wakes up on its way (default: %(default)s)')
+        help='number of wake-ups along the recording (default: %(default)s)')
     parser.add_argument(
         '--rate', type=_positive, default=4.0, metavar='X',
-        help='speed between wake-ups: 2 is twice as fast as recorded (default: %(default)g)')
+        help='speed between wake-ups; 2 is twice as fast as recorded (default: %(default)g)')
     parser.add_argument(
         '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',
-        help='as the paper names them, such as class_bf, clip_prosac (default: %(default)s)')
+        help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
     parser.add_argument(
         '--assets', type=Path, default=ASSETS, metavar='DIR',
         help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt '
-        'and, unless only classes are matched, clip.json and clip.safetensors')
+        'and, except for class_*, clip.json and clip.safetensors')
     parser.add_argument(
         '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
     return parser
 
 
 def demonstrate(options: argparse.Namespace) -> int:
-    """Run the demo as the command line asks; return the exit code."""
+    """Run the demo as the command line says; return the exit code."""
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
         raise OptionsError(
-            f'ROS 2 is not there to run the nodes in ({error}): source it, or run script/setup'
+            f'the demo needs ROS 2 ({error}): source it, or run script/setup'
         ) from error
     from cliploc_ros.demo.run import DemoOptions, run_demo
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``tum_to_bag``: a TUM RGB-D folder becomes a rosbag2 recording."""
+"""The executable ``tum_to_bag``: convert a TUM RGB-D folder into a rosbag2 recording."""
 
 import argparse
 import sys
@@ -46,27 +46,27 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='tum_to_bag',
-        description='Turn a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt) into a rosbag2 '
-        'recording that the nodes of this package understand. Needs no sourced ROS.',
+        description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt) into a rosbag2 '
+        'recording with the topics of the nodes. Needs no sourced ROS.',
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('folder', type=Path, help='the TUM folder')
-    parser.add_argument('output', type=Path, help='the recording to make; must not exist')
+    parser.add_argument('output', type=Path, help='folder of the recording; must not exist')
     parser.add_argument(
-        '--every', type=int, default=1, metavar='N', help='take each N-th image only (default: 1)'
+        '--every', type=int, default=1, metavar='N', help='take every N-th image only (default: 1)'
     )
     parser.add_argument(
         '--detections',
         type=Path,
         metavar='FILE',
-        help='also write detections that were recorded earlier (JSON)',
+        help='also write these recorded detections (JSON)',
     )
     parser.add_argument(
         '--intrinsics',
         metavar='fr1|fr2|fr3|FILE',
         help="the dataset's camera, or a camera.json (default: the folder's camera.json, else "
-        "the folder's name says which)",
+        "the camera in the folder's name)",
     )
     parser.add_argument(
         '--storage', choices=list(STORAGES), default='sqlite3', help='default: %(default)s'
@@ -85,7 +85,7 @@ def make_parser() -> argparse.ArgumentParser:
         dest='image_format',
         action='store_const',
         const='compressed',
-        help="write the image files' own bytes as compressed images",
+        help='write the bytes of the image files as compressed images',
     )
     defaults = ConversionOptions()
     parser.add_argument('--prefix', default=defaults.prefix, help='namespace of all topics')
@@ -97,7 +97,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Convert as the command line asks; return the exit code."""
+    """Convert as the command line says; return the exit code."""
     begin = time.monotonic()
     sequence = read_tum(options.folder).every(options.every)
     camera, origin = find_camera(options.intrinsics, options.folder)
@@ -119,8 +119,7 @@ def convert(options: argparse.Namespace) -> int:
         options.output,
         conversion,
         detections,
-        # without a terminal there is nothing to draw on
-        progress=lambda frames: tqdm(frames, unit='image', disable=None),
+        progress=lambda images: tqdm(images, unit='image', disable=None),  # on a terminal only
     )
     report(sequence, result, options, time.monotonic() - begin)
     return 0
@@ -129,7 +128,7 @@ def convert(options: argparse.Namespace) -> int:
 def report(
     sequence: TumSequence, result: ConversionResult, options: argparse.Namespace, elapsed_s: float
 ) -> None:
-    """Say what was written, and which frames lack something."""
+    """Print what was written, and how many images lack something."""
     print(
         f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
         f'{result.detections} detection messages in {elapsed_s:.1f} s'
@@ -137,9 +136,9 @@ def report(
     if len(sequence.trajectory) == 0:
         print('the folder has no ground truth')
     elif missing := result.images - result.poses:
-        print(f'without ground truth within 20 ms, and so without pose: {missing} images')
+        print(f'{missing} images have no ground truth within 20 ms and so no pose')
     if options.detections is not None and (missing := result.images - result.detections):
-        print(f'without recorded detections, and so without message: {missing} images')
+        print(f'{missing} images have no recorded detections and so no detection message')
 
 
 if __name__ == '__main__':

@@ -7,7 +7,7 @@ import numpy as np
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import make_rig
-from cliploc_ros.core.fit.verification import choose_distinct, scores_of
+from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.search.compatibility import compatible_pairs
@@ -38,6 +38,7 @@ def call_every_kernel() -> None:
     rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
     scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
     choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+    verify_rig(rig, np.eye(3), np.zeros(3))
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
     project_ellipsoids(np.eye(4), centers, shapes)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
@@ -109,7 +110,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                 raise DatasetError(f'{bag}: {name} has no messages')
         image = _first(reader, topics.image)
         poses = read_poses(reader, str(image.header.frame_id))
-        first_ns = _stamp_ns(image)
+        first_ns = stamp_ns(image)
         check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, str(bag))
         info = next(reader.messages([topics.camera_info])).data
         count = reader.topic(topics.image).message_count
@@ -174,10 +175,6 @@ def _peek_stamp_ns(recorded: BagMessage) -> int:
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
-def _stamp_ns(message: Any) -> int:
-    return int(message.header.stamp.sec) * NS_PER_S + int(message.header.stamp.nanosec)
-
-
 def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: bytes
                   ) -> tuple[NDArray[np.uint8], Camera]:
     message = _deserialize(data, msgtype, where)
@@ -186,12 +183,12 @@ def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: 
         size = (image.shape[1], image.shape[0])
         return image, camera_from_msg(_deserialize(info, _CAMERA_INFO, where), size, rectified)
     except CliplocError as error:
-        raise DatasetError(f'{where} at {_stamp_ns(message) / 1e9:.6f}: {error}') from error
+        raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
 
 
 def _decode_depth(where: str, form: DepthFormat, data: bytes) -> DepthImage:
     message = _deserialize(data, _IMAGE, where)
-    where = f'{where} at {_stamp_ns(message) / 1e9:.6f}'
+    where = f'{where} at {stamp_ns(message) / NS_PER_S:.6f}'
     try:
         counts = depth_counts_from_msg(message)
     except CliplocError as error:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a recording to and from the package's own types; needs no sourced ROS.
+"""Convert messages of a recording to and from the package's types, without a sourced ROS.
 
-Message objects are those of the rosbags library. Their fields are named as rclpy's are.
+The message objects are those of the rosbags library; their fields have rclpy's names.
 """
 
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.bag_types import typestore
-from cliploc_ros.datasets.tum import NS_PER_S
+from cliploc_ros.units import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -43,7 +43,7 @@ def image_message(stamp: int, frame_id: str, pixels_rgb: NDArray[np.uint8]) -> A
     stamp : int
         Header stamp [ns].
     frame_id : str
-        Camera frame.
+        The camera's coordinate frame.
     pixels_rgb : ndarray (height, width, 3) of uint8
         The image, red first.
     """
@@ -67,7 +67,7 @@ def compressed_image_message(stamp: int, frame_id: str, data: bytes, codec: str)
     stamp : int
         Header stamp [ns].
     frame_id : str
-        Camera frame.
+        The camera's coordinate frame.
     data : bytes
         The encoded image.
     codec : str
@@ -75,7 +75,7 @@ def compressed_image_message(stamp: int, frame_id: str, data: bytes, codec: str)
     """
     return _type(COMPRESSED_IMAGE)(
         header=_header(stamp, frame_id),
-        # as image_transport writes it: the image was rgb8, its decoder yields bgr8
+        # As image_transport writes it: the image was rgb8, its decoder yields bgr8.
         format=f'rgb8; {codec} compressed bgr8',
         data=np.frombuffer(data, dtype=np.uint8),
     )
@@ -102,7 +102,7 @@ def camera_info_message(stamp: int, frame_id: str, camera: Camera) -> Any:
 
 
 def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any:
-    """Make a vision_msgs/Detection2DArray; every header is the image's."""
+    """Make a vision_msgs/Detection2DArray; all headers equal the image's."""
     header = _header(stamp, frame_id)
     return _type(DETECTIONS)(
         header=header,
@@ -116,7 +116,7 @@ def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any
 
 
 def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]) -> Any:
-    """Make a geometry_msgs/PoseStamped of the camera (4, 4) in the frame of the map."""
+    """Make a geometry_msgs/PoseStamped of the camera (4, 4) in the map's coordinate frame."""
     return _type(POSE)(
         header=_header(stamp, frame_id),
         pose=_pose(map_from_camera[:3, 3], quaternion_from_transform(map_from_camera)),
@@ -124,12 +124,12 @@ def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]
 
 
 def detections_of(message: Any) -> Detections:
-    """Read a vision_msgs/Detection2DArray; of each detection the best hypothesis counts.
+    """Read a vision_msgs/Detection2DArray; the best hypothesis of each detection counts.
 
     Parameters
     ----------
     message : vision_msgs/Detection2DArray
-        As this library or rclpy deserializes it.
+        As rosbags or rclpy deserializes it.
 
     Returns
     -------

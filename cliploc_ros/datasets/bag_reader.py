@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading recordings of rosbag2 (sqlite3 and mcap) without a sourced ROS."""
+"""Read rosbag2 recordings (sqlite3 and mcap) with the rosbags library.
+
+Not with rosbag2_py, which PyPI lacks: recordings are also read where no ROS is installed.
+"""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,11 +27,11 @@ class BagTopic:
     name, msgtype : str
         As ``/image`` and ``sensor_msgs/msg/Image``.
     message_count : int
-        How many messages the recording says it holds.
+        Number of messages that the recording lists.
     offered_qos : tuple of Qos
-        What its publishers offered when it was recorded; empty if that is not known.
+        What its publishers offered during the recording; empty if unknown.
     type_hash : str
-        The type's RIHS01 hash; empty if not recorded.
+        RIHS01 hash of the type; empty if not recorded.
     """
 
     name: str
@@ -45,7 +48,7 @@ class BagMessage:
     Parameters
     ----------
     topic : str
-        Its topic's name.
+        Name of its topic.
     stamp_ns : int
         When it was recorded [ns].
     data : bytes
@@ -60,8 +63,8 @@ class BagMessage:
 class BagReader:
     """Reads a rosbag2 folder, or a single .mcap or .db3 file, in order of recording.
 
-    A context manager. Messages are streamed: memory does not grow with the recording.
-    Compressed files (zstd) are unpacked into the temporary folder while it is open.
+    A context manager. It streams messages: memory does not grow with the recording. It unpacks
+    compressed files (zstd) into the temporary folder while it is open.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ class BagReader:
     Raises
     ------
     DatasetError
-        On entry, if the recording cannot be read: path and reason are named.
+        On entry, if the recording cannot be read; the message names path and reason.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -85,7 +88,7 @@ class BagReader:
         try:
             reader = Reader(self.path)
             reader.open()
-        except Exception as error:  # whatever the library meets in a broken file
+        except Exception as error:  # the library's own, sqlite's, the operating system's
             raise self._unreadable(error) from error
         self._reader = reader
         try:
@@ -124,7 +127,7 @@ class BagReader:
     @property
     def end_ns(self) -> int:
         """Stamp of the last message [ns]; 0 for an empty recording."""
-        # the library's end lies one nanosecond after the last message
+        # The library's end lies one nanosecond after the last message.
         return self._open_reader.end_time - 1 if self.message_count else 0
 
     def topic(self, name: str) -> BagTopic:
@@ -133,13 +136,13 @@ class BagReader:
         Raises
         ------
         DatasetError
-            If the recording has none of that name; those it has are listed.
+            If the recording has no topic of that name; the message lists its topics.
         """
         if name not in self._topics:
-            there = ', '.join(
+            recorded = ', '.join(
                 f'{topic.name} ({topic.msgtype})' for topic in self._topics.values()
             )
-            raise DatasetError(f'{self.path}: has no topic {name}; it has {there or "none"}')
+            raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
         return self._topics[name]
 
     def messages(
@@ -153,9 +156,9 @@ class BagReader:
         Parameters
         ----------
         topics : collection of str, optional
-            Names of topics; all of them if not given.
+            Names of topics; all of them by default.
         start_ns, stop_ns : int, optional
-            Only messages at or after the one, and before the other [ns].
+            Yield only messages at or after start_ns and before stop_ns [ns].
 
         Yields
         ------
@@ -164,7 +167,7 @@ class BagReader:
         Raises
         ------
         DatasetError
-            For an unknown topic, or where the recording turns out to be broken.
+            For an unknown topic, or at a damaged part of the recording.
         """
         names = self._topics if topics is None else topics
         connections = self._connections({self.topic(name).name for name in names})
@@ -176,7 +179,7 @@ class BagReader:
                 connection, stamp_ns, data = next(stream)
             except StopIteration:
                 return
-            except Exception as error:  # whatever the library meets in a broken file
+            except Exception as error:  # the library's own, sqlite's, the operating system's
                 raise self._unreadable(error) from error
             yield BagMessage(connection.topic, stamp_ns, bytes(data))
 
@@ -186,7 +189,7 @@ class BagReader:
         Raises
         ------
         DatasetError
-            If the type is not known here, was recorded with another definition, or the
+            If the type is unknown here or was recorded with another definition, or if the
             bytes do not fit it.
         """
         topic = self.topic(message.topic)
@@ -196,13 +199,13 @@ class BagReader:
         if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
             raise DatasetError(
                 f'{self.path}: {topic.name} was recorded with another definition of '
-                f'{topic.msgtype} than the one known here'
+                f'{topic.msgtype} than the one of Jazzy'
             )
         try:
             return store.deserialize_cdr(message.data, topic.msgtype)
-        except Exception as error:  # the library raises what the bytes happen to cause
+        except Exception as error:  # the library does not check the bytes before it unpacks them
             raise DatasetError(
-                f'{self.path}: a message of {topic.name} at {message.stamp_ns} is no '
+                f'{self.path}: the message of {topic.name} at {message.stamp_ns} is no valid '
                 f'{topic.msgtype}: {error}'
             ) from error
 
@@ -217,8 +220,8 @@ class BagReader:
             raise DatasetError(f'{self.path}: no such recording')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise DatasetError(
-                f'{self.path}: no metadata.yaml in this folder, so it is no rosbag2 recording, '
-                f'or one that was cut off: `ros2 bag reindex {self.path}` rebuilds it'
+                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
+                f'one that `ros2 bag reindex {self.path}` rebuilds'
             )
 
     def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
@@ -244,8 +247,8 @@ class BagReader:
     def _connections(self, names: Collection[str]) -> list[Connection]:
         """Return the library's handles of topics, of the recording and of each of its files.
 
-        The library drops a file's messages without a word where the file's QoS differs from
-        metadata.yaml's, which people edit to repair QoS; the files' own handles always match.
+        The library silently drops the messages of a file whose QoS differs from that in
+        metadata.yaml, which people edit to repair QoS. The files' own handles always match.
         """
         reader = self._open_reader
         files = getattr(reader.storage, 'storages', [])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The message types that recordings are written and read with, without a sourced ROS."""
+"""Message types for reading and writing recordings without a sourced ROS."""
 
 from functools import cache
 from importlib.resources import files
@@ -26,7 +26,7 @@ def typestore() -> Typestore:
     Returns
     -------
     Typestore
-        Shared: do not register types in it.
+        Shared by all callers: do not register types in it.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = files('cliploc_ros.datasets') / 'vision_msgs' / 'msg'

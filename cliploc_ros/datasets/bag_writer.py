@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing recordings of rosbag2 (sqlite3 and mcap) without a sourced ROS."""
+"""Write rosbag2 recordings (sqlite3 and mcap) with the rosbags library.
+
+Not with rosbag2_py, which PyPI lacks: recordings are also written where no ROS is installed.
+"""
 
 import shutil
 import sqlite3
@@ -32,8 +35,8 @@ STORAGES: Mapping[str, StoragePlugin] = {
 
 _INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
-#: What camera drivers and detectors offer: rclcpp's default, which best-effort and reliable
-#: subscribers both match.
+#: The default of rclcpp, as camera drivers and detectors offer it; matches best-effort and
+#: reliable subscribers.
 RELIABLE_QOS = Qos(
     QosHistory.KEEP_LAST,
     10,
@@ -45,15 +48,15 @@ RELIABLE_QOS = Qos(
     _INFINITE,
     False,
 )
-#: What publishers of maps and static transforms offer: late subscribers get the last one.
+#: For maps and static transforms: a late subscriber receives the last message.
 LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 
 
 class BagWriter:
     """Writes a rosbag2 folder as Jazzy does (metadata version 9).
 
-    A context manager. The recording is built beside its place and moved there when it is
-    complete; if the block raises, nothing is left behind.
+    A context manager. It builds the recording beside its final path and moves it there when it
+    is complete. If the block raises, nothing remains.
 
     Parameters
     ----------
@@ -65,7 +68,7 @@ class BagWriter:
     Raises
     ------
     DatasetError
-        If the path exists or cannot be written, a full disk among the reasons.
+        If the path exists or cannot be written, for example because the disk is full.
     """
 
     def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:
@@ -78,7 +81,7 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
-        """Begin the recording beside its place."""
+        """Begin the recording beside its final path."""
         self._check_free()
         prefix = f'.{self.path.name}.'
         try:
@@ -103,13 +106,13 @@ class BagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Complete the recording and move it to its place, or remove it."""
+        """Complete the recording and move it to its final path, or remove it."""
         writer, self._writer = self._writer, None
         try:
             if writer is not None and kind is None:
                 self._finish(writer)
             elif writer is not None:
-                with suppress(Exception):  # the error that ended the block is the one to report
+                with suppress(Exception):  # the block's own exception is the one to report
                     writer.abort()
         finally:
             self._discard()
@@ -139,9 +142,9 @@ class BagWriter:
         topic : str
             A declared topic.
         stamp_ns : int
-            Time of the recording [ns].
+            Time at which it counts as recorded [ns].
         message : object
-            An object of the typestore's type, or its bytes.
+            An object of a type of the typestore, or its bytes.
         """
         connection = self._connections[topic]
         data = (
@@ -162,7 +165,7 @@ class BagWriter:
 
     def _check_free(self) -> None:
         if self.path.exists() or self.path.is_symlink():
-            raise DatasetError(f'{self.path}: exists already, and is not overwritten')
+            raise DatasetError(f'{self.path}: exists already and is not overwritten')
         if not self.path.parent.is_dir():
             raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
 
@@ -170,7 +173,7 @@ class BagWriter:
         assert self._staging is not None
         try:
             writer.close()
-            self._check_free()  # it may have appeared meanwhile
+            self._check_free()  # another process may have written it meanwhile
             (self._staging / self.path.name).rename(self.path)
         except (OSError, sqlite3.Error) as error:
             with suppress(Exception):
@@ -184,4 +187,4 @@ class BagWriter:
 
     def _unwritable(self, error: Exception) -> DatasetError:
         reason = getattr(error, 'strerror', None) or str(error)
-        return DatasetError(f'{self.path}: cannot be written: {reason}; nothing was left behind')
+        return DatasetError(f'{self.path}: cannot be written: {reason}; no partial file remains')

@@ -157,7 +157,7 @@ def _read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
         raise DatasetError(f'{path} cannot be read as an image')
     if image.shape[:2] != (camera.height, camera.width):
         raise DatasetError(f'{path} has {image.shape[1]}x{image.shape[0]} px, but the '
-                           f'camera {camera.width}x{camera.height}')
+                           f'camera has {camera.width}x{camera.height} px')
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera intrinsics of the TUM sequences, and of one's own from a camera.json."""
+"""Camera intrinsics: those of the TUM sequences, and the user's own in a camera.json."""
 
 import json
 import re
@@ -34,8 +34,8 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     Parameters
     ----------
     choice : str or None
-        A preset's name (fr1, fr2, fr3), a camera.json, or None to look in the folder for
-        a ``camera.json`` and then at its name for the TUM camera.
+        A preset's name (fr1, fr2, fr3), a camera.json, or None for the folder's
+        ``camera.json`` or, without one, the TUM camera that the folder's name contains.
     folder : Path
         The sequence's folder.
 
@@ -43,12 +43,12 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     -------
     camera : Camera
     origin : str
-        Where it comes from, to be shown to the user.
+        The source of the intrinsics, for the user.
 
     Raises
     ------
     DatasetError
-        If nothing says which camera it was, or the file cannot be used.
+        If neither choice nor folder determines the camera, or the file is invalid.
     """
     if choice is not None and choice in PRESETS:
         return PRESETS[choice], f'preset {choice}'
@@ -59,7 +59,7 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     match = _SEQUENCE_NAME.search(folder.resolve().name)
     if match is None:
         raise DatasetError(
-            f'{folder}: the folder name does not say which camera this is; give '
+            f'{folder}: the name of the folder contains no TUM camera; give '
             '--intrinsics fr1, fr2, fr3 or a camera.json'
         )
     return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
@@ -68,8 +68,8 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
 def read_camera(path: str | Path) -> Camera:
     """Read a camera.json.
 
-    It is a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and, where
-    there is distortion, ``distortion_model`` and its coefficients ``d``.
+    The file holds a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and,
+    for a lens with distortion, ``distortion_model`` and its coefficients ``d``.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def read_camera(path: str | Path) -> Camera:
     Raises
     ------
     DatasetError
-        Naming the file and the field that is missing, unknown or impossible.
+        If a field is missing, unknown or invalid; the message names file and field.
     """
     path = Path(path)
     values = _load_mapping(path)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
+from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_reader import BagReader
 from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.errors import DatasetError
@@ -85,7 +86,7 @@ def read_pose_topic(reader: BagReader, name: str) -> Trajectory:
     for recorded in reader.messages([name]):
         message = reader.deserialize(recorded)
         pose = pose_of(message)
-        stamps.append(stamp_of(message))
+        stamps.append(stamp_ns(message))
         rows.append(_numbers(pose.position, pose.orientation))
     return make_trajectory(stamps, rows, f'{reader.path}: {name}')
 
@@ -147,12 +148,6 @@ def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:
     raise DatasetError(
         f'{where}: images begin at {first_ns / NS_PER_S:.3f} s, poses at '
         f'{span[0] / NS_PER_S:.3f} s, {offset_s:+.3f} s apart, and do not overlap; {remedy}')
-
-
-def stamp_of(message: Any) -> int:
-    """Return the header stamp of a message or transform [ns]."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def _numbers(position: Any, orientation: Any) -> tuple[float, ...]:

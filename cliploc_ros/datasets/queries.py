@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Query files: recorded boxes and similarities, so that methods meet identical input."""
+"""Query files: recorded boxes and similarities, identical input for every method."""
 
 import math
 import os
@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.datasets.tum import NS_PER_S
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.units import NS_PER_S
 
-#: Arrays of the file, by name: shape in terms of the letters below, and kind of dtype.
+#: Arrays of the file by name: shape (F frames, n boxes, L landmarks), and kind of dtype.
 LAYOUT = {
     'landmark_ids': (('L',), 'string'),
     'intrinsics_fx_fy_cx_cy': ((4,), 'number'),
@@ -32,14 +32,14 @@ LAYOUT = {
     'query_group': (('F',), 'integer'),
     'is_main': (('F',), 'boolean'),
 }
-#: An array beyond the format that keeps what a float64 of seconds cannot: exact stamps [ns].
+#: An optional array of exact stamps [ns]; a float64 of seconds cannot hold them.
 STAMPS_NS = 'stamps_ns'
-#: Arrays beyond the format that say how long detector and CLIP took; NaN where not known.
+#: Optional arrays: the time that detector and CLIP took [ms], NaN where unknown.
 _STAGES = ('detector_ms', 'clip_ms')
 _OPTIONAL = {STAMPS_NS: (('F',), 'integer')} | dict.fromkeys(_STAGES, (('F',), 'number'))
 
 _KINDS = {'string': 'US', 'number': 'fiu', 'integer': 'iu', 'boolean': 'b'}
-_MAX_SIMILARITY = 1.001  # cosines in half precision stray a little beyond 1
+_MAX_SIMILARITY = 1.001  # half precision rounds some cosines to just above 1
 
 
 @dataclass(frozen=True)
@@ -57,17 +57,17 @@ class QueryFrame:
     scores : ndarray (n,)
         Detector confidences.
     similarities : ndarray (n, L)
-        Cosine of each crop with each landmark's label.
+        Cosine similarity of each crop and each landmark's label.
     true_landmark : ndarray (n,) of int
-        Index into the landmarks, -1 where unknown. Never to be used for localizing.
+        Index into the landmarks, -1 where unknown. For evaluation only.
     map_from_camera : ndarray (4, 4)
         Ground truth.
     group : int
-        The query that the frame belongs to.
+        The query to which the frame belongs.
     is_main : bool
-        Whether it is the query itself, not a neighbouring frame.
+        Whether the frame is the query itself and not one of its neighbours.
     detector_ms, clip_ms : float
-        How long these took on the image [ms]; NaN where it was not recorded.
+        Processing time of the image [ms]; NaN if not recorded.
     """
 
     stamp_ns: int
@@ -94,7 +94,7 @@ class Queries:
     Parameters
     ----------
     landmark_ids : tuple of str
-        The landmarks that the columns of the similarities stand for.
+        The landmarks of the columns of the similarities.
     intrinsics_fx_fy_cx_cy : tuple of float
         Of the undistorted camera [px].
     frames : tuple of QueryFrame
@@ -118,7 +118,7 @@ class Queries:
         return self.frames[index]
 
     def main_frames(self) -> tuple[QueryFrame, ...]:
-        """Return the frames that are queries themselves."""
+        """Return the main frame of each query."""
         return tuple(frame for frame in self.frames if frame.is_main)
 
     def group(self, group: int) -> tuple[QueryFrame, ...]:
@@ -136,7 +136,7 @@ def load_queries(
     path : str or Path
         An npz file without pickles.
     landmark_ids : collection of str, optional
-        The map's landmarks; the file must know no others.
+        The map's landmarks; the file must contain no others.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def load_queries(
     Raises
     ------
     DatasetError
-        Naming the file, the array and what is wrong with it.
+        If the file is invalid; the message names file, array and error.
     """
     path = Path(path)
     try:
@@ -160,19 +160,19 @@ def load_queries(
 
 
 def save_queries(path: str | Path, queries: Queries) -> None:
-    """Write a query file in one step: it is there complete, or not at all.
+    """Write a query file atomically.
 
     Parameters
     ----------
     path : str or Path
-        The npz file; one that exists is replaced.
+        The npz file; an existing one is replaced.
     queries : Queries
-        What to write. It is validated as on reading.
+        What to write; validated like a file that is read.
 
     Raises
     ------
     DatasetError
-        If the queries are malformed or the file cannot be written.
+        If the queries are invalid or the file cannot be written.
     """
     path = Path(path)
     try:
@@ -185,12 +185,12 @@ def save_queries(path: str | Path, queries: Queries) -> None:
         _write_atomically(path, arrays)
     except OSError as error:
         raise DatasetError(
-            f'{path}: cannot be written: {error.strerror}; nothing was left behind'
+            f'{path}: cannot be written: {error.strerror}; no partial file remains'
         ) from error
 
 
 class _ArrayError(Exception):
-    """What is wrong with an array; the caller adds the file's name."""
+    """An invalid array; the caller adds the file's name."""
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -213,7 +213,7 @@ def _load_array(content: Any, name: str) -> NDArray[Any]:
     try:
         array = np.asarray(content[name])
         return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
-    except Exception as error:  # whatever numpy and zipfile meet in a broken file
+    except Exception as error:  # numpy's and zipfile's own, in a damaged file
         raise _ArrayError(f'array {name} cannot be read: {error}') from error
 
 
@@ -243,7 +243,7 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
             row = np.argwhere(~np.isfinite(arrays[name]))[0][0]
             raise _ArrayError(f'array {name} is not finite in row {row}')
     ids = arrays['landmark_ids']
-    _refuse('landmark_ids', 'is there twice', _repeated(ids))
+    _refuse('landmark_ids', 'repeats an id', _repeated(ids))
     _refuse('landmark_ids', 'is empty', ids == '')
     if (arrays['intrinsics_fx_fy_cx_cy'][:2] <= 0).any():
         raise _ArrayError('array intrinsics_fx_fy_cx_cy has a focal length that is not above 0')
@@ -348,7 +348,7 @@ def _make_frame(arrays: dict[str, NDArray[Any]], index: int, rows: slice) -> Que
 def _stamp_ns(arrays: dict[str, NDArray[Any]], index: int) -> int:
     if STAMPS_NS in arrays:
         return int(arrays[STAMPS_NS][index])
-    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
+    # A float64 of today's seconds resolves 0.24 us: round to microseconds.
     return round(float(arrays['timestamps'][index]) * 1e6) * 1000
 
 
@@ -371,7 +371,7 @@ def _make_arrays(queries: Queries) -> dict[str, NDArray[Any]]:
             [np.empty(0, dtype=np.int64), *(one.true_landmark for one in frames)]
         ),
         'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
-        # Python's division of integers rounds once, NumPy's would twice
+        # Python's division of integers rounds once, NumPy's twice.
         'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
         'query_group': np.array([one.group for one in frames], dtype=np.int64),
         'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading boxes that a detector found earlier and that were saved as JSON."""
+"""Read recorded detections from a JSON file."""
 
 import json
 import math
@@ -22,24 +22,24 @@ def read_recorded_detections(
 
     The form is ``{"image_size": [w, h], "frames": [{"timestamp": "1341847980.722988",
     "detections": [{"class_id": "book", "score": 0.58, "bbox_xyxy": [173, 138, 219, 208]}]}]}``;
-    ``image_size`` may be left out.
+    ``image_size`` is optional.
 
     Parameters
     ----------
     path : str or Path
         The JSON file.
     image_size : (int, int), optional
-        Width and height [px] of the images that the boxes are meant for.
+        Expected width and height of the images [px].
 
     Returns
     -------
     dict of int to Detections
-        By stamp [ns], exact. A frame without detections is there, with none.
+        By exact stamp [ns]. A frame without detections has an empty entry.
 
     Raises
     ------
     DatasetError
-        Naming file, frame and field.
+        If the file is invalid; the message names file, frame and field.
     """
     path = Path(path)
     content = _load(path)
@@ -50,14 +50,14 @@ def read_recorded_detections(
         timestamp = _field(frame, 'timestamp', (str, int, Decimal), where)
         stamp_ns = parse_stamp_ns(str(timestamp), where)
         if stamp_ns in detections:
-            raise DatasetError(f'{where}: timestamp {timestamp} is there twice')
+            raise DatasetError(f'{where}: timestamp {timestamp} is a repetition')
         detections[stamp_ns] = _parse_frame(_field(frame, 'detections', list, where), where)
     return detections
 
 
 def _load(path: Path) -> Any:
     try:
-        # Decimal keeps a timestamp's digits, which a float would round to 0.2 us
+        # Decimal keeps a timestamp's digits; a float would round them to 0.2 us.
         return json.loads(
             path.read_text(encoding='utf-8'),
             parse_float=Decimal,
@@ -70,7 +70,7 @@ def _load(path: Path) -> Any:
 
 
 def _refuse(path: Path, name: str) -> NoReturn:
-    raise DatasetError(f'{path}: contains {name}, which is no number')
+    raise DatasetError(f'{path}: contains {name}; expected finite numbers')
 
 
 def _check_size(content: Any, image_size: tuple[int, int] | None, path: Path) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The door to recordings of rosbag2: reading, writing, and what their messages hold."""
+"""Read and write rosbag2 recordings: the public names of the bag modules."""
 
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
 from cliploc_ros.datasets.bag_types import typestore

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A camera's path: poses over time, and the pose between two of them."""
+"""Trajectories of a camera: poses over time, with interpolation between them."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 
-#: A pose counts for a stamp only if a sample lies this close to it.
+#: A stamp has a pose only if a sample lies this close to it.
 MAX_SAMPLE_DISTANCE_NS = 20_000_000
 
 
@@ -49,8 +49,8 @@ class Trajectory:
         Returns
         -------
         ndarray (4, 4) or None
-            ``map_from_camera``; None where no sample is near enough. Just outside the
-            trajectory the nearest sample itself is taken, never an extrapolation.
+            ``map_from_camera``; None if no sample is near enough. Just outside the trajectory
+            it is the first or last sample, without extrapolation.
         """
         if len(self) == 0:
             return None
@@ -86,9 +86,9 @@ def slerp(
         Unit quaternion, x y z w (Shoemake 1985).
     """
     cosine = float(start_xyzw @ end_xyzw)
-    if cosine < 0:  # q and -q are one rotation: take the nearer of the two
+    if cosine < 0:  # q and -q are the same rotation: take the nearer one
         end_xyzw, cosine = -end_xyzw, -cosine
-    if cosine > 0.9995:  # the sine below would lose its digits
+    if cosine > 0.9995:  # dividing by the sine would lose precision
         mixed = (1 - fraction) * start_xyzw + fraction * end_xyzw
         return np.asarray(mixed / np.linalg.norm(mixed))
     angle = np.arccos(cosine)

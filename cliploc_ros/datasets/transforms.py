@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.poses import make_trajectory, stamp_of
+from cliploc_ros.datasets.poses import make_trajectory
 from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.errors import DatasetError
 
@@ -160,7 +161,7 @@ def _read_edges(reader: BagReader, topics: Collection[str], children: Collection
                 raise DatasetError(
                     f"{reader.path}: tf: '{child}' has two parents, '{parents[child]}' and "
                     f"'{_name(transform.header.frame_id)}'; record one tree of one robot")
-            stamp, row = stamp_of(transform), _row(transform.transform)
+            stamp, row = stamp_ns(transform), _row(transform.transform)
             if recorded.topic == TF_STATIC:
                 static[child] = stamp, row
             else:

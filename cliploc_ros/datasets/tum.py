@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading TUM RGB-D folders (Sturm et al. 2012): rgb.txt, rgb/, groundtruth.txt."""
+"""Read TUM RGB-D folders (Sturm et al. 2012): rgb.txt, rgb/, groundtruth.txt."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 
 from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.units import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 #: builtin_interfaces/Time holds seconds in an int32.
 MAX_STAMP_S = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class TumSequence:
-    """A TUM RGB-D folder: colour images with stamps, and where the camera was.
+    """A TUM RGB-D folder: colour images with stamps, and the camera's trajectory.
 
     Parameters
     ----------
     folder : Path
-        The folder it was read from.
+        The folder.
     stamps_ns : tuple of int
-        Stamp of each image [ns], exactly as its decimal text says, strictly increasing.
+        Stamp of each image [ns], exact to the last decimal, strictly increasing.
     image_paths : tuple of Path
-        The image files, one a stamp. They exist.
+        The existing image file of each stamp.
     trajectory : Trajectory
         Ground truth, map from camera; empty if the folder has no groundtruth.txt.
     """
@@ -48,7 +48,7 @@ class TumSequence:
         return self.trajectory.pose_at(stamp_ns)
 
     def every(self, step: int) -> 'TumSequence':
-        """Return the sequence with each ``step``-th image only, the first included.
+        """Return the sequence with every ``step``-th image only, beginning with the first.
 
         Raises
         ------
@@ -56,19 +56,19 @@ class TumSequence:
             If ``step`` is less than 1.
         """
         if step < 1:
-            raise DatasetError(f'every {step}th image makes no sense: give 1 or more')
+            raise DatasetError(f'every {step}th image is no selection: give 1 or more')
         return replace(
             self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step]
         )
 
 
 def read_tum(folder: str | Path) -> TumSequence:
-    """Read a TUM RGB-D folder; the images themselves stay on disk.
+    """Read a TUM RGB-D folder, except for the pixels of its images.
 
     Parameters
     ----------
     folder : str or Path
-        Holds ``rgb.txt``, the images it lists, and perhaps ``groundtruth.txt``.
+        Holds ``rgb.txt``, the images that it lists, and optionally ``groundtruth.txt``.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def read_tum(folder: str | Path) -> TumSequence:
     Raises
     ------
     DatasetError
-        Naming the file and line that cannot be used.
+        If the folder is invalid; the message names file and line.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -91,7 +91,7 @@ def read_tum(folder: str | Path) -> TumSequence:
 def read_tum_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
 
-    Lines may come in any order; of equal stamps the first counts.
+    Lines may have any order; of equal stamps the first counts.
 
     Parameters
     ----------
@@ -106,7 +106,8 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
     Raises
     ------
     DatasetError
-        Naming file and line: not eight numbers, or a quaternion far from unit norm.
+        If a line does not hold eight numbers, or its quaternion is far from unit norm; the
+        message names file and line.
     """
     path = Path(path)
     samples: dict[int, list[float]] = {}
@@ -126,7 +127,7 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
 
 
 def parse_stamp_ns(text: str, where: str) -> int:
-    """Turn decimal seconds into nanoseconds without going through a float.
+    """Convert decimal seconds to nanoseconds exactly, without a float.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def parse_stamp_ns(text: str, where: str) -> int:
     Raises
     ------
     DatasetError
-        If the text is no number, or no time that ROS can express.
+        If the text is no number, or outside the range of a ROS time.
     """
     try:
         seconds = Decimal(text)
@@ -163,7 +164,7 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
         Naming the file and line that cannot be used.
     """
     if not path.exists():
-        raise DatasetError(f'{path}: not there; a TUM folder lists its images in rgb.txt')
+        raise DatasetError(f'{path}: no such file; a TUM folder lists its images in rgb.txt')
     stamps_ns: list[int] = []
     image_paths: list[Path] = []
     for where, line in _data_lines(path):
@@ -172,7 +173,7 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
             raise DatasetError(f'{where}: expected timestamp and file name, got {line!r}')
         stamp_ns = parse_stamp_ns(fields[0], where)
         if stamps_ns and stamp_ns <= stamps_ns[-1]:
-            raise DatasetError(f'{where}: timestamp {fields[0]} does not come after the last one')
+            raise DatasetError(f'{where}: timestamp {fields[0]} does not exceed the one before')
         image_path = path.parent / fields[1]
         if not image_path.is_file():
             raise DatasetError(f'{where}: image {image_path} does not exist')

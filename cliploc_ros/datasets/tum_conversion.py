@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turning a TUM RGB-D sequence into a recording that the nodes understand."""
+"""Convert a TUM RGB-D sequence into a recording with the nodes' topics."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -18,7 +18,7 @@ from cliploc_ros.datasets.rosbag import BagWriter
 from cliploc_ros.datasets.tum import TumSequence
 from cliploc_ros.errors import DatasetError
 
-#: Hands on the stamp [ns] and file of one image after another, and shows how far it is.
+#: Passes on an iterable of stamp [ns] and file of each image, and shows progress.
 Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
 
 _NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?|/?')
@@ -27,7 +27,7 @@ _CODECS = {b'\x89PNG': 'png', b'\xff\xd8\xff': 'jpeg'}
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """How the recording shall look.
+    """Format, topics and coordinate frames of the recording.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ class ConversionOptions:
         ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage with
         the files' own bytes.
     prefix : str
-        Namespace put before each topic: ``camera`` makes ``/camera/image``.
+        Namespace of all topics: ``camera`` gives ``/camera/image``.
     camera_frame : str
-        Frame of the images, camera_info and detections (optical axes).
+        Coordinate frame of images, camera_info and detections (optical axes).
     world_frame : str
-        Frame of the ground-truth poses: the map's.
+        Coordinate frame of the ground-truth poses: the map's.
     """
 
     storage: str = 'sqlite3'
@@ -56,7 +56,7 @@ class ConversionOptions:
         Raises
         ------
         DatasetError
-            If the prefix is no ROS namespace.
+            If the prefix is no valid ROS namespace.
         """
         if _NAMESPACE.fullmatch(self.prefix) is None:
             raise DatasetError(f'prefix {self.prefix!r} is no ROS namespace, such as /camera')
@@ -65,16 +65,16 @@ class ConversionOptions:
 
 @dataclass(frozen=True)
 class ConversionResult:
-    """What was written.
+    """Counts of what was written.
 
     Parameters
     ----------
     images : int
-        Images, each with its camera_info.
+        Images, each with a camera_info.
     poses : int
         Images with ground truth.
     detections : int
-        Images with recorded detections, of which a frame may hold none.
+        Images with an entry of recorded detections, which may be empty.
     """
 
     images: int
@@ -93,23 +93,23 @@ def convert_tum(
     """Write a sequence as a rosbag2 recording.
 
     Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth`` and, if
-    given, ``detections``. All headers of a frame bear exactly the image's stamp, which is
+    given, ``detections``. All headers of a frame have exactly the image's stamp, which is
     also the time of recording.
 
     Parameters
     ----------
     sequence : TumSequence
-        The images and ground truth.
+        Images and ground truth.
     camera : Camera
-        Its intrinsics; the images must have its size.
+        Intrinsics; the images must have its size.
     output : str or Path
         The folder to make.
     options : ConversionOptions
-        How the recording shall look.
+        Format, topics and coordinate frames.
     detections : mapping of int to Detections, optional
         Recorded detections by stamp [ns].
     progress : callable
-        Wraps the iterable of frames, to show how far it is.
+        Wraps the iterable of images, to show progress.
 
     Returns
     -------
@@ -118,13 +118,13 @@ def convert_tum(
     Raises
     ------
     DatasetError
-        If an image cannot be used, none has detections, or the output cannot be written.
-        Nothing half-written is left.
+        If an image is invalid, no image has detections, or the output cannot be written.
+        No partial recording remains.
     """
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
         raise DatasetError(
-            f'{sequence.folder}: no recorded detections have the stamp of one of its images; '
-            'are they those of another sequence?'
+            f'{sequence.folder}: the recorded detections have the stamps of none of its images; '
+            'are they of another sequence?'
         )
     with BagWriter(output, options.storage) as bag:
         recorder = _FrameRecorder(bag, camera, options, detections)
@@ -136,7 +136,7 @@ def convert_tum(
 
 
 class _FrameRecorder:
-    """Writes all that belongs to one image after another."""
+    """Writes the messages of one frame after another."""
 
     def __init__(
         self,
@@ -183,8 +183,8 @@ class _FrameRecorder:
         height, width = pixels_bgr.shape[:2]
         if (width, height) != (self._camera.width, self._camera.height):
             raise DatasetError(
-                f'{path}: is {width}x{height} pixels, but the intrinsics are for '
-                f'{self._camera.width}x{self._camera.height}'
+                f'{path}: has {width}x{height} px, but the intrinsics are for '
+                f'{self._camera.width}x{self._camera.height} px'
             )
         frame = self._options.camera_frame
         if self._compressed:
@@ -205,13 +205,13 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode(data: bytes, path: Path) -> NDArray[np.uint8]:
-    # compressed images are decoded too: a broken file shall show here, not in a node
+    # Compressed images are decoded too: this refuses a damaged file before a node receives it.
     try:
         pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
-        pixels_bgr = None  # how OpenCV refuses an empty buffer
+        pixels_bgr = None  # OpenCV raises for an empty buffer and returns None for a damaged one
     if pixels_bgr is None:
-        raise DatasetError(f'{path}: is no image that can be decoded')
+        raise DatasetError(f'{path}: cannot be decoded as an image')
     return np.asarray(pixels_bgr, dtype=np.uint8)
 
 
@@ -219,4 +219,4 @@ def _codec(data: bytes, path: Path) -> str:
     for magic, codec in _CODECS.items():
         if data.startswith(magic):
             return codec
-    raise DatasetError(f'{path}: is neither PNG nor JPEG; convert it with raw images')
+    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images instead (--raw)')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's wake-ups as a table, on the terminal and on a page with the pictures."""
+"""Report the demo's wake-ups: a table on the terminal, and a page with the pictures."""
 
 from collections.abc import Sequence
 from html import escape
@@ -17,7 +17,7 @@ PICTURES = 'wake_up_??.png'
 
 # Heading and width on the terminal.
 _COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('inliers', 7),
-            ('x y z [m]', 18), ('error', 15), ('answered in', 11), ('of which', 0))
+            ('x y z [m]', 18), ('error', 15), ('answer time', 11), ('stages', 0))
 
 _STYLE = f"""\
 body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1280px;
@@ -31,24 +31,23 @@ figure {{ margin: 2rem 0 }} figcaption {{ font-size: 14px; color: #555 }}
 """
 
 _SYNTHETIC = """\
-<p class="note"><b>This world is synthetic.</b> Room, objects and images are computer graphics,
-made from a seed, and detector and CLIP are small networks trained on renders of other such rooms.
-What is real is the program: the nodes, the messages between them, the inference and the search
-are those that run on a robot. So this page shows that the whole system works. It does
-<em>not</em> show how well it recognizes real objects, copes with real light, lenses, dirt and
-motion, with labels that people wrote, or with a map that was made from real images; nor how
-large networks such as YOLOv8x and ViT-L/14 perform. For that, run it on your own
-recordings.</p>"""
+<p class="note"><b>This world is synthetic.</b> A program rendered room, objects and images;
+detector and CLIP are small networks trained on renders of other such rooms. The software is real:
+nodes, messages, inference and search are those that run on a robot. So this page shows that the
+whole system works. It does <em>not</em> show how well the system recognizes real objects, or how
+it copes with real light, lenses, dirt and motion, with labels written by people, or with a map
+made from real images. Nor does it show how large networks such as YOLOv8x and ViT-L/14 perform.
+To find out, run the nodes on your own recordings.</p>"""
 
 _HOW = """\
-<p>Boxes, hypotheses and figures in the table came over ROS from the two nodes; the errors are
-against the recording's ground truth, which the nodes never see. Which box belongs to which
-landmark is on no topic: for the pictures the search was repeated on the same detections with the
-same code, networks, options and seed, and its pose compared with the one that came over ROS
+<p>The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors compare
+with the recording's ground truth, which the nodes never see. No topic carries the matches of boxes
+and landmarks. For the pictures the demo therefore repeats the search on the same detections with
+the same code, networks, options and seed, and compares its pose with the one from ROS
 ({repeated}). CLIP is the cosine similarity of crop and label, rank its place among all labels of
-the map, IoU the overlap of box and projected landmark; ✓ and ✗, where there is one, compare with
-what the renderer drew there. A cross may also mean that the object has been moved since the
-map was made or is not in it.</p>"""
+the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the
+renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not in the
+map.</p>"""
 
 
 def picture_name(judged: Judged) -> str:
@@ -67,7 +66,7 @@ def console_row(judged: Judged) -> str:
 
 
 def summary(judged: Sequence[Judged]) -> str:
-    """Return what came of all wake-ups, in a line."""
+    """Summarize all wake-ups in one line."""
     accepted = [one for one in judged if one.wake_up.accepted]
     wrong = sum(one.is_wrong for one in accepted)
     errors = [one.error[0] for one in accepted if one.error is not None]
@@ -75,7 +74,7 @@ def summary(judged: Sequence[Judged]) -> str:
             f'refused, {wrong or "none"} wrong by more than {WRONG_M:g} m')
     if errors:
         text += f'; error {np.median(errors):.3f} m (median), {max(errors):.3f} m at most'
-    return text + f'; answered in {np.median([one.wake_up.answer_s for one in judged]):.2f} s ' \
+    return text + f'; answer time {np.median([one.wake_up.answer_s for one in judged]):.2f} s ' \
         '(median)'
 
 
@@ -91,8 +90,8 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str) -> Path:
         '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
         f'{escape(method)}.</p>', _SYNTHETIC, _table(judged),
         f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
-        '<figcaption>The map from above. Each estimate is joined to the truth; a pose that was '
-        'refused was told to nobody.</figcaption></figure>', how,
+        '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
+        'poses were not published.</figcaption></figure>', how,
         *map(_figure, judged), '</html>', '']), encoding='utf-8')
     return page
 
@@ -125,7 +124,7 @@ def _cells(judged: Judged) -> list[str]:
 
 
 def _error(judged: Judged) -> str:
-    """Return the error; in brackets if the pose was not published."""
+    """Return the error, in brackets if the pose was refused."""
     if judged.error is None:
         return '–'
     text = f'{judged.error[0]:.3f} m {judged.error[1]:.1f}°'

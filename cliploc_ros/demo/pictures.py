@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's pictures of a wake-up: the camera image, and which box is which landmark."""
+"""Draw the demo's picture of a wake-up: the camera image, and its matches."""
 
 import textwrap
 from pathlib import Path
@@ -22,7 +22,7 @@ from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
 _DPI = 110
 _BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'
 _EDGED = (withStroke(linewidth=2.6, foreground='black', alpha=0.6),)
-# Of the panel beside the image: where each column begins, 0 to 1.
+# Left edge of each column in the panel beside the image, 0 to 1.
 _COLUMNS = {'box': 0.0, 'landmark': 0.065, 'CLIP': 0.73, 'rank': 0.815, 'IoU': 0.89, '': 0.965}
 _LABEL_CHARS = 54
 _LINE_CHARS = 88
@@ -81,7 +81,7 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap) -> None:
 
 def _draw_landmarks(axes: Axes, review: Review, landmark_map: LandmarkMap,
                     map_from_camera: NDArray[np.float64]) -> None:
-    """Draw the outlines of landmarks as the pose would show them: matched ones, and all others."""
+    """Draw the outlines of all landmarks as seen from the pose; emphasize matched ones."""
     matched = {match.landmark for match in review.matches}
     outlines = project_ellipsoids(invert_transform(map_from_camera), landmark_map.centers,
                                   landmark_map.shapes)
@@ -116,8 +116,8 @@ def _reading_order(review: Review) -> dict[int, int]:
 def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap) -> None:
     line = _list_reason(panel, review, -0.5)
     if not review.repeated:
-        panel.text(0, line, 'The search, repeated for this picture, ended elsewhere: '
-                            'no matches are shown.', fontsize=9, va='top')
+        panel.text(0, line, 'The repeated search for this picture found another pose: '
+                            'its matches are not shown.', fontsize=9, va='top')
         return
     for name, x in _COLUMNS.items():
         if review.similarities is not None or name not in ('CLIP', 'rank'):
@@ -133,12 +133,12 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap) -> Non
 
 
 def _list_reason(panel: Axes, review: Review, line: float) -> float:
-    """Write why there is no pose; return the next free line."""
+    """Write why the pose was refused; return the next free line."""
     if review.judged.wake_up.accepted:
         return line
     lines = textwrap.wrap('Refused: ' + review.judged.wake_up.reason, _LINE_CHARS)
     if review.judged.pose is not None:
-        lines.append('Not published, what speaks for the best hypothesis:')
+        lines.append('Matches of the best hypothesis, which was not published:')
     for text in lines:
         panel.text(0, line, text, fontsize=9, va='top', color=REFUSED)
         line += 1
@@ -167,11 +167,11 @@ def _write_row(panel: Axes, line: float, cells: list[str], is_true: bool | None)
 
 
 def _list_rest(panel: Axes, review: Review, numbers: dict[int, int], line: float) -> None:
-    """List the boxes without a landmark in as few lines as they need."""
+    """List the boxes without a landmark in as few lines as possible."""
     matched = {match.detection for match in review.matches}
     rest = [f'{number} {review.detections.class_ids[row]}' for row, number in numbers.items()
             if row not in matched]
     if rest:
-        text = 'No landmark there: ' + ', '.join(rest)
+        text = 'Without a landmark: ' + ', '.join(rest)
         panel.text(0, line, textwrap.fill(text, _LINE_CHARS), fontsize=8.5, va='top',
                    color='#555555')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's processes: each ends with the demo, however that ends."""
+"""Run the demo's processes, which all end with the demo, even if it is killed."""
 
 import ctypes
 import os
@@ -21,7 +21,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class DemoError(CliplocError):
-    """The demo cannot go on; the message says why."""
+    """The demo cannot continue; the message says why."""
 
 
 class Process:
@@ -32,17 +32,18 @@ class Process:
         self._popen, self._log = popen, log
 
     def wait_for_output(self, text: str, patience_s: float) -> None:
-        """Wait until a text stands in the output.
+        """Wait until the output contains a text.
 
         Raises
         ------
         DemoError
-            The process reports an error, ends, or takes longer; what it said last is quoted.
+            If the process reports an error, ends, or takes longer than patience_s; the message
+            quotes its last line.
         """
         deadline = time.monotonic() + patience_s
         while text not in (output := self._log.read_text(errors='replace')):
             if '[ERROR]' in output or time.monotonic() > deadline:
-                raise DemoError(f'the {self.name} does not become ready: {self._last_words()}')
+                raise DemoError(f'the {self.name} does not become ready: {self._last_line()}')
             self.check()
             time.sleep(_POLL_S)
 
@@ -50,14 +51,14 @@ class Process:
         """Raise a DemoError if the process has ended."""
         code = self._popen.poll()
         if code is not None:
-            raise DemoError(f'the {self.name} ended with exit code {code}: {self._last_words()}')
+            raise DemoError(f'the {self.name} ended with exit code {code}: {self._last_line()}')
 
     def wait(self) -> None:
         """Wait until the process ends by itself."""
         self._popen.wait()
 
     def end(self) -> None:
-        """Ask the process to end, and make it end if it does not."""
+        """Terminate the process; kill it after a grace period."""
         self._popen.terminate()
         try:
             self._popen.wait(_GRACE_S)
@@ -65,15 +66,15 @@ class Process:
             self._popen.kill()
             self._popen.wait()
 
-    def _last_words(self) -> str:
+    def _last_line(self) -> str:
         lines = self._log.read_text(errors='replace').splitlines()
         errors = [line for line in lines if '[ERROR]' in line]
-        return f'{(errors or lines or ["it said nothing"])[-1]} (its output: {self._log})'
+        return f'{(errors or lines or ["no output"])[-1]} (log: {self._log})'
 
 
 @contextmanager
 def running(command: Sequence[object], log: Path) -> Iterator[Process]:
-    """Run a program for the length of a with statement.
+    """Run a program inside a with statement.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def running(command: Sequence[object], log: Path) -> Iterator[Process]:
     """
     arguments = [str(argument) for argument in command]
     with log.open('wb') as output:
-        # Killed itself, the demo could end nothing any more: then the kernel does.
+        # If the demo is killed, the kernel ends its processes.
         popen = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=output,
                                  stderr=subprocess.STDOUT,
                                  preexec_fn=_end_with_parent)
@@ -92,9 +93,9 @@ def running(command: Sequence[object], log: Path) -> Iterator[Process]:
     try:
         yield process
     finally:
-        impatient = signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # against a second Ctrl-C
         process.end()
-        signal.signal(signal.SIGINT, impatient)
+        signal.signal(signal.SIGINT, handler)
 
 
 def _end_with_parent() -> None:
@@ -107,7 +108,7 @@ def node_command(name: str, parameters: Mapping[str, object]) -> list[object]:
     Raises
     ------
     DemoError
-        The package is not installed.
+        If the package is not installed.
     """
     arguments: list[object] = [_find_executable(name), '--ros-args']
     for parameter, value in parameters.items():
@@ -116,7 +117,7 @@ def node_command(name: str, parameters: Mapping[str, object]) -> list[object]:
 
 
 def installed_share() -> Path:
-    """Return the folder of what the package installs beside its code."""
+    """Return the package's share folder."""
     return _find_executable('detector').parents[2] / 'share' / 'cliploc_ros'
 
 
@@ -137,16 +138,16 @@ def _find_executable(name: str) -> Path:
 
 @contextmanager
 def own_ros_domain() -> Iterator[int]:
-    """Keep this process and its children away from every other node, and yield the domain.
+    """Move this process and its children to a ROS domain of their own; yield the domain.
 
-    A domain (1 to 101) is reserved by a bound port, as ROS's own ``domain_coordinator`` does it:
-    the reservation ends with this process, however that ends.
+    A bound port reserves the domain (1 to 101), as in ROS's own ``domain_coordinator``. The
+    reservation ends with this process, even if it is killed.
     """
     domain, reservation = _reserve_domain()
     with reservation:
         os.environ['ROS_DOMAIN_ID'] = str(domain)
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        # The older name of the same; where both are set, ROS warns.
+        # The older name of this variable: with both set, ROS warns.
         os.environ.pop('ROS_LOCALHOST_ONLY', None)
         yield domain
 
@@ -161,4 +162,4 @@ def _reserve_domain() -> tuple[int, socket.socket]:
             reservation.close()
         else:
             return domain, reservation
-    raise DemoError('all ROS domains of this machine are taken: end other demos or test runs')
+    raise DemoError('all ROS domains of this machine are in use: end other demos or test runs')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's wake-ups beside the truth, and what no topic carries: which box is which landmark."""
+"""Compare the demo's wake-ups with the ground truth, and find the matches behind each pose."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,13 +15,14 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.datasets.tum import NS_PER_S, TumSequence, parse_stamp_ns
+from cliploc_ros.datasets.tum import TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
 from cliploc_ros.demo.truth import TrueBox, read_frames
+from cliploc_ros.units import NS_PER_S
 
-#: Poses farther from the truth than this are wrong [m].
+#: A pose with a greater error is wrong [m].
 WRONG_M = 1.0
-# A repeated search that ends up farther away than this is another one [m, deg].
+# A repeated search that differs by more than this has found another pose [m, deg].
 _SAME_POSE = (1e-6, 1e-4)
 _SAME_OBJECT_IOU = 0.5
 
@@ -31,17 +32,17 @@ Observe = Callable[[NDArray[np.uint8], Camera, Detections, int], Observation]
 
 @dataclass(frozen=True)
 class Judged:
-    """A wake-up beside the truth.
+    """A wake-up and its ground truth.
 
     Parameters
     ----------
     number : int
-        From 1.
+        Counted from 1.
     wake_up : WakeUp
     time_s : float
-        Of the image, from the start of the recording [s].
+        Stamp of the image since the start of the recording [s].
     truth : ndarray (4, 4) or None
-        map_from_camera; None where the recording has none.
+        ``map_from_camera``; None if the recording lacks it.
     """
 
     number: int
@@ -51,25 +52,25 @@ class Judged:
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
-        """Return the best hypothesis (4, 4), published or not; None if there is none."""
+        """Return the best hypothesis (4, 4), published or not, or None."""
         return self.wake_up.hypotheses[0] if self.wake_up.hypotheses else None
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Return the error of the best hypothesis [m, deg]; None where it cannot be known."""
+        """Return the error of the best hypothesis [m, deg], or None if it is unknown."""
         if self.pose is None or self.truth is None:
             return None
         return pose_error(self.pose, self.truth)
 
     @property
     def is_wrong(self) -> bool:
-        """Return whether a pose was accepted that lies far from the truth."""
+        """Return whether the wake-up is a false accept."""
         return self.wake_up.accepted and self.error is not None and self.error[0] > WRONG_M
 
 
 @dataclass(frozen=True)
 class Review:
-    """What a picture of a wake-up shows.
+    """The content of a wake-up's picture.
 
     Parameters
     ----------
@@ -77,16 +78,16 @@ class Review:
     image_rgb : ndarray (h, w, 3) uint8
     camera : Camera
     detections : Detections
-        Those that the relocalizer used, n of them.
+        The n detections that the relocalizer used.
     matches : tuple of Match
         Inliers of the best hypothesis.
     similarities : ndarray (n, L) or None
-        Of each crop with each label; None where only classes are matched.
+        Similarity of each crop and each label; None if the method matches classes only.
     true_ids : tuple of str, or None
-        Which object each detection really shows, '' if none; None where nobody knows.
+        The object that each detection shows, '' if none; None if the recording lacks it.
     repeated : bool
-        Whether the search, repeated for the picture, found the pose that came over the wire. If
-        not there are no matches.
+        Whether the repeated search found the pose that the node sent. If not, there are no
+        matches.
     """
 
     judged: Judged
@@ -100,19 +101,19 @@ class Review:
 
 
 def judge(wake_up: WakeUp, number: int, sequence: TumSequence) -> Judged:
-    """Put a wake-up beside the truth."""
+    """Return a wake-up with its ground truth."""
     return Judged(number, wake_up, (wake_up.stamp_ns - sequence.stamps_ns[0]) / NS_PER_S,
                   sequence.pose_at(wake_up.stamp_ns))
 
 
 def observe_classes(image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                     stamp_ns: int) -> Observation:
-    """Return an observation where only classes are matched."""
+    """Return an observation without similarities."""
     return Observation(camera, detections, stamp_ns=stamp_ns)
 
 
 class Reviewer:
-    """Repeats what the relocalizer did with a frame, with the same code, options and seed.
+    """Repeats the relocalizer's search of a frame with the same code, options and seed.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ class Reviewer:
     camera : Camera
     observe : Observe
     relocalize : callable
-        Searches the pose of observations.
+        Searches the pose of observations, as `Relocalizer.relocalize`.
     max_detections : int
         The relocalizer's parameter of this name.
     """
@@ -159,12 +160,12 @@ def _same_pose(first: NDArray[np.float64] | None, second: NDArray[np.float64] | 
 
 def _read_image(path: Path) -> NDArray[np.uint8]:
     pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    assert pixels_bgr is not None  # it has been converted already
+    assert pixels_bgr is not None  # the conversion to a recording has read it
     return np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
 
 
 def _read_true_boxes(folder: Path) -> dict[int, tuple[TrueBox, ...]]:
-    """Return what the generator of the world knows of each image, by stamp [ns]."""
+    """Return the true boxes of each image by stamp [ns]; empty without truth.json."""
     if not (folder / 'truth.json').is_file():
         return {}
     return {parse_stamp_ns(frame.timestamp, 'truth.json'): frame.boxes

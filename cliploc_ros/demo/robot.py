@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's robot: plays a recording, and where it wakes up asks where it is."""
+"""The demo's robot: play a recording, and request the pose at each wake-up."""
 
 import re
 import time
@@ -23,34 +23,34 @@ from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns
 from cliploc_ros.ros.replay.bag_publisher import create_publisher
+from cliploc_ros.units import NS_PER_S
 
 _PATIENCE_S = 60.0
-# How often a camera that stands still shows the same again.
+# Period at which the standing robot publishes the same frame again.
 _FRAME_PERIOD_S = 0.2
-# Of a request, before the image is shown.
+# From the request to the first image.
 _HEAD_START_S = 0.03
 _SPIN_S = 0.02
-_NS_PER_S = 1e9
 
 
 @dataclass(frozen=True)
 class WakeUp:
-    """A request and its answer, as they came over the wire.
+    """A request and its answer, as received over ROS.
 
     Parameters
     ----------
     stamp_ns : int
-        Of the image that was answered [ns].
+        Stamp of the answer's image [ns].
     accepted : bool
         Whether the relocalizer published a pose.
     message : str
-        What it said.
+        The answer's message.
     hypotheses : tuple of ndarray (4, 4)
-        map_from_camera of the distinct best, best first; the first is the pose published.
+        ``map_from_camera`` of the distinct best, best first; an accepted pose is the first.
     detections : Detections
-        Of the detector.
+        The detector's.
     answer_s : float
-        From the request to the answer, the detector's work included [s].
+        From the request to the answer, including detection [s].
     """
 
     stamp_ns: int
@@ -62,39 +62,39 @@ class WakeUp:
 
     @property
     def score(self) -> float:
-        """Return the score that the relocalizer stated."""
+        """Return the score in the message."""
         return float(self._stated(r'score ([0-9.]+)'))
 
     @property
     def inliers(self) -> int:
-        """Return the number of inliers that the relocalizer stated."""
+        """Return the number of inliers in the message."""
         return int(self._stated(r'(\d+) inliers'))
 
     @property
     def stage_ms(self) -> dict[str, int]:
-        """Return the time that the relocalizer stated for each of its stages [ms]."""
+        """Return the time of each stage in the message [ms]."""
         return {stage: int(ms) for stage, ms in re.findall(r'(\w+) (\d+) ms', self.message)}
 
     @property
     def reason(self) -> str:
-        """Return why there is no pose, without the figures; empty if accepted."""
+        """Return the reason of a refusal without its figures; empty if accepted."""
         return '' if self.accepted else self.message.removeprefix('refused: ').split(' [')[0]
 
     def _stated(self, pattern: str) -> str:
-        # the reason before the bracket may speak of scores too
+        # The reason before the bracket may hold a score too.
         found = re.search(pattern, self.message.rpartition(' [')[2])
         return found[1] if found else '0'
 
 
 class Robot(Node):
-    """Publishes a recording, as the player does, but stops to ask.
+    """Publishes a recording and stops for each wake-up.
 
     Parameters
     ----------
     reader : BagReader
         The open recording.
     check : callable
-        Called while waiting; raises when waiting has no sense any more.
+        Called while waiting; raises if a node has ended.
     """
 
     def __init__(self, reader: BagReader, check: Callable[[], None]) -> None:
@@ -113,24 +113,24 @@ class Robot(Node):
                                  qos.POSE)
 
     def connect(self) -> None:
-        """Wait until detector and relocalizer are there to talk to."""
+        """Wait until detector and relocalizer are discovered."""
         self._wait(lambda: self._client.service_is_ready()
                    and self.count_publishers('detections') > 0
                    and self.count_publishers('relocalizer/hypotheses') > 0)
 
     def walk(self, wake_up_at: Collection[int], rate: float) -> Iterator[WakeUp]:
-        """Play the recording; at each of some stamps [ns] stop, ask, and yield the answer.
+        """Play the recording; at each wake-up stop, request the pose, and yield the answer.
 
         Parameters
         ----------
         wake_up_at : collection of int
             Stamps of images [ns].
         rate : float
-            Speed between them; 1 is as recorded.
+            Speed between wake-ups; 1 is as recorded.
         """
         last_ns = self._reader.start_ns
         for stamp, group in groupby(self._reader.messages(), key=lambda message: message.stamp_ns):
-            self._rest((stamp - last_ns) / _NS_PER_S / rate)
+            self._rest((stamp - last_ns) / NS_PER_S / rate)
             last_ns, frame = stamp, list(group)
             if stamp in wake_up_at:
                 yield self._wake_up(stamp, frame)
@@ -138,11 +138,11 @@ class Robot(Node):
                 self._publish(frame)
 
     def _wake_up(self, stamp: int, frame: list[BagMessage]) -> WakeUp:
-        """Ask where this frame was taken, and show it until the answer comes."""
+        """Request the pose of this frame, and publish it until the answer arrives."""
         start = time.monotonic()
         future = self._client.call_async(Trigger.Request())
-        # An image right behind it, larger than the memory that Fast DDS shares with a process's
-        # readers, lost one request in nine: DDS sent it again after up to three seconds.
+        # Of images published right after the request and larger than Fast DDS's shared memory, one
+        # in nine was lost, and DDS resent it after up to 3 s.
         shown_at = start + _HEAD_START_S - _FRAME_PERIOD_S
 
         def answered() -> bool:
@@ -157,7 +157,7 @@ class Robot(Node):
         self._wait(answered)
         answer_s, answer = time.monotonic() - start, future.result()
         if not answer.message.startswith(('accepted', 'refused')):
-            raise DemoError(f'the relocalizer found no answer: {answer.message}')
+            raise DemoError(f'the relocalizer gave no answer: {answer.message}')
         self._wait(lambda: stamp in self._hypotheses and stamp in self._detections)
         return WakeUp(stamp, answer.success, answer.message, self._hypotheses[stamp],
                       self._detections[stamp], answer_s)
@@ -173,13 +173,13 @@ class Robot(Node):
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def _wait(self, condition: Callable[[], bool]) -> None:
-        """Handle what arrives until a condition holds."""
+        """Process callbacks until a condition holds."""
         deadline = time.monotonic() + _PATIENCE_S
         while not condition():
             self._check()
             if time.monotonic() > deadline:
-                raise DemoError(f'nothing came over ROS for {_PATIENCE_S:g} s: does a firewall '
-                                'forbid UDP on this machine?')
+                raise DemoError(f'nothing arrived over ROS for {_PATIENCE_S:g} s: does a firewall '
+                                'block UDP on this machine?')
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def _on_detections(self, msg: Detection2DArray) -> None:

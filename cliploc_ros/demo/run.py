@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo from its start to its page of pictures."""
+"""Run the demo from its start to its page of pictures."""
 
 import shutil
 import time
@@ -45,23 +45,23 @@ _PATIENCE_S = 180.0
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """How to run the demo.
+    """Options of the demo.
 
     Parameters
     ----------
     assets : Path
-        Holds sequence/ (a TUM folder), map.yaml, yolo.pt and, unless only classes are matched,
-        clip.json and clip.safetensors.
+        Folder with sequence/ (a TUM folder), map.yaml, yolo.pt and, unless the method matches
+        classes only, clip.json and clip.safetensors.
     out : Path
-        Where the pictures go.
+        Folder for the pictures.
     wake_ups : int
-        How often the robot wakes up.
+        Number of wake-ups.
     rate : float
-        Speed of the recording between the wake-ups; 1 is as recorded.
+        Speed between wake-ups; 1 is as recorded.
     method : str
-        Matching and algorithm as the paper joins them, ``hybrid_auto``.
+        Matching and algorithm, joined as in the paper: ``hybrid_auto``.
     rviz : bool
-        Whether to open RViz where it is installed.
+        Whether to open RViz if it is installed.
     """
 
     assets: Path
@@ -73,11 +73,12 @@ class DemoOptions:
 
     @property
     def parameters(self) -> dict[str, object]:
-        """Return the relocalizer's parameters that are not its defaults."""
+        """Return the relocalizer's parameters that differ from its defaults."""
         matching, _, algorithm = self.method.partition('_')
         parameters: dict[str, object] = {'map_file': self.assets / 'map.yaml',
                                          'matching': matching, 'algorithm': algorithm,
-                                         # searches that the clock cuts are not to be repeated
+                                         'require_localizer': False,  # the demo has no AMCL
+                                         # a search that the clock ends cannot be repeated
                                          'time_budget_ms': 10_000.0}
         if matching != 'class':
             parameters |= {'clip_model': self.assets / 'clip.json',
@@ -91,7 +92,7 @@ class DemoOptions:
 
 
 def run_demo(options: DemoOptions) -> list[Judged]:
-    """Let the robot walk and wake up, and draw what it saw.
+    """Let the robot walk and wake up, and draw the results.
 
     Returns
     -------
@@ -101,7 +102,7 @@ def run_demo(options: DemoOptions) -> list[Judged]:
     Raises
     ------
     CliplocError
-        For assets that are missing or cannot be used, and where the nodes do not run.
+        For missing or invalid assets, and if the nodes do not run.
     """
     start = time.monotonic()
     relocalizer_options(options.values)  # refuses an unknown method before anything starts
@@ -128,12 +129,12 @@ def _check_assets(options: DemoOptions) -> None:
               *(value for value in options.parameters.values() if isinstance(value, Path))]
     for path in needed:
         if not path.exists():
-            raise DemoError(f'{path} is missing: run script/setup again, or give another folder '
-                            'with --assets')
+            raise DemoError(f'{path} is missing: run script/setup again, or choose another '
+                            'folder with --assets')
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the folder for the pictures, and remove those of an earlier demo."""
+    """Make the folder for the pictures, and remove those of an earlier run."""
     make_folder(folder)
     for picture in folder.glob(page.PICTURES):
         picture.unlink()
@@ -142,13 +143,13 @@ def _make_folder(folder: Path) -> None:
 def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:
     camera, _ = find_camera(None, sequence.folder)
     convert_tum(sequence, camera, bag, ConversionOptions(world_frame=frame_id))
-    print(f'a walk of {len(sequence)} images is now a recording', flush=True)
+    print(f'converted a walk of {len(sequence)} images into a recording', flush=True)
     return bag
 
 
 @contextmanager
 def _rviz(options: DemoOptions, frame_id: str) -> Iterator[Process | None]:
-    """Open RViz if it is asked for and there."""
+    """Open RViz if requested and installed."""
     if options.rviz and shutil.which('rviz2'):
         config = installed_share() / 'config' / 'demo.rviz'
         with running(['rviz2', '-d', config, '-f', frame_id],
@@ -156,12 +157,12 @@ def _rviz(options: DemoOptions, frame_id: str) -> Iterator[Process | None]:
             yield process
         return
     if options.rviz:
-        print('RViz (rviz2) is not installed or not sourced here: going on without it')
+        print('RViz (rviz2) is not installed or not sourced here: continuing without it')
     yield None
 
 
 def _walk(options: DemoOptions, bag: Path, sequence: TumSequence, domain: int) -> list[Judged]:
-    """Let the robot wake up along the recording; print each answer as it comes."""
+    """Let the robot wake up along the recording; print each answer as it arrives."""
     chosen = np.linspace(0, len(sequence) - 1, min(options.wake_ups, len(sequence)))
     wake_up_at = {sequence.stamps_ns[round(index)] for index in chosen}
     judged: list[Judged] = []
@@ -177,9 +178,9 @@ def _walk(options: DemoOptions, bag: Path, sequence: TumSequence, domain: int) -
 
 @contextmanager
 def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
-    """Run detector and relocalizer; yield a function that raises when one has died."""
+    """Run detector and relocalizer; yield a function that raises if one has ended."""
     start = time.monotonic()
-    print(f'starting detector and relocalizer ({options.method}); to listen in: export '
+    print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
     with (running(node_command('detector', {'model': options.assets / 'yolo.pt'}),
                   options.out / 'detector.log') as detector,
@@ -220,7 +221,7 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
 
 
 def _walked(sequence: TumSequence) -> NDArray[np.float64]:
-    """Return where the camera was while it took images (t, 3) [m]."""
+    """Return the camera's path while it took images (t, 3) [m]."""
     truth = sequence.trajectory
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
     return truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's map from above, with estimates joined to their truth (the paper's Fig. 7)."""
+"""Draw the demo's map from above, with a line from each estimate to its truth (paper, Fig. 7)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ _HEADING_M = 0.28
 
 def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                   path_xyz: NDArray[np.float64], path: Path) -> None:
-    """Draw map, walk, and each estimate joined to its truth.
+    """Draw map, walk, and a line from each estimate to its ground truth.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
         The wake-ups.
     landmark_map : LandmarkMap
     path_xyz : ndarray (t, 3)
-        Where the camera walked [m].
+        Path of the camera [m].
     path : Path
         The PNG to write.
     """
@@ -77,7 +77,7 @@ def _draw_wake_up(axes: Axes, judged: Judged) -> None:
     if judged.wake_up.accepted or judged.truth is None:
         _draw_camera(axes, judged.pose, color, 'o' if judged.wake_up.accepted else 'X')
     else:
-        # Nobody was told of this one, so it is drawn smaller.
+        # Not published, so drawn smaller.
         axes.plot(*judged.pose[:2, 3], marker='X', markersize=6, color=color, zorder=7,
                   linestyle='none')
     if judged.truth is not None:
@@ -107,7 +107,7 @@ def _number(axes: Axes, map_from_camera: NDArray[np.float64], number: int, color
 def _legend(class_colors: dict[str, tuple[float, ...]]) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=_TRUTH, marker='o', markersize=9, markerfacecolor='none',
-               label='truth, and where it looks'),
+               label='ground truth and view'),
         Line2D([], [], color=ACCEPTED, marker='o', markersize=5.5,
                label='accepted estimate,\njoined to its truth'),
         Line2D([], [], color=REFUSED, marker='X', linestyle=(0, (4, 3)),

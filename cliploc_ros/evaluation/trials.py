@@ -168,7 +168,8 @@ def _judge(method: str, trial: int, query: Query, found: Relocalization) -> Resu
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
         method=method, trial=trial, query=query.number,
-        timestamp=query.observation.stamp_ns / NS_PER_S, boxes=len(query.observation.detections),
+        timestamp=float(query.observation.stamp_ns) / NS_PER_S,
+        boxes=len(query.observation.detections),
         solved=found.solved, accepted=found.accepted,
         map_from_camera=None if pose is None else pose.tolist(),
         error_m=None if error_m is None else float(error_m),

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Neural networks behind two small protocols: an object detector, an image-text encoder.
 
-To import this package imports neither torch nor open_clip nor ultralytics: that happens when an
-encoder or a detector is made.
+Importing this package imports neither torch nor open_clip nor ultralytics; making an encoder or a
+detector does.
 """
 
 from cliploc_ros.models.clip_encoder import ClipEncoder, LoadedEncoder, load_encoder

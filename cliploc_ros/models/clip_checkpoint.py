@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of CLIP, read tensor by tensor and never by running pickled code."""
+"""Read checkpoints of CLIP as tensors only, never by running pickled code."""
 
 import pickle
 import warnings
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
     """Return the tensors of a checkpoint, mapped from the file where its format allows.
 
-    The names are those of open_clip's ``CustomTextCLIP``: 'visual.*' and 'text.*', whatever
-    form the checkpoint has. TorchScript archives (OpenAI's own files) and pickles of PyTorch
-    before 1.6 cannot be mapped and are read whole.
+    The names are those of open_clip's ``CustomTextCLIP``, 'visual.*' and 'text.*', for every
+    form of checkpoint. TorchScript archives (OpenAI's own files) and pickles of PyTorch before
+    1.6 cannot be mapped and are read whole.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def _read(file: Path) -> object:
 
 
 def _unwrap(state: object) -> 'dict[str, torch.Tensor]':
-    """Return the tensors of a state dict, out of the wrappings that training code puts on."""
+    """Return the tensors of a state dict without the wrappers of training code."""
     import torch
 
     if isinstance(state, dict) and isinstance(state.get('state_dict'), dict):
@@ -73,17 +73,17 @@ def _unwrap(state: object) -> 'dict[str, torch.Tensor]':
 
 
 def _content(state: object) -> str:
-    """Say what was read instead of tensors.
+    """Describe what the file holds instead of tensors.
 
-    Once ultralytics has loaded a detector, its classes pass PyTorch's check of pickles for as long
-    as the process lives, and a detector is read whole.
+    Once ultralytics has loaded a detector, PyTorch's check of pickles passes its classes until the
+    process ends, and then reads a whole detector.
     """
     values = state.values() if isinstance(state, dict) else [state]
     types = sorted({f'{type(value).__module__}.{type(value).__qualname__}' for value in values})
-    return f'it holds no tensors by name, but {", ".join(types[:8]) or "nothing"}'
+    return f'it holds no named tensors, but {", ".join(types[:8]) or "nothing"}'
 
 
 def _first_cause(error: pickle.UnpicklingError) -> str:
-    """Return the line of torch's long message that names what it refused."""
+    """Return the line of torch's long message that names the refused class."""
     lines = str(error).splitlines() or ['']
     return next((line.strip() for line in lines if 'Unsupported' in line), lines[0])

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import torch
 
 _LABEL_BATCH = 64
-# Past this the middle square, all that CLIP sees of a long crop, no longer depends on the rest.
+# CLIP sees only the middle square of a long crop; beyond this ratio the rest has no influence.
 _MAX_ASPECT = 16
 
 logger = logging.getLogger(__name__)
@@ -38,11 +38,11 @@ class LoadedEncoder(NamedTuple):
 
 
 def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
-    """Load CLIP for a map: its labels encoded, its image tower ready, its text tower gone.
+    """Load CLIP for a map: encode its labels and keep only the image tower.
 
-    The labels' embeddings come from the cache when model, weights and labels are known there;
-    then the text tower is never loaded. Otherwise it is loaded first, alone, and freed before
-    the image tower comes.
+    The labels' embeddings come from the cache if it knows model, weights and labels; then the text
+    tower is never loaded. Otherwise the text tower is loaded first, alone, and freed before the
+    image tower is loaded.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def embed_labels(options: ClipOptions, labels: Sequence[str]) -> LabelEmbeddings
 
 def _embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
                   ) -> LabelEmbeddings:
-    # Once each, in one order: neither moving nor reordering landmarks asks for new embeddings.
+    # Once each and sorted: moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(labels))
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
     embeddings = cache.load(weights.key, unique, weights.embed_dim)
@@ -117,7 +117,7 @@ class ClipEncoder:
         self._dtype = open_clip.get_input_dtype(precision)
         shortens = weights.preprocess.get('image_resize_mode', 'shortest') == 'shortest'
         self._max_aspect = _MAX_ASPECT if shortens else sys.maxsize
-        # The first pass pays for kernels and memory; better now than when the robot wakes up.
+        # The first pass sets up kernels and memory: do it before the first request.
         self.encode_crops(np.zeros((32, 32, 3), dtype=np.uint8), np.array([[0.0, 0, 32, 32]]))
 
     @property
@@ -140,15 +140,15 @@ class ClipEncoder:
     ) -> NDArray[np.float32]:
         """Return one embedding for each box of an image.
 
-        A crop holds every pixel that its box touches, goes through open_clip's own
-        preprocessing, and all crops go through the tower together, at most ``max_batch`` at once.
+        A crop holds every pixel that its box touches. open_clip's own preprocessing prepares the
+        crops; the tower takes at most ``max_batch`` of them at once.
 
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
             The image, red first.
         bboxes_xyxy : ndarray (n, 4)
-            Left, top, right, bottom [px]; `visible_boxes` says which ones can be cropped.
+            Left, top, right, bottom [px]; `visible_boxes` finds those that can be cropped.
 
         Returns
         -------
@@ -160,7 +160,7 @@ class ClipEncoder:
         ImageError
             For an image of another shape or type, or without pixels.
         CliplocError
-            For boxes that are not finite, are empty, or do not overlap the image.
+            For boxes that are not finite, are empty, or lie outside the image.
         ModelError
             When memory runs out, or the tower gives no finite numbers.
         """
@@ -171,7 +171,7 @@ class ClipEncoder:
         return _as_rows(embeddings, self.embed_dim, self._weights)
 
     def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
-        """Return one embedding (L, d) for each label; the text tower is loaded and freed again."""
+        """Return the embeddings (L, d) of labels; loads the text tower and frees it again."""
         return encode_labels(self._weights, labels, self._device)
 
     def _encode_batch(
@@ -197,9 +197,9 @@ def encode_labels(
 ) -> NDArray[np.float32]:
     """Return one embedding (L, d) for each label, float32 rows of unit length.
 
-    The text tower is loaded for it and freed afterwards. It runs in fp32 on any device, so that
-    what one machine caches serves another. Labels longer than the model reads are cut, with a
-    warning.
+    This loads the text tower and frees it afterwards. The tower runs in fp32 on any device, so
+    that a cache made on one machine serves another. A label longer than the model's context is
+    cut, with a warning.
     """
     if not labels:
         return np.empty((0, weights.embed_dim), dtype=np.float32)
@@ -236,10 +236,10 @@ def _warn_of_long_labels(tokenizer: Any, labels: Sequence[str]) -> None:
 def _cut(
     image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64], max_aspect: int
 ) -> NDArray[np.uint8]:
-    """Return a crop, a very long one shortened about its middle.
+    """Return a crop; cut a very long one to its middle.
 
-    open_clip scales the short side up to the tower's and cuts a square from the middle: of a
-    crop of 1 x 2000 pixels it would make an image of 224 x 448,000 first.
+    open_clip scales the short side up to the tower's input before it cuts a square from the
+    middle: a crop of 1 x 2000 pixels would first become an image of 224 x 448,000.
     """
     left, top, right, bottom = bounds.tolist()
     longest = max_aspect * min(right - left, bottom - top)

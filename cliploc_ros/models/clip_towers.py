@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The two towers of CLIP, each loaded alone: the image tower to stay, the text tower to go."""
+"""Load the image tower or the text tower of CLIP alone."""
 
 import contextlib
 import logging
@@ -23,7 +23,7 @@ _FOREIGN_SUFFIXES = ('.npz', '.npy')
 def load_image_tower(
     weights: ClipWeights, device: 'torch.device', precision: str
 ) -> 'tuple[Any, Callable[[Image], torch.Tensor]]':
-    """Return a CLIP of which only ``encode_image`` works, and open_clip's preprocessing for it.
+    """Return a CLIP with ``encode_image`` only, and open_clip's preprocessing for it.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def load_image_tower(
 
 
 def load_text_tower(weights: ClipWeights, device: 'torch.device') -> Any:
-    """Return a CLIP of which only ``encode_text`` works, in fp32; raises as the image tower."""
+    """Return a CLIP with ``encode_text`` only, in fp32; see `load_image_tower`."""
     model, _ = _load(weights, 'text', device, 'fp32')
     return model
 
@@ -68,7 +68,7 @@ def _load(
 def _build_without_memory(weights: ClipWeights, precision: str) -> tuple[Any, Any]:
     """Return the model on torch's meta device (shapes and types alone) and its preprocessing.
 
-    To draw random weights and overwrite them would take seconds and the memory of both towers.
+    Drawing random weights only to overwrite them takes seconds and the memory of both towers.
     """
     import open_clip
     import torch
@@ -81,7 +81,7 @@ def _build_without_memory(weights: ClipWeights, precision: str) -> tuple[Any, An
 
 
 def _load_by_open_clip(weights: ClipWeights, device: 'torch.device', precision: str) -> Any:
-    """Return the model as open_clip itself builds and fills it: slower, in twice the memory."""
+    """Return the model as open_clip itself loads it: slower, with twice the memory."""
     import open_clip
 
     try:
@@ -99,7 +99,7 @@ def _is_foreign(state: 'dict[str, torch.Tensor]') -> bool:
 
 
 def _has_unsaved_buffers(module: 'torch.nn.Module') -> bool:
-    """Tell whether a tower computes tensors when built that no checkpoint holds."""
+    """Return whether a tower computes tensors at construction that no checkpoint holds."""
     from open_clip.transformer import TextTransformer
 
     unsaved = {name for name, _ in module.named_buffers()} - module.state_dict().keys()
@@ -113,7 +113,7 @@ def _fill(
     weights: ClipWeights,
     device: 'torch.device',
 ) -> None:
-    """Give a tower on the meta device its weights, every one of them.
+    """Fill a tower on the meta device with all of its weights.
 
     The tower gets copies, not the mapped tensors: a process dies when a file that it has mapped is
     cut short, as a copy over the old weights does.
@@ -143,9 +143,9 @@ def _misfits(
 
 @contextlib.contextmanager
 def quiet_root_logger() -> Iterator[None]:
-    """Keep open_clip from warning of random weights, and from configuring the root logger.
+    """Suppress open_clip's warnings of random weights and its handler on the root logger.
 
-    It logs through ``logging.warning``, which gives a root logger without handlers one.
+    It logs through ``logging.warning``, which adds a handler to a root logger without one.
     """
     root = logging.getLogger()
     handler = logging.NullHandler()

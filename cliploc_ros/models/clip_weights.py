@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which CLIP is meant: its architecture, its file of weights and how they were trained."""
+"""Find the CLIP that the options name: architecture, file of weights, activation."""
 
 import difflib
 import json
@@ -27,12 +27,12 @@ class ClipOptions:
     Parameters
     ----------
     model : str
-        Architecture, a name of ``open_clip.list_models()``, or the path of a model config of
-        open_clip (.json), which is then known by its file's name.
+        Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
+        config (.json), whose name is then the file's.
     pretrained : str
-        A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also says
-        how the weights were trained (activation, colour normalization); a path leaves the
-        architecture's own values.
+        A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also
+        determines activation and colour normalization; with a path the architecture's own
+        values hold.
     checkpoint_path : str
         Local file with the weights of the tag, instead of a download; '' downloads.
     device : str
@@ -40,7 +40,7 @@ class ClipOptions:
     precision : str
         'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'; of the image tower.
     max_batch : int
-        Most crops in one forward pass; it bounds the memory.
+        Greatest number of crops in one forward pass; bounds the memory.
     cache_dir : str
         Folder for downloads and label embeddings; '' is the user's cache.
 
@@ -67,7 +67,7 @@ class ClipOptions:
 
 @dataclass(frozen=True)
 class ClipWeights:
-    """A file of CLIP weights and what must be known to use it.
+    """A file of CLIP weights and what is needed to use it.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class ClipWeights:
     file : Path
         The weights.
     quick_gelu : bool
-        Whether they were trained with OpenAI's approximate GELU.
+        Whether the weights were trained with OpenAI's approximate GELU.
     preprocess : dict
         ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
         ``open_clip.create_model_and_transforms`` takes them; empty for its defaults.
@@ -95,18 +95,18 @@ class ClipWeights:
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
-    """Find the weights that the options name, downloading them where they are not here yet.
+    """Find the weights that the options name; download them if they are not here yet.
 
     Raises
     ------
     ModelError
-        For an unknown model or tag (the nearest names are listed), a file that is missing or
-        damaged, and a download that fails.
+        For an unknown model or tag (the message lists the nearest names), a missing or damaged
+        file, and a failed download.
     """
     import open_clip
 
     own = options.model.endswith('.json')
-    # OpenAI wrote ViT-L/14
+    # OpenAI writes ViT-L/14.
     model = _add_config(options.model) if own else options.model.replace('/', '-')
     config = open_clip.get_model_config(model) if model in open_clip.list_models() else None
     if config is None:
@@ -135,7 +135,7 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
 
 
 def _add_config(name: str) -> str:
-    """Make a model config of the user's own known to open_clip; return the model's name."""
+    """Register a model config of the user with open_clip; return the model's name."""
     import open_clip
 
     file = Path(name).expanduser().absolute()
@@ -156,7 +156,7 @@ def _add_config(name: str) -> str:
 
 
 def is_torchscript(file: Path) -> bool:
-    """Tell whether a file is a TorchScript archive: the form in which OpenAI published CLIP."""
+    """Return whether a file is a TorchScript archive, the form in which OpenAI published CLIP."""
     if not zipfile.is_zipfile(file):
         return False
     with zipfile.ZipFile(file) as archive:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a network runs and how precisely."""
+"""Device, precision and memory of networks."""
 
 import ctypes
 import gc
@@ -16,7 +16,7 @@ PRECISIONS = ('auto', 'fp16', 'fp32')
 
 
 def check_precision(precision: str) -> None:
-    """Refuse with an OptionsError a precision that is none of PRECISIONS."""
+    """Raise an OptionsError for a precision that is none of PRECISIONS."""
     if precision not in PRECISIONS:
         raise OptionsError(f"precision '{precision}' is none of {', '.join(PRECISIONS)}")
 
@@ -40,7 +40,7 @@ def resolve_device(device: str) -> 'torch.device':
     if resolved is None or resolved.type not in ('cpu', 'cuda'):
         raise OptionsError(f"device '{device}' is none of auto, cpu, cuda, cuda:0, cuda:1 ...")
     if resolved.type == 'cuda' and (resolved.index or 0) >= torch.cuda.device_count():
-        raise OptionsError(f"device '{device}' is not there: torch {torch.__version__} sees "
+        raise OptionsError(f"device '{device}' is missing: torch {torch.__version__} sees "
                            f"{torch.cuda.device_count()} GPUs; set the device to 'auto' or 'cpu'")
     return resolved
 
@@ -54,12 +54,12 @@ def resolve_precision(precision: str, device: 'torch.device') -> str:
 
 
 def free_memory() -> None:
-    """Give what freed networks held back to the system."""
+    """Return the memory of freed networks to the system."""
     gc.collect()
-    torch = sys.modules.get('torch')  # where it was never loaded, it holds nothing
+    torch = sys.modules.get('torch')  # not loaded, it holds nothing
     if torch is not None and torch.cuda.is_available():
         torch.cuda.empty_cache()
-    # glibc keeps freed blocks below 32 MB for later; a robot's other processes want them now.
+    # glibc keeps freed blocks below 32 MB for later; other processes of a robot need them now.
     trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
     if trim is not None:
         trim(0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights and caches as files: where they are, what is wrong with them, which ones they are."""
+"""Files of weights and caches: where they lie, whether they are intact, their fingerprint."""
 
 import atexit
 import hashlib
@@ -27,9 +27,9 @@ logger = logging.getLogger(__name__)
 def resolve_cache_dir(cache_dir: str) -> Path:
     """Return the folder for downloads and label embeddings; '' means the user's cache.
 
-    That is ``$XDG_CACHE_HOME/cliploc_ros``, else ``~/.cache/cliploc_ros``. Whoever writes there
-    chooses what CLIP answers. So where the user has no home folder, or others can write to the
-    cache, a private folder takes its place until the process ends.
+    That is ``$XDG_CACHE_HOME/cliploc_ros``, else ``~/.cache/cliploc_ros``. A forged label
+    embedding leads to wrong poses. So if the user has no home folder, or other users own the cache
+    or can write to it, a private folder replaces it until the process ends.
     """
     if cache_dir:
         return Path(cache_dir).expanduser().absolute()
@@ -54,7 +54,7 @@ def _is_open_to_others(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-    except OSError:  # nobody can write there: whoever needs the folder reports it
+    except OSError:  # the first write reports it
         return False
     return status.st_uid != os.getuid() or bool(status.st_mode & stat.S_IWOTH)
 
@@ -69,11 +69,11 @@ def _process_cache(reason: str) -> Path:
 
 
 def fingerprint_file(path: Path) -> str:
-    """Return a hash that tells one file of weights from another, in milliseconds.
+    """Return a hash that distinguishes files of weights, within milliseconds.
 
     It is the SHA-256 of the size and of 66 blocks of 64 KiB: head, tail and 64 evenly spaced
-    between them. Training changes every tensor and so the blocks; an edit of a few bytes that
-    falls between them is not seen.
+    between them. Training changes every tensor and so the blocks. The hash misses an edit of a few
+    bytes between the blocks.
     """
     size = path.stat().st_size
     last = max(size - _BLOCK_BYTES, 0)
@@ -87,9 +87,9 @@ def fingerprint_file(path: Path) -> str:
 
 
 def check_weights_file(path: Path) -> None:
-    """Refuse with a ModelError a file that is missing, unreadable, cut off or no weights at all.
+    """Raise a ModelError for a file that is missing, unreadable, cut off or no weights at all.
 
-    Only the frame of the file is looked at; what it holds is for the loader to judge.
+    This looks at head and end of the file only; the loader checks the content.
     """
     if path.is_dir():
         raise ModelError(f'{path} is a folder: name the file with the weights')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images and the crops of them that an encoder sees."""
+"""Check images, and compute the crops that an encoder sees."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from cliploc_ros.errors import CliplocError, ImageError
 
 
 def check_image_rgb(image_rgb: NDArray[np.uint8]) -> None:
-    """Refuse with an ImageError what is no (h, w, 3) uint8 image of at least one pixel."""
+    """Raise an ImageError unless the image is (h, w, 3) uint8 with at least one pixel."""
     if not isinstance(image_rgb, np.ndarray):
         raise ImageError(f'an image must be a NumPy array, not {type(image_rgb).__name__}')
     if image_rgb.ndim != 3 or image_rgb.shape[2] != 3 or image_rgb.dtype != np.uint8:
@@ -22,7 +22,7 @@ def check_image_rgb(image_rgb: NDArray[np.uint8]) -> None:
 def visible_boxes(
     bboxes_xyxy: NDArray[np.float64], width: int, height: int
 ) -> NDArray[np.bool_]:
-    """Tell which boxes can be cropped from an image.
+    """Find the boxes that can be cropped from an image.
 
     Parameters
     ----------

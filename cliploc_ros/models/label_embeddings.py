@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Label embeddings on disk: with them a robot wakes up without the text tower."""
+"""Label embeddings on disk: with them CLIP starts without its text tower."""
 
 import contextlib
 import hashlib
@@ -27,24 +27,24 @@ logger = logging.getLogger(__name__)
 class LabelCache:
     """A folder of label embeddings, one ``.npz`` for each model and set of labels.
 
-    A file is named by the hash of the encoder's key (model, activation, fingerprint of the
-    weights) and of the labels, and holds both, so that a foreign or damaged file is noticed. One
-    file for the whole set, not one a label: embeddings then never depend on what was encoded
-    before, and a map edit costs one cold start. Files are written beside their place and
-    renamed, so that any number of processes may share the folder. A hit marks its file as used;
-    beyond 32 files the longest unused go.
+    The name of a file is the hash of the encoder's key (model, activation, fingerprint of the
+    weights) and of the labels. The file holds both, which reveals a foreign or damaged one. One
+    file holds the whole set, not one label: embeddings then never depend on earlier batches, and
+    an edit of the map costs one cold start. Files are written under another name and renamed, so
+    that any number of processes may share the folder. A hit marks its file as used; beyond 32
+    files the least recently used are removed.
 
     Parameters
     ----------
     folder : Path
-        Where the files are; made when first needed.
+        The folder; made at the first write.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def load(self, key: str, labels: Sequence[str], embed_dim: int) -> NDArray[np.float32] | None:
-        """Return the embeddings (L, embed_dim) of L labels, or None when they must be encoded."""
+        """Return the embeddings (L, embed_dim) of L labels, or None if the cache lacks them."""
         file = self._file(key, labels)
         if not file.exists():
             return None
@@ -60,21 +60,21 @@ class LabelCache:
                 or not np.allclose(np.einsum('ij,ij->i', embeddings, embeddings), 1.0,
                                    atol=2e-3)):
             return self._ignore(file, 'its embeddings are not unit rows of the expected shape')
-        with contextlib.suppress(OSError):  # a read-only cache serves as well
+        with contextlib.suppress(OSError):  # a read-only cache works too
             os.utime(file)
         return embeddings
 
     def store(self, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]) -> None:
-        """Write the embeddings of labels; a failure costs the cache and nothing else."""
+        """Write the embeddings of labels; on failure only warn."""
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._prune()
             self._write(file, key, labels, embeddings)
         except OSError as error:
-            logger.warning('label embeddings are not cached, so the next start will be slow '
-                           'again: cannot write %s (%s); make room there, or let cache_dir name '
-                           'a folder that can be written', file, error.strerror or error)
+            logger.warning('label embeddings are not cached and the next start is slow again: '
+                           'cannot write %s (%s); make room, or choose a writable cache_dir',
+                           file, error.strerror or error)
 
     def _write(
         self, file: Path, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]
@@ -91,7 +91,7 @@ class LabelCache:
             Path(name).unlink(missing_ok=True)
 
     def _prune(self) -> None:
-        """Make room for one file more, and clear what writers that were killed left behind."""
+        """Remove the least recently used files, and those of writers that were killed."""
         files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
         stale = [file for file in self._folder.glob('.*.tmp')
                  if _modified(file) < time.time() - _STALE_S]
@@ -115,5 +115,5 @@ def _identity(key: str, labels: Sequence[str]) -> bytes:
 def _modified(file: Path) -> float:
     try:
         return file.stat().st_mtime
-    except OSError:  # another process was faster
+    except OSError:  # another process has removed it
         return 0.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From an image and its detections to an observation: crops are compared with labels here."""
+"""Make an observation of an image and its detections: compare crops with labels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from cliploc_ros.models.protocols import ImageTextEncoder
 
 
 class Observer:
-    """Looks at the crops of an image with an encoder.
+    """Encodes the crops of an image and compares them with labels.
 
     Parameters
     ----------
@@ -32,16 +32,16 @@ class Observer:
 
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:
-        """Return what the camera saw, each detection with its similarity to every label.
+        """Return an observation: each detection with its similarity to every label.
 
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
         camera : Camera
         detections : Detections
-            Usable ones, see Detections.usable.
+            See `Detections.usable`.
         stamp_ns : int
-            When the image was taken [ns].
+            Stamp of the image [ns].
         """
         crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
         return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The two protocols behind which the neural networks stand."""
+"""Protocols of the neural networks."""
 
 from collections.abc import Sequence
 from typing import Protocol

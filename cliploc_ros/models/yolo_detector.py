@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""YOLO through ultralytics, which is kept from the network, from installing and from the home.
+"""YOLO through ultralytics, without its network requests, installations and files in the home.
 
-The only module that imports ultralytics (AGPL-3.0). It sets ultralytics' environment variables
-before the import, so import it before anything else imports ultralytics.
+This is the only module that imports ultralytics (AGPL-3.0). It sets environment variables before
+the import, so nothing else may import ultralytics first.
 """
 
 import atexit
@@ -39,15 +39,15 @@ class YoloOptions:
     Parameters
     ----------
     model : str
-        Path of a ``.pt`` file, or the name of a published one, which is downloaded once.
+        Path of a ``.pt`` file, or the name of a published one, which is then downloaded once.
     conf : float
         Least confidence of a detection, 0 to 1.
     iou : float
-        Overlap from which on the weaker of two boxes of a class is dropped, 0 to 1.
+        IoU from which the weaker of two boxes of a class is dropped, 0 to 1.
     imgsz : int
-        The image's longer side is scaled to this for the network [px].
+        The network sees the image with its longer side scaled to this [px].
     max_det : int
-        Most detections in an image; the most confident stay.
+        Greatest number of detections in an image; the most confident are kept.
     device : str
         'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
     precision : str
@@ -84,11 +84,10 @@ class YoloOptions:
 class YoloDetector:
     """An `ObjectDetector`: a detection model of ultralytics.
 
-    Ultralytics' checkpoints are pickles, which can run code of their own. They are read in
-    ultralytics' restricted mode (``weights_only=True`` and a list of known classes), which
-    refuses that. An ultralytics without this mode, or a PyTorch before 2.6, falls back to plain
-    pickles: then only a file that the options name by its path is loaded, and a warning says to
-    load none from a source that you do not trust.
+    Ultralytics' checkpoints are pickles, which can run code. This class reads them in ultralytics'
+    restricted mode (``weights_only=True`` and a list of known classes), which refuses code. An
+    ultralytics without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only
+    a file that the options name by its path is loaded, with a warning to load trusted files only.
 
     Parameters
     ----------
@@ -98,9 +97,9 @@ class YoloDetector:
     Raises
     ------
     ModelError
-        When the weights cannot be found, are damaged, or are no detection model.
+        When the weights are missing or damaged, or are no detection model.
     OptionsError
-        When the device is not there.
+        When the device is missing.
     """
 
     def __init__(self, options: YoloOptions) -> None:
@@ -113,13 +112,13 @@ class YoloDetector:
         self._stride = int(self._model.model.stride.max())
         self._device = device
         self.configure(options)
-        # The first pass sets up the predictor; better now than on the first image.
+        # The first pass sets up the predictor: do it before the first image.
         self.detect(np.zeros((self._stride, self._stride, 3), dtype=np.uint8))
         # Ultralytics leaves one core free on a CPU, for the whole process.
         torch.set_num_threads(threads)
 
     def configure(self, options: YoloOptions) -> None:
-        """Run from now on with other options; which model, and where, stays."""
+        """Change the options, except for model and device."""
         self._settings = {
             'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
             'imgsz': -(-options.imgsz // self._stride) * self._stride,
@@ -156,11 +155,11 @@ class YoloDetector:
 
 @cache
 def import_ultralytics() -> Any:
-    """Import ultralytics so that it neither asks the network, installs, nor writes to the home."""
+    """Import ultralytics without network requests, installations and files in the home."""
     import torch  # first: it reads OMP_NUM_THREADS, which ultralytics sets to 1
 
     if 'ultralytics' in sys.modules:
-        logger.warning('ultralytics was imported before the detector: it may go to the network')
+        logger.warning('ultralytics was imported before the detector: it may use the network')
     folder = tempfile.mkdtemp(prefix='cliploc_ros_ultralytics_')
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     threads = os.environ.get('OMP_NUM_THREADS')
@@ -175,19 +174,19 @@ def import_ultralytics() -> Any:
     if threads is None:
         os.environ.pop('OMP_NUM_THREADS', None)
     ultralytics.settings.update({'sync': False})
-    # It logs to the standard output, past the loggers of the process.
+    # It logs to the standard output instead of the loggers of the process.
     ultralytics_logger = logging.getLogger('ultralytics')
     ultralytics_logger.handlers.clear()
     ultralytics_logger.propagate = True
     ultralytics_logger.setLevel(logging.WARNING)
     if not _is_restricted(ultralytics):
-        logger.warning('ultralytics %s with torch %s runs code that weights may hold: load only '
-                       'files that you trust', ultralytics.__version__, torch.__version__)
+        logger.warning('ultralytics %s with torch %s runs code in files of weights: load trusted '
+                       'files only', ultralytics.__version__, torch.__version__)
     return ultralytics
 
 
 def _is_restricted(ultralytics: Any) -> bool:
-    """Return whether weights are read as weights only, and what else they hold is refused."""
+    """Return whether ultralytics reads weights only and refuses code in their files."""
     import torch
 
     return (getattr(ultralytics.utils, 'SAFE_LOAD', False)
@@ -195,7 +194,7 @@ def _is_restricted(ultralytics: Any) -> bool:
 
 
 def _resolve_file(options: YoloOptions) -> Path:
-    """Return the file of weights that the options name, downloading it where it must be."""
+    """Return the file of weights that the options name; download it if necessary."""
     file = Path(options.model).expanduser().absolute()
     if file.exists() or Path(options.model).name != options.model:
         check_weights_file(file)
@@ -241,12 +240,12 @@ def _load(file: Path) -> Any:
     """Return ultralytics' model of a file of weights."""
     ultralytics = import_ultralytics()
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
-        # Ultralytics rewrites some paths (quotes, yolov5) and insists on the suffix.
+        # Ultralytics rewrites some paths (quotes, yolov5) and requires the suffix.
         neutral = Path(desk) / 'weights.pt'
         neutral.symlink_to(file.resolve())
         try:
             model = ultralytics.YOLO(neutral)
-        except Exception as error:  # ultralytics raises what comes
+        except Exception as error:  # ultralytics has no exceptions of its own
             reason = first_line(error).removeprefix('ERROR').strip()
             raise ModelError(f'{file} is no detection model of YOLO: '
                              f'{reason.replace(str(neutral), "it")}') from error

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables' tests share."""
+"""Fixtures of the executables' tests."""
 
 import subprocess
 
@@ -10,7 +10,7 @@ from executables import PROJECT, Listener, command, write_sequence
 
 @pytest.fixture
 def start():
-    """Start an executable as its own process; what still runs at the end is killed."""
+    """Start an executable as its own process; kill it at the end if it still runs."""
     processes = []
 
     def start_process(module: str, *args: object, **options) -> subprocess.Popen:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Running the executables, small TUM folders to feed them, and a node that listens to them."""
+"""Run the executables, write small TUM folders and recordings, and listen to topics."""
 
 import json
 import os
@@ -58,7 +58,7 @@ def run(module: str, *args: object, **options) -> subprocess.CompletedProcess:
 
 @dataclass(frozen=True)
 class SmallSequence:
-    """A TUM folder of random images, with what was put into it."""
+    """A TUM folder of random images, and its content."""
 
     folder: Path
     stamps: list[str]
@@ -112,7 +112,7 @@ def write_poses(path, offsets_ms, topics=None):
 
 
 class Listener:
-    """A node in a thread that keeps the serialized messages of topics, and when they came."""
+    """A node in a thread that stores serialized messages of topics with their arrival times."""
 
     def __init__(self) -> None:
         self.received: dict[str, list[bytes]] = defaultdict(list)

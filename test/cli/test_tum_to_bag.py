@@ -50,7 +50,7 @@ def test_small_sequence_round_trip(make_sequence, tmp_path, storage, form):
     )
     assert done.returncode == 0, done.stderr
     assert '4 images, 3 ground-truth poses, 4 detection messages' in done.stdout
-    assert 'without ground truth within 20 ms, and so without pose: 1 images' in done.stdout
+    assert '1 images have no ground truth within 20 ms' in done.stdout
 
     topics = read_all(tmp_path / 'bag')
     images = '/front/camera/image' + ('/compressed' if form == 'compressed' else '')
@@ -160,7 +160,7 @@ def assert_refused(capfd):
 
 
 def assert_one_line(errors, *messages):
-    """One line says what to mend (beside the bar and OpenCV's own complaints)."""
+    """Expect one line with the error, beside the progress bar and OpenCV's messages."""
     assert errors.splitlines()[-1].startswith('error: ')
     assert 'Traceback' not in errors
     for message in messages:
@@ -195,8 +195,8 @@ def bitmap_image(sequence):
 @pytest.mark.parametrize(
     ('damage', 'messages'),
     [
-        (truncate_image, ['100.200000.png', 'is no image that can be decoded']),
-        (empty_image, ['100.200000.png', 'is no image that can be decoded']),
+        (truncate_image, ['100.200000.png', 'cannot be decoded as an image']),
+        (empty_image, ['100.200000.png', 'cannot be decoded as an image']),
         (enlarge_image, ['100.200000.png', '64x96', '64x48']),
         (bitmap_image, ['100.200000.png', 'neither PNG nor JPEG']),
         (lambda sequence: (sequence.folder / 'rgb.txt').unlink(), ['rgb.txt']),
@@ -240,7 +240,7 @@ def test_existing_output_is_kept(make_sequence, tmp_path):
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_full_disk_leaves_nothing(make_sequence, tmp_path, storage):
-    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    """A limit on the size of files gives the error of a full disk."""
     sequence = make_sequence(count=30)
 
     def limit():
@@ -250,7 +250,7 @@ def test_full_disk_leaves_nothing(make_sequence, tmp_path, storage):
         'tum_to_bag', sequence.folder, tmp_path / 'bag', '--storage', storage, preexec_fn=limit
     )
     assert done.returncode == 1
-    assert_one_line(done.stderr, 'cannot be written', 'nothing was left behind')
+    assert_one_line(done.stderr, 'cannot be written', 'no partial file remains')
     assert_nothing_at(tmp_path / 'bag')
 
 
@@ -259,7 +259,7 @@ def test_interruption_leaves_nothing(make_sequence, tmp_path, start, number):
     sequence = make_sequence()
     image = sequence.folder / 'rgb' / f'{sequence.stamps[0]}.png'
     with (sequence.folder / 'rgb.txt').open('a') as file:
-        for index in range(5_000):  # one image under many names: far from done when stopped
+        for index in range(5_000):  # many links to one image: too many to finish before the signal
             os.link(image, sequence.folder / 'rgb' / f'{index}.png')
             file.write(f'{200 + index} rgb/{index}.png\n')
     process = start('tum_to_bag', sequence.folder, tmp_path / 'bag')

@@ -59,10 +59,10 @@ def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
     ({'semi_axes': [1e-300, 1.0, 0.1]}, 'semi_axes: .* must be within'),
     ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'orientation: .* norm 2, not 1'),
     ({'orientation': [0.0] * 4}, 'orientation: .* norm 0, not 1'),
-    ({'label': ''}, 'label: must be text'),
-    ({'label': 7}, 'label: must be text'),
+    ({'label': ''}, 'label: must be non-empty text'),
+    ({'label': 7}, 'label: must be non-empty text'),
     ({'label': 'x' * 100_000}, 'label: longer than'),
-    ({'class_id': None}, 'class_id: must be text'),
+    ({'class_id': None}, 'class_id: must be non-empty text'),
     ({'colour': 'red'}, 'unknown field: colour'),
 ])
 def test_bad_fields_are_named_with_file_and_landmark(tmp_path, change, message):
@@ -95,7 +95,7 @@ def test_missing_fields_are_named(tmp_path, field):
     (file_of({}), 'the map is empty'),
     (file_of([1, 2]), 'the map is empty'),
     (file_of({'a.b': CUP}), 'without dots'),
-    (file_of({'a': CUP}, ''), 'frame_id: must be text'),
+    (file_of({'a': CUP}, ''), 'frame_id: must be non-empty text'),
     (file_of({'a': 'cup'}), "landmark 'a': expected the fields"),
     (file_of({'a': CUP}) | {'/x': {'ros__parameters': {'map': {}}}}, 'more than one map'),
     ('!!python/object/apply:os.system [echo]', 'no YAML mapping'),

@@ -147,12 +147,14 @@ def test_one_more_frame_keeps_it_too(frames):
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(iterations=1_000_000,
                                                                time_budget_s=0.05))
     relocalizer.warm_up()
-    window, searched = [replace(observation, odom_from_camera=np.eye(4))] * frames, []
-    relocalizer.relocalize(window[:-1], searched)
+    observation = replace(observation, odom_from_camera=np.eye(4))
+    earlier = [relocalizer.search(observation, time.perf_counter() + 0.05)] * (frames - 1)
     times_ms = []
     for _ in range(8):
         start = time.perf_counter()
-        found = relocalizer.relocalize(window, searched[:frames - 1])
+        budget = relocalizer.begin(frames)
+        newest = relocalizer.search(observation, budget.search_end())
+        found = relocalizer.locate([*earlier, newest], budget)
         times_ms.append(1e3 * (time.perf_counter() - start))
     print(f'\n{frames} frames, 50 ms: took {min(times_ms):.1f} to {max(times_ms):.1f} ms')
     assert found.solved

@@ -51,37 +51,37 @@ def scene(potential):
 
 
 def test_it_chooses_and_scores_as_the_reference(scene, potential, rng):
-    bench, compared = set_up(scene), 0
+    (candidates, prior, targets, memory, poses, overlaps), compared = set_up(scene), 0
     samples = draw_ransac(scene.pairs, 2_000, rng)
     for number, sample in enumerate(samples):
-        which = make_hypothesis(bench, samples, number, 0.0)
+        which = make_hypothesis(candidates, prior, memory, poses, samples, number, 0.0)
         expected, total = sample_pose(scene, sample)
         assert (which >= 0) == (expected is not None)
         if expected is None:
             continue
         compared += 1
         assert total >= 0.0
-        assert (bench.poses.rotations[which] == expected[0]).all()
-        assert (bench.poses.translations[which] == expected[1]).all()
+        assert (poses.rotations[which] == expected[0]).all()
+        assert (poses.translations[which] == expected[1]).all()
         plain, landmarks = score(scene, potential, expected)
         verified = verify(scene, *expected)
         assert verified.score == pytest.approx(plain, abs=1e-12)
         assert (verified.landmarks == landmarks).all()
         for floor in (-1.0, 0.5 * plain, plain - 1e-6, plain + 1e-6, plain + 1.0):
-            found = verify_beyond(bench.targets, bench.poses, which, bench.overlaps, floor)
+            found = verify_beyond(targets, poses, which, overlaps, floor)
             assert found == pytest.approx(max(plain, floor), abs=1e-9)
     assert compared > 500
 
 
 def test_a_least_overlap_drops_what_overlaps_less(scene, rng):
-    bench, dropped = set_up(scene), 0
+    (candidates, prior, _, memory, poses, _), dropped = set_up(scene), 0
     samples = draw_ransac(scene.pairs, 500, rng)
     for number, sample in enumerate(samples):
-        which = make_hypothesis(bench, samples, number, 1.0)
+        which = make_hypothesis(candidates, prior, memory, poses, samples, number, 1.0)
         expected, total = sample_pose(scene, sample)
         assert (which >= 0) == (total >= 1.0)
         if which >= 0:
-            assert (bench.poses.rotations[which] == expected[0]).all()
+            assert (poses.rotations[which] == expected[0]).all()
         dropped += expected is not None and which < 0
     assert dropped > 20
 

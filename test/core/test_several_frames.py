@@ -166,9 +166,9 @@ def test_the_information_of_verticals_is_that_of_the_refinement(room, walk):
         pose = invert_transform(walk[-1])
         rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
         inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
-        in_front, residuals = residuals_of_rig(rig, inliers, rotation, translation)
+        in_front, residuals = residuals_of_rig(inliers, rotation, translation)
         assert in_front
-        information, _ = linearize_rig(rig, inliers, rotation, translation, residuals)
+        information, _ = linearize_rig(inliers, rotation, translation, residuals)
         informations.append(information)
     rotations = cameras[:, :3, :3] @ invert_transform(walk[-1])[:3, :3]
     np.testing.assert_allclose(vertical_information(rotations, verticals),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in the very form of Jazzy's `ros2 bag record`, put together by hand.
+"""Recordings in the exact format of Jazzy's `ros2 bag record`, assembled by hand.
 
 Nothing here goes through the writer under test or the library beneath it: the tables, the YAML
 and the MCAP records are spelled out as rosbag2 0.26 writes them, metadata version 9. They are
@@ -22,7 +22,7 @@ INFINITE = 'sec: 9223372036', 'nsec: 854775807'
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic; QoS as discovery tells it: history and depth are not known."""
+    """One topic, with QoS as from discovery: history and depth are unknown."""
 
     name: str
     msgtype: str
@@ -40,7 +40,7 @@ class Message:
 
 
 def qos_yaml(topic: Topic) -> str:
-    """One publisher's offer, as yaml-cpp dumps it."""
+    """Return one publisher's QoS as yaml-cpp writes it."""
     lines = [
         '- history: unknown',
         '  depth: 0',
@@ -65,7 +65,7 @@ def metadata_yaml(
     compression_format: str = '',
     compression_mode: str = '',
 ) -> str:
-    """metadata.yaml; of files, the names on disk and what they hold."""
+    """Return metadata.yaml; files are names on disk and their content."""
     everything = [message for _, messages in files for message in messages]
     start, length = time_range(everything)
     lines = [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading recordings of Jazzy's `ros2 bag record` (crafted, see jazzy_bags) and broken ones."""
+"""Read recordings in the format of Jazzy's `ros2 bag record` (jazzy_bags), and damaged ones."""
 
 import struct
 from types import SimpleNamespace
@@ -14,13 +14,13 @@ from cliploc_ros.datasets.rosbag import BagMessage, BagReader, BagWriter, typest
 from cliploc_ros.errors import DatasetError
 
 START_NS = 1_700_000_000_123_456_789
-# as ROS's own generator has it, not computed here
+# From ROS's own generator, not computed here.
 STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
 
 def string_cdr(text: str) -> bytes:
-    """Return a std_msgs/String in little-endian CDR, spelled out."""
+    """Return a std_msgs/String in little-endian CDR, byte by byte."""
     encoded = text.encode() + b'\x00'
     return b'\x00\x01\x00\x00' + struct.pack('<I', len(encoded)) + encoded
 
@@ -110,7 +110,7 @@ def test_reads_a_single_file(tmp_path, storage):
 
 
 def test_reads_all_where_metadata_was_edited(tmp_path):
-    """People change QoS in metadata.yaml; the files keep the old, and no message may vanish."""
+    """Users change QoS in metadata.yaml but not in the files: no message may be lost."""
     messages = make_messages(0, 6)
     bag = jazzy_bags.write_bag(tmp_path / 'bag', 'mcap', TOPICS, [messages])
     metadata = bag / 'metadata.yaml'
@@ -219,7 +219,7 @@ def test_empty_recording(tmp_path, storage):
 
 
 def test_type_hashes_are_the_published_ones():
-    """Compared on the wire; the values are those of ROS's own generator for Jazzy."""
+    """ROS compares the hashes on the wire; the values are from its own generator for Jazzy."""
     store = typestore()
     assert store.hash_rihs01('std_msgs/msg/String') == STRING_HASH
     assert store.hash_rihs01('vision_msgs/msg/Detection2DArray') == (

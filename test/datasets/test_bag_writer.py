@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing recordings: what comes back, what Jazzy would find, what a failure leaves behind."""
+"""Write recordings: round trip, Jazzy's metadata, and no remains after a failure."""
 
 import sqlite3
 import subprocess
@@ -160,7 +160,7 @@ def test_failure_leaves_nothing(tmp_path, storage):
     with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', storage) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
-        assert not (tmp_path / 'bag').exists()  # built beside its place
+        assert not (tmp_path / 'bag').exists()  # built beside its final path
         assert len(list(tmp_path.iterdir())) == 1
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []
@@ -184,7 +184,7 @@ def test_missing_parent_and_storage_are_named(tmp_path):
 
 
 def test_full_disk_leaves_nothing(tmp_path, storage):
-    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    """A limit on the size of files gives the error of a full disk."""
     program = textwrap.dedent("""
         import resource, sys
         import numpy as np
@@ -206,5 +206,5 @@ def test_full_disk_leaves_nothing(tmp_path, storage):
         capture_output=True, text=True, check=True, timeout=300,
     )
     assert 'cannot be written' in run.stdout
-    assert 'nothing was left behind' in run.stdout
+    assert 'no partial file remains' in run.stdout
     assert list(tmp_path.iterdir()) == []

@@ -98,7 +98,7 @@ def become(name, value):
         (put('timestamps', 0, -1.0), 'timestamps is negative in row 0'),
         (put('frame_offsets', 1, 3), 'frame_offsets decreases in row 2'),
         (put('frame_offsets', 3, 2), 'frame_offsets goes from 0 to 2, expected 0 to 3'),
-        (put('landmark_ids', 0, 'cup_2'), 'landmark_ids is there twice in row 1'),
+        (put('landmark_ids', 0, 'cup_2'), 'landmark_ids repeats an id in row 1'),
         (put('landmark_ids', 0, ''), 'landmark_ids is empty in row 0'),
         (put('intrinsics_fx_fy_cx_cy', 0, 0.0), 'focal length'),
         (put('is_main', 1, True), 'is_main marks 2 frames of query_group 0'),
@@ -175,7 +175,7 @@ def assert_same(queries, others):
 
 def test_round_trip(tmp_path):
     queries = load_queries(save(tmp_path / 'q.npz', make_arrays()))
-    # a stamp that no float64 of seconds can hold
+    # A float64 of seconds cannot hold this stamp.
     exact = replace(queries[2], stamp_ns=1341847981000000123)
     queries = replace(queries, frames=(*queries.frames[:2], exact))
     save_queries(tmp_path / 'again.npz', queries)
@@ -213,7 +213,7 @@ def test_malformed_queries_are_not_written(tmp_path):
 
 
 def test_full_disk_keeps_the_old_file(tmp_path):
-    """A limit on the size of files stands for the disk: the kernel refuses to write more."""
+    """A limit on the size of files gives the error of a full disk."""
     path = save(tmp_path / 'q.npz', make_arrays())
     before = path.read_bytes()
     program = textwrap.dedent("""
@@ -231,7 +231,7 @@ def test_full_disk_keeps_the_old_file(tmp_path):
         [sys.executable, '-c', program, path],
         capture_output=True, text=True, check=True, timeout=300,
     )
-    assert 'cannot be written: File too large; nothing was left behind' in run.stdout
+    assert 'cannot be written: File too large; no partial file remains' in run.stdout
     assert [one.name for one in tmp_path.iterdir()] == ['q.npz']
     assert path.read_bytes() == before
 

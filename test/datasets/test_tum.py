@@ -22,7 +22,7 @@ MS = 1_000_000
 
 @pytest.fixture
 def folder(tmp_path):
-    """A TUM folder of three images; their content does not matter here."""
+    """A TUM folder of three placeholder images."""
     path = tmp_path / 'rgbd_dataset_freiburg2_desk'
     (path / 'rgb').mkdir(parents=True)
     lines = ['# color images', '# timestamp filename']
@@ -111,8 +111,8 @@ def test_no_stamps(text):
         ('rgb.txt', '1.0\n', r'rgb.txt:1: expected timestamp and file name'),
         ('rgb.txt', 'one rgb/1.1.png\n', r"rgb.txt:1: 'one' is no timestamp"),
         ('rgb.txt', '# x\n\n1.0 rgb/none.png\n', r'rgb.txt:3: image .*none.png does not exist'),
-        ('rgb.txt', '1.1 rgb/1.1.png\n1.1 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
-        ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not come after'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.1 rgb/1.1.png\n', r'rgb.txt:2: .*not exceed the one'),
+        ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not exceed the one'),
         ('rgb.txt', '# nothing\n', r'rgb.txt: lists no images'),
         ('groundtruth.txt', '1 2 3\n', r'groundtruth.txt:1: expected .*, got 3 fields'),
         ('groundtruth.txt', '1 0 0 0 0 0 0 one\n', r'groundtruth.txt:1: .*not seven numbers'),
@@ -134,7 +134,7 @@ def test_missing_files_are_named(folder, tmp_path):
     with pytest.raises(DatasetError, match=r'rgb\.txt: cannot be read'):
         read_tum(folder)
     (folder / 'rgb.txt').unlink()
-    with pytest.raises(DatasetError, match=r'rgb\.txt: not there'):
+    with pytest.raises(DatasetError, match=r'rgb\.txt: no such file'):
         read_tum(folder)
     with pytest.raises(DatasetError, match='cannot be read'):
         read_tum_trajectory(tmp_path / 'none.txt')
@@ -153,14 +153,14 @@ quaternions = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
 @given(quaternions, quaternions, st.floats(0, 1))
 def test_slerp_agrees_with_scipy(start, end, fraction):
     turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).magnitude()
-    if turn > np.pi - 1e-3:  # two shortest arcs: either is right
+    if turn > np.pi - 1e-3:  # two arcs are equally short
         return
     expected = Rotation.from_quat(start) * Rotation.from_rotvec(
         fraction * (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
     )
     result = slerp(start, end, fraction)
     assert np.linalg.norm(result) == pytest.approx(1, abs=1e-9)
-    # below cosine 0.9995 slerp is exact; above it is linear, and 3e-6 rad off at most
+    # Below cosine 0.9995 slerp is exact; above it is linear, with an error of at most 3e-6 rad.
     assert (expected.inv() * Rotation.from_quat(result)).magnitude() < 1e-5
 
 
@@ -305,7 +305,7 @@ def test_recorded_detections(tmp_path):
         ([{'detections': []}], "frame 0: field 'timestamp' is missing"),
         ([{'timestamp': '1'}], "frame 0: field 'detections' is missing"),
         ([{'timestamp': 'x', 'detections': []}], "frame 0: 'x' is no timestamp"),
-        ([{'timestamp': '1', 'detections': []}] * 2, 'frame 1: timestamp 1 is there twice'),
+        ([{'timestamp': '1', 'detections': []}] * 2, 'frame 1: timestamp 1 is a repetition'),
         ([{'timestamp': '1', 'detections': [{}]}], "detection 0: field 'class_id' is missing"),
         ([3], "frame 0: field 'timestamp' is missing"),
         ([{'timestamp': '1', 'detections': [{**BOOK, 'score': 2}]}], 'score is 2.0'),

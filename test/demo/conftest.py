@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A few rendered worlds for the tests of training."""
+"""Rendered worlds for the tests of training."""
 
 import subprocess
 import sys
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-# Before anything renders: PyTorch's Triton and Mesa's software renderer each bring an LLVM, and
-# loading them the other way round ends the process. Programs render and train in different ones.
+# Import this before anything renders: PyTorch's Triton and Mesa's software renderer each load an
+# LLVM, and the opposite order crashes the process. The programs render and train in separate ones.
 import torchvision  # noqa: F401
 
 PROJECT = Path(__file__).resolve().parents[2]

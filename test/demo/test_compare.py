@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's table and the growth of a class in the demo's world, with its real networks."""
+"""The paper's table and growing classes in the demo's world, with its networks."""
 
 import csv
 import re
@@ -31,7 +31,7 @@ def compare(folder, *arguments):
 
 @pytest.fixture(scope='module')
 def compared(tmp_path_factory):
-    """The folder and the output of a comparison, with little time for the exhaustive methods."""
+    """Run a comparison with a short time limit; return its folder and output."""
     folder = tmp_path_factory.mktemp('compare')
     done = compare(folder, '--budget', '0.05', '--trials', '1')
     assert done.returncode == 0, done.stderr

@@ -36,7 +36,7 @@ def run(executables, *arguments):
 
 @pytest.fixture(scope='module')
 def finished(executables, tmp_path_factory):
-    """One run to its end: the folder of its pictures, and its output."""
+    """Run the demo to its end; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'pictures'
     code, output, errors = run(executables, '--out', out, '--rviz', '--wake-ups', WAKE_UPS)
     assert code == 0, errors
@@ -81,7 +81,7 @@ def test_without_rviz_it_says_so_and_goes_on(finished):
 
 
 def children(pid):
-    """Return the processes that a process has started."""
+    """Return the children of a process."""
     return [int(child) for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 

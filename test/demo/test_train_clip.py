@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Training the demo's CLIP: it learns, and what it writes loads as any CLIP does."""
+"""Train the demo's CLIP: its loss falls, and its file loads as any CLIP does."""
 
 import re
 
@@ -14,7 +14,7 @@ from demo_world import train_clip
 
 
 def test_equal_labels_are_all_right_answers():
-    """Two crops of one label: their texts are equal, so the best loss is that of a tie."""
+    """Two crops share a label: their texts are equal, so the least loss is that of a tie."""
     axes = torch.eye(3)
     images = texts = axes[[0, 0, 1]]
     loss = train_clip.contrastive_loss(images, texts, torch.tensor(100.0), ['a', 'a', 'b'])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The synthetic world: what it says of itself is what its images show."""
+"""The synthetic world: its labels and boxes agree with its images."""
 
 import json
 
@@ -81,7 +81,7 @@ def test_moved_objects_change_places_and_stay_in_the_map(room):
 
 
 def test_boxes_are_where_the_ellipsoids_project(room, renderer):
-    """The renderer's camera and the core's are one: wholly seen objects fill their outlines."""
+    """Renderer and core share a camera model: fully visible objects fill their outlines."""
     overlaps = []
     for pose in draw_views(room, 8, np.random.default_rng(0)):
         for seen in find_boxes(room, renderer, pose):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP with random weights as a local checkpoint, and open_clip's own answers for it."""
+"""CLIP with random weights as a local checkpoint, and open_clip's embeddings for it."""
 
 import json
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import open_clip
 import torch
 from PIL import Image
 
-# CLIP's own architecture, made small where its size is not the point.
+# CLIP's architecture at a small size.
 SMALL_CONFIG = {
     'embed_dim': 64,
     'vision_cfg': {'image_size': 224, 'layers': 2, 'width': 64, 'head_width': 32,

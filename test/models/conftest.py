@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the models share: checkpoints and an image."""
+"""Fixtures of the models' tests: checkpoints and an image."""
 
 from pathlib import Path
 

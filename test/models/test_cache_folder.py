@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The cache lies where nobody but the user can write."""
+"""Only the user can write to the default cache."""
 
 import os
 import stat
@@ -50,7 +50,7 @@ def test_the_default_is_the_users_cache(monkeypatch, tmp_path):
 def test_without_a_home_the_cache_is_private_and_ends_with_the_process(tmp_path):
     if subprocess.run([*HOMELESS, 'true'], capture_output=True, check=False).returncode:
         pytest.skip('no user namespaces here')
-    # What another user may have put where an earlier version looked for its cache.
+    # Another user may have made the folder that earlier versions used.
     (tmp_path / 'cliploc_ros-54321').mkdir()
     (first, mode, is_own), log = resolve(*HOMELESS, TMPDIR=str(tmp_path))
     (second, *_), _ = resolve(*HOMELESS, TMPDIR=str(tmp_path))

@@ -84,7 +84,7 @@ def test_many_labels_are_encoded_in_batches(small_clip, small_encoder):
 def test_very_long_crops_cost_little(small_clip, small_encoder):
     image = np.random.default_rng(0).integers(0, 255, (4, 4000, 3), dtype=np.uint8)
     crop = small_encoder.encode_crops(image, np.array([[0.0, 1, 4000, 2]]))
-    # Its middle is what open_clip would have seen of it.
+    # open_clip sees only its middle.
     expected = small_clip.crops(image, np.array([[1992, 1, 2008, 2]]))
     assert difference(crop, expected) < 1e-5
 
@@ -186,7 +186,7 @@ def test_openai_torchscript_archive(small_clip, tmp_path, image_rgb):
     write_torchscript(small_clip.model, file)
     encoder, label_embeddings = load_encoder(
         options(small_clip, tmp_path, pretrained=str(file)), LABELS)
-    # Whoever published in this form trained with OpenAI's activation.
+    # Weights in this format were trained with OpenAI's activation.
     reference = with_quick_gelu(small_clip)
     bounds = crop_bounds(BBOXES, 640, 480)
     crops = reference.crops(image_rgb, bounds)
@@ -209,7 +209,7 @@ def test_a_tag_says_how_weights_were_trained(large_clip, tmp_path):
 
 
 def test_a_tower_with_computed_tensors_is_loaded_by_open_clip(tmp_path, image_rgb):
-    # Its rotary embeddings are in no checkpoint. Its text tower is CLIP's: a small one will do.
+    # No checkpoint holds its rotary embeddings. Its text tower is CLIP's: use a small one.
     config = open_clip.get_model_config('PE-Core-T-16-384')
     config['text_cfg'] |= SMALL_CONFIG['text_cfg']
     rotary = make_small_reference('small-rotary', config, tmp_path)
@@ -243,7 +243,7 @@ def test_weights_may_change_on_disk_while_they_run(small_clip, tmp_path, image_r
     shutil.copy(small_clip.file, file)
     encoder = load_image_encoder(options(small_clip, tmp_path, pretrained=str(file)))
     before = encoder.encode_crops(image_rgb, BBOXES)
-    with file.open('r+b') as opened:  # in place, as scp does: a mapped file would kill us
+    with file.open('r+b') as opened:  # in place, as scp does: SIGBUS if it were mapped
         opened.truncate(1000)
     assert np.array_equal(encoder.encode_crops(image_rgb, BBOXES), before)
 

@@ -55,7 +55,7 @@ def run(script: str, cache: Path, *within: str, **environment: str) -> dict[str,
 
 @pytest.fixture
 def silent_port():
-    """Yield a port that swallows connections: packets are dropped, not refused."""
+    """Yield a port that drops packets instead of refusing connections."""
     with socket.socket() as listener:
         listener.bind(('127.0.0.1', 0))
         listener.listen(0)
@@ -83,14 +83,14 @@ def test_no_network_for_yolo(tmp_path):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         port = free.getsockname()[1]
-    # A port where nothing listens refuses at once.
+    # A port without a listener refuses connections at once.
     text = run(LOAD_YOLO, tmp_path, HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']
     assert 'cannot download yolov8n.pt' in text and 'on another machine' in text
     assert list((tmp_path / 'weights').iterdir()) == []
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """As much of a model hub as a download needs."""
+    """The part of a model hub that a download needs."""
 
     weights = b''
     name = 'open_clip_model.safetensors'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Label embeddings on disk: found again, never trusted blindly, never fatal."""
+"""Label embeddings on disk: hits, damaged files, and failures that only cost the cache."""
 
 import os
 import pickle
@@ -131,7 +131,7 @@ def test_the_longest_unused_files_go(cache):
         cache.store(KEY, [f'label {number}'], unit_rows(1))
         newest = max(cache._folder.glob('*.npz'), key=lambda file: file.stat().st_mtime_ns)
         os.utime(newest, (number, number))
-        # One that is used at each start stays however old it is.
+        # A file that every start uses is never removed.
         assert cache.load(KEY, ['label 0'], 16) is not None
     assert len(list(cache._folder.iterdir())) == 32
     assert cache.load(KEY, ['label 1'], 16) is None

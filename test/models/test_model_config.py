@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A CLIP whose architecture stands in a file of the user's own."""
+"""A CLIP with the architecture from a user's model config."""
 
 import json
 

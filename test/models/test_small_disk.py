@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP with its cache on a disk that is really full, and on one that is really read-only."""
+"""CLIP with its cache on a full disk and on a read-only one."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ def say(text):
 
 
 def run(folder, small_clip, script):
-    """Run a script with a small disk; return the lines it logged and said."""
+    """Run a script with a small disk; return the lines of its standard error."""
     disk = folder / 'disk'
     disk.mkdir()
     weights = folder / small_clip.file.name
@@ -49,7 +49,7 @@ def run(folder, small_clip, script):
 
 
 def test_a_full_disk_costs_only_the_cache(tmp_path, small_clip):
-    """Writing breaks off halfway; nothing of it stays, and with room again all is as it was."""
+    """A write fails halfway and leaves nothing; with room again the next one succeeds."""
     lines = run(tmp_path, small_clip, """
 (folder / 'cache').mkdir()
 (folder / 'filler').write_bytes(bytes(56 * 1024))

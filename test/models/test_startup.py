@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a first start of CLIP and a start with a warm cache cost."""
+"""Memory of CLIP's first start and of a start with a warm cache."""
 
 from cliploc_ros.benchmark.startup import KINDS, format_results, measure_startup
 from cliploc_ros.models import ClipOptions
@@ -17,5 +17,5 @@ def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):
     # One tower at a time: its weights, and the pages of the mapped file that they are copied from.
     assert first.peak_mib - first.imports_mib < 2 * first.weights_mib + 64
     assert warm.peak_mib - warm.imports_mib < 2 * warm.weights_mib + 64
-    # The image tower is the larger: both starts end at its peak, the first with some rest.
+    # The image tower is larger than the text tower, so it determines the peak of both starts.
     assert warm.peak_mib < first.peak_mib + 16

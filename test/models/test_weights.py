@@ -122,7 +122,7 @@ def test_pickled_code_is_never_run(tmp_path, zipped):
 
 
 def test_where_pickled_code_would_run_only_a_path_is_loaded(shared_data, tmp_path, monkeypatch):
-    """As with a PyTorch before 2.6, which lacks this function."""
+    """A PyTorch before 2.6 lacks this function."""
     YoloDetector(YoloOptions(str(shared_data / 'weights/yolov8n_coco.pt'), device='cpu'))
     monkeypatch.delattr(torch.serialization, 'get_unsafe_globals_in_checkpoint')
     with pytest.raises(ModelError, match='would run code that yolov8n'):
@@ -151,7 +151,7 @@ def test_unknown_names(tmp_path):
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'device': 'tpu'}, "device 'tpu'"), ({'device': 'cuda:99'}, "device 'cuda:99' is not there"),
+    ({'device': 'tpu'}, "device 'tpu'"), ({'device': 'cuda:99'}, "device 'cuda:99' is missing"),
     ({'precision': 'int8'}, "precision 'int8'"), ({'max_batch': 0}, 'max_batch'),
 ])
 def test_options_out_of_range(small_clip, tmp_path, change, message):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A real YOLOv8n on real images; ultralytics stays off the network, the home and pip."""
+"""A real YOLOv8n on real images; ultralytics uses neither network, home nor pip."""
 
 import json
 import os
@@ -182,7 +182,7 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
     home, here, temporary = (tmp_path / name for name in ('home', 'here', 'temporary'))
     for folder in (home, here, temporary):
         folder.mkdir()
-    # Not as a test: ultralytics is silent where it sees pytest.
+    # Hide pytest: ultralytics is silent under it.
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(('PYTEST', 'YOLO', 'XDG', 'OMP', 'ULTRALYTICS'))}
     environment |= {'HOME': str(home), 'PYTHONPATH': str(PROJECT), 'TMPDIR': str(temporary),

@@ -1,161 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real nodes as processes, and a node in the test that talks to them over the wire."""
+"""Fixtures: nodes as processes, and the node in the test that exchanges messages with them."""
 
-import time
-from contextlib import contextmanager
-
-import numpy as np
 import pytest
 import rclpy
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from processes import PATIENCE_S, Process, wait_for
-from rcl_interfaces.srv import SetParameters
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from scene import CAMERA, make_room, see_room, write_map
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Header
-from std_srvs.srv import Empty, Trigger
-from vision_msgs.msg import Detection2DArray
-
-from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
-
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
-
-class Tester(Node):
-    """Publishes frames, asks for poses, and keeps what the relocalizer publishes."""
-
-    def __init__(self):
-        super().__init__('tester')
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self)
-        self.images = self.create_publisher(Image, 'image', RELIABLE)
-        self.compressed = self.create_publisher(CompressedImage, 'image/compressed', RELIABLE)
-        self.infos = self.create_publisher(CameraInfo, 'camera_info', RELIABLE)
-        self.detections = self.create_publisher(Detection2DArray, 'detections', RELIABLE)
-        self.poses, self.initial_poses, self.hypotheses = [], [], []
-        self._forgotten_ns = 0
-        for message, topic, kept in (
-                (PoseWithCovarianceStamped, 'relocalizer/pose', self.poses),
-                (PoseWithCovarianceStamped, 'initialpose', self.initial_poses),
-                (PoseArray, 'relocalizer/hypotheses', self.hypotheses)):
-            self.create_subscription(message, topic, self._keeper(kept), RELIABLE)
-        self._relocalize = self.create_client(Trigger, 'relocalizer/relocalize')
-        self._reinitialize = self.create_client(Empty, 'reinitialize_global_localization')
-
-    def _keeper(self, kept):
-        def keep(msg, info):
-            if info['source_timestamp'] > self._forgotten_ns:
-                kept.append(msg)
-        return keep
-
-    def forget(self):
-        """Forget what was published until now, also what is still on its way here."""
-        self._forgotten_ns = time.time_ns()
-        for kept in (self.poses, self.initial_poses, self.hypotheses):
-            kept.clear()
-
-    def spin(self):
-        self._executor.spin_once(timeout_sec=0.02)
-
-    def wait(self, condition, what, patience_s=PATIENCE_S):
-        wait_for(condition, what, patience_s, self.spin)
-
-    def connect(self):
-        """Wait until one relocalizer answers, and is heard."""
-        self.wait(lambda: len(self.get_publishers_info_by_topic('/relocalizer/pose')) == 1,
-                  'one relocalizer')
-        self.wait(self._relocalize.service_is_ready, 'the service relocalize')
-        self.wait(self._reinitialize.service_is_ready, 'the service reinitialize')
-
-    def call(self, service_type, name, request):
-        """Call any service; return its answer."""
-        client = self.create_client(service_type, name)
-        self.wait(client.service_is_ready, name)
-        answer = self.answer(client.call_async(request))
-        self.destroy_client(client)
-        return answer
-
-    def set_parameter(self, name, value):
-        """Set a parameter of the relocalizer; return rclpy's result."""
-        request = SetParameters.Request(
-            parameters=[Parameter(name, value=value).to_parameter_msg()])
-        return self.call(SetParameters, '/relocalizer/set_parameters', request).results[0]
-
-    @contextmanager
-    def hearing_detections(self):
-        """Keep the first detections of every stamp [ns] that anybody publishes meanwhile."""
-        heard = {}
-        subscription = self.create_subscription(
-            Detection2DArray, 'detections',
-            lambda msg: heard.setdefault(stamp_ns(msg.header.stamp), detections_from_msg(msg)),
-            RELIABLE)
-        try:
-            yield heard
-        finally:
-            self.destroy_subscription(subscription)
-
-    def listened_to(self):
-        """Return how many subscriptions there are to what this node publishes."""
-        return sum(publisher.get_subscription_count() for publisher in (
-            self.images, self.compressed, self.infos, self.detections))
-
-    def ask(self):
-        """Send a wake-up request; return its future."""
-        return self._relocalize.call_async(Trigger.Request())
-
-    def ask_reinitialize(self):
-        return self._reinitialize.call_async(Empty.Request())
-
-    def answer(self, future):
-        self.wait(future.done, 'an answer')
-        return future.result()
-
-    def publish(self, messages):
-        """Publish messages, each on the topic of its type."""
-        for message in messages:
-            {Image: self.images, CompressedImage: self.compressed, CameraInfo: self.infos,
-             Detection2DArray: self.detections}[type(message)].publish(message)
-
-    def feed_until(self, condition, frame, what='an answer'):
-        """Publish a frame again and again, as a camera would, until a condition holds."""
-        def work():
-            self.publish(frame)
-            for _ in range(5):
-                self.spin()
-        wait_for(condition, what, work=work)
-
-    def relocalize(self, frame):
-        """Ask, publish a frame until there is an answer, and return it."""
-        future = self.ask()
-        self.feed_until(future.done, frame)
-        return future.result()
-
-
-def transform_of(pose):
-    p, q = pose.position, pose.orientation
-    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
-
-
-def make_frame(detections=None, stamp_s=100.0):
-    """The messages of one frame of the simulated room, all of one stamp."""
-    seconds = int(stamp_s)
-    header = Header(frame_id='camera_optical_frame',
-                    stamp=Time(sec=seconds, nanosec=round((stamp_s - seconds) * 1e9)))
-    image = Image(header=header, height=CAMERA.height, width=CAMERA.width, encoding='rgb8',
-                  step=3 * CAMERA.width)
-    image.data = np.random.default_rng(0).integers(
-        0, 256, 3 * CAMERA.width * CAMERA.height, dtype=np.uint8).tobytes()
-    info = CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
-                      k=CAMERA.matrix.ravel(), distortion_model='plumb_bob', d=[0.0] * 5,
-                      p=np.c_[CAMERA.matrix, np.zeros(3)].ravel())
-    return image, info, detections_to_msg(detections or see_room(make_room()), header)
+from processes import Process
+from scene import make_room, write_map
+from tester import Tester, class_matching
 
 
 @pytest.fixture(scope='session')
@@ -185,7 +36,7 @@ def room_map(tmp_path_factory):
 
 
 def starter(folder):
-    """Return a function that starts modules as processes, and the list of those it started."""
+    """Return a function that starts modules as processes, and the list of these processes."""
     started = []
 
     def run(module, *arguments, parameters=None, **options):
@@ -201,7 +52,7 @@ def starter(folder):
 
 @pytest.fixture
 def start(tmp_path):
-    """Start modules of the package as processes; all are ended with the test."""
+    """Start modules of the package as processes; stop them at the end of the test."""
     run, started = starter(tmp_path)
     yield run
     for process in started:
@@ -210,21 +61,16 @@ def start(tmp_path):
 
 @pytest.fixture(scope='module')
 def start_shared(tmp_path_factory):
-    """The same for processes that several tests ask."""
+    """The same for processes that the tests of a module share."""
     run, started = starter(tmp_path_factory.mktemp('shared'))
     yield run
     for process in started:
         process.stop()
 
 
-def class_matching(room_map, **parameters):
-    """Parameters of a relocalizer that needs no network."""
-    return {'map_file': room_map, 'matching': 'class', 'algorithm': 'bf', **parameters}
-
-
 @pytest.fixture(scope='module')
 def relocalizer(start_shared, tester, room_map):
-    """A relocalizer that matches classes in the simulated room, ready to be asked."""
+    """A relocalizer that matches classes in the simulated room, ready for requests."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(room_map))
     process.wait_for_output('ready after')
     tester.connect()
@@ -235,7 +81,7 @@ def relocalizer(start_shared, tester, room_map):
 
 @pytest.fixture
 def own_relocalizer(start, tester, room_map):
-    """Start a relocalizer with parameters of the test's own; ready, or with its error logged."""
+    """Start a relocalizer with the test's parameters; wait until it is ready or logs an error."""
     def run(*arguments, expect='ready after', fresh=False, **parameters):
         process = start('nodes.relocalizer', *arguments, fresh=fresh,
                         parameters=class_matching(room_map, **parameters))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Modules of the package as processes of their own, and waiting for what they do."""
+"""Start modules of the package as processes, and wait for what they do."""
 
 import multiprocessing
 import os
@@ -16,21 +16,21 @@ from pathlib import Path
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
-# How long a test waits for what must come; only failures take so long.
+# The time limit of a wait. Only a failing test takes this long.
 PATIENCE_S = 60.0
-# What takes nearly all of a start: two seconds, nine with PyTorch.
+# These imports take most of a start: two seconds, nine with PyTorch.
 _IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
             'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer']
 
 
 @cache
 def _forked():
-    """Return what forks processes from one that has imported, and done nothing else."""
+    """Return a context that forks processes from a server with the imports done."""
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload(_IMPORTS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(PROJECT)  # whose modules these are
-        patch.setenv('OMP_WAIT_POLICY', 'PASSIVE')  # run_node's, which PyTorch reads when loaded
+        patch.chdir(PROJECT)  # so that it imports the source tree
+        patch.setenv('OMP_WAIT_POLICY', 'PASSIVE')  # as run_node does; PyTorch reads it on import
         forkserver.ensure_running()
     return context
 
@@ -44,7 +44,7 @@ def _run(module, arguments, log):
 
 
 class Fork:
-    """A forked process, used as one of subprocess is."""
+    """A forked process with the interface of subprocess.Popen."""
 
     def __init__(self, module, arguments, log):
         self._process = _forked().Process(target=_run, args=(module, arguments, log), daemon=True)
@@ -65,8 +65,8 @@ class Fork:
 class Process:
     """A module of the package in its own process, with its output in a file.
 
-    Most are forked from a server that has imported what they import. A fresh one is started as
-    its user does, as are those within another command or with an environment of their own.
+    By default it is forked from a server that has done its imports. With fresh, or inside another
+    command, or with its own environment variables, a new interpreter starts it, as for a user.
     """
 
     def __init__(self, module, arguments, log, fresh=False, within=(), **environment):
@@ -90,7 +90,7 @@ class Process:
         return self.log.read_text()
 
     def sees(self, path):
-        """Return where a path of the process, which may have disks of its own, is for others."""
+        """Return the path outside of the process's own mounts."""
         return self._proc(f'root{path}')
 
     def wait_for_output(self, text):
@@ -106,26 +106,26 @@ class Process:
         return int(self._proc('status').read_text().split(f'{field}:')[1].split()[0]) / 1024
 
     def descriptors(self):
-        """Return how many files, sockets and the like are open."""
+        """Return the number of open file descriptors."""
         return len(list(self._proc('fd').iterdir()))
 
     def threads(self):
-        """Return how many threads run."""
+        """Return the number of threads."""
         return len(list(self._proc('task').iterdir()))
 
     def wait_for_import(self, library):
-        """Wait until a part of a library is in memory: its loading has begun."""
+        """Wait until the process has mapped a file of a library: the import has begun."""
         wait_for(lambda: not self.alive or f'/{library}/' in self._proc('maps').read_text(),
                  f'{library} to be loaded')
         assert self.alive, self.output()
 
     def cpu_s(self):
-        """Processor time used so far [s]."""
+        """Return the processor time used so far [s]."""
         fields = self._proc('stat').read_text().rsplit(')', 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
     def stop(self, signal_number=signal.SIGINT):
-        """Signal the process; return its exit code and how long it took to end [s]."""
+        """Signal the process; return its exit code and the time until it ended [s]."""
         start = time.monotonic()
         if self.alive:
             os.kill(self._process.pid, signal_number)
@@ -138,7 +138,7 @@ class Process:
 
 
 def wait_for(condition, what, patience_s=PATIENCE_S, work=lambda: time.sleep(0.02)):
-    """Wait until a condition holds; fail after a time limit."""
+    """Wait until a condition holds; fail at the time limit."""
     deadline = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < deadline, f'waited {patience_s:g} s for {what}'

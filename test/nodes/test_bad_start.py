@@ -3,8 +3,8 @@
 """A relocalizer that is started wrongly says so, lives, and works once it is mended."""
 
 import pytest
-from conftest import make_frame
 from rcl_interfaces.srv import GetParameters
+from tester import make_frame
 
 
 @pytest.mark.parametrize(('parameters', 'reason'), [

@@ -14,9 +14,9 @@ import time
 import open_clip
 import pytest
 import torch
-from conftest import class_matching, make_frame, transform_of
 from rcl_interfaces.srv import GetParameters
 from scene import MAP_FROM_CAMERA, make_room, see_room
+from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
@@ -39,7 +39,7 @@ def cache_dir(tmp_path_factory):
 def clip_relocalizer(request, start_shared, room_map, tester, checkpoint, cache_dir):
     """A relocalizer with CLIP, started twice: the second time its labels are encoded already."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(
-        room_map, matching='hybrid', algorithm='b-prosac', k=12, iterations=30000,
+        room_map, matching='hybrid', algorithm='b-prosac', k=12, iterations=30000, timeout_s=60.0,
         clip_model='ViT-B-32', clip_pretrained=checkpoint, cache_dir=cache_dir))
     process.wait_for_output('ready after')
     assert ('encoded' if request.param == 'first start' else 'cached') in process.output()

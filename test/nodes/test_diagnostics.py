@@ -3,9 +3,9 @@
 """What the nodes say of themselves on /diagnostics while their input comes, stops and fails."""
 
 import pytest
-from conftest import make_frame
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import PROJECT
+from tester import make_frame
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 

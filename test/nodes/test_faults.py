@@ -9,12 +9,12 @@ import time
 
 import numpy as np
 import pytest
-from conftest import class_matching, make_frame
 from disks import small_disk
 from geometry_msgs.msg import PoseArray
 from processes import PROJECT
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
+from tester import class_matching, make_frame
 
 from cliploc_ros.ros.conversions import stamp_ns
 

@@ -5,7 +5,7 @@
 import os
 
 import numpy as np
-from conftest import make_frame
+from tester import make_frame
 from vision_msgs.msg import BoundingBox2D, Detection2D, ObjectHypothesis, ObjectHypothesisWithPose
 
 CASES = int(os.environ.get('CLIPLOC_FUZZ_CASES', '300'))

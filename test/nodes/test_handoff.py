@@ -6,9 +6,9 @@ import time
 from itertools import pairwise
 
 import pytest
-from conftest import make_frame
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Empty
+from tester import make_frame
 
 
 @pytest.fixture

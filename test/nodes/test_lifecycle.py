@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import class_matching, make_frame
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from processes import PROJECT
+from tester import class_matching, make_frame
 
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 # What each transition makes of each state where it is possible.

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from conftest import RELIABLE, make_frame, transform_of
 from nav_msgs.msg import Odometry
 from processes import wait_for
 from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from std_msgs.msg import Header
+from tester import RELIABLE, make_frame, transform_of
 
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,

@@ -9,11 +9,11 @@ import time
 import cv2
 import numpy as np
 import pytest
-from conftest import make_frame, transform_of
 from nav_msgs.msg import Odometry
 from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
+from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,

@@ -4,11 +4,11 @@
 
 import numpy as np
 import pytest
-from conftest import make_frame, transform_of
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from scene import MAP_FROM_CAMERA
 from std_msgs.msg import Header
+from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
 from cliploc_ros.ros.outputs.map_to_odom import transform_msg

@@ -4,10 +4,10 @@
 
 import pytest
 import yaml
-from conftest import class_matching, make_frame
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from std_srvs.srv import Trigger
+from tester import class_matching, make_frame
 
 
 def dump(tester, name):
@@ -73,9 +73,9 @@ def test_tools_see_what_a_parameter_allows(own_relocalizer, tester):
         DescribeParameters, '/relocalizer/describe_parameters',
         DescribeParameters.Request(names=['timeout_s', 'k', 'matching'])).descriptors
     timeout, k, matching = described
-    assert timeout.description == 'How long a request waits for fresh frames. [s]'
+    assert timeout.description == 'A request is answered within this time. [s]'
     assert timeout.floating_point_range[0].to_value == 3600.0
-    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (0, 1000)
+    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (1, 1000)
     assert (timeout.read_only, k.read_only, matching.read_only) == (False, False, True)
 
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 import yaml
-from conftest import make_frame, transform_of
 from processes import PROJECT
+from tester import make_frame, transform_of
 from wake_ups import judge, wake_up_on_every_frame
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag

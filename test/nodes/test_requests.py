@@ -5,10 +5,10 @@
 import time
 
 import numpy as np
-from conftest import make_frame, transform_of
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import Image
+from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 

@@ -6,8 +6,8 @@ import subprocess
 import xml.etree.ElementTree as ElementTree
 
 import pytest
-from conftest import make_frame
 from processes import PROJECT
+from tester import make_frame
 
 POLICY = PROJECT / 'config/security_policy.xml'
 # What tf2_ros brings, which is not installed everywhere the tests run.

@@ -5,11 +5,11 @@
 from contextlib import contextmanager
 
 import numpy as np
-from conftest import make_frame
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scene import make_room
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
+from tester import make_frame
 from visualization_msgs.msg import Marker, MarkerArray
 
 from cliploc_ros.messages import image_from_msg

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from conftest import RELIABLE, make_frame, transform_of
 from nav_msgs.msg import Odometry
 from processes import wait_for
 from rosgraph_msgs.msg import Clock
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
+from tester import RELIABLE, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,

@@ -14,7 +14,6 @@ from statistics import median_low
 import cv2
 import numpy as np
 import pytest
-from conftest import RELIABLE, transform_of
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import PATIENCE_S, wait_for
 from rclpy.executors import SingleThreadedExecutor
@@ -22,6 +21,7 @@ from rclpy.node import Node
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
+from tester import RELIABLE, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.bag_messages import (

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots on one network, and several cameras on one robot."""
 
-from conftest import class_matching, make_frame
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
+from tester import class_matching, make_frame
 
 
 def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_map, tmp_path):

@@ -3,7 +3,7 @@
 """Waking up on every frame of a recording, and judging the answers by the true poses."""
 
 import numpy as np
-from conftest import transform_of
+from tester import transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import stamp_ns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real nodes inside the test's process, in a context of their own."""
+"""Nodes inside the test's process, in their own context."""
 
 import time
 
@@ -9,13 +9,13 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-# How long a test waits for what must come; only failures take so long.
+# The time limit of a wait. Only a failing test takes this long.
 PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope='module')
 def context():
-    """A context that leaves rclpy's default one to the tests of the executables."""
+    """Create a context; rclpy's default one belongs to the tests of the nodes."""
     own = Context()
     own.init()
     yield own
@@ -24,7 +24,7 @@ def context():
 
 @pytest.fixture
 def make_node(context):
-    """Make nodes that end with the test; keywords are those of rclpy's Node."""
+    """Create nodes that are destroyed at the end of the test; keywords as of rclpy's Node."""
     made = []
 
     def make(name='node_under_test', **keywords):
@@ -37,7 +37,7 @@ def make_node(context):
 
 @pytest.fixture
 def wait():
-    """Wait until a condition holds; fail after a time limit."""
+    """Wait until a condition holds; fail at the time limit."""
     def wait_for(condition, what, work=lambda: time.sleep(0.002)):
         deadline = time.monotonic() + PATIENCE_S
         while not condition():

@@ -76,8 +76,8 @@ def test_a_file_goes_before_the_parameters(start_with, tmp_path):
     ({'center': [1.0, 2.0]}, "parameters: landmark 'cup_1': center: must be 3 numbers"),
     ({'center': [float('nan'), 0.0, 0.0]}, 'center: .* not finite'),
     ({'center': {'x': 1.0}}, 'center: must be 3 numbers'),
-    ({'label': 7}, "landmark 'cup_1': label: must be text"),
-    ({'label': True}, "landmark 'cup_1': label: must be text"),
+    ({'label': 7}, "landmark 'cup_1': label: must be non-empty text"),
+    ({'label': True}, "landmark 'cup_1': label: must be non-empty text"),
     ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'orientation: .* norm 2'),
     ({'colour': 'red'}, "landmark 'cup_1': unknown field: colour")])
 def test_a_bad_landmark_is_named(load, change, message):

@@ -21,6 +21,7 @@ from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates
+from cliploc_ros.units import NS_PER_S
 
 #: A robot that is refused retries at once: discovering its publishers anew would cost it a tenth
 #: of a second.
@@ -221,7 +222,7 @@ class FrameSource:
                    if self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
-        stamps = ', '.join(f'{self._resolved(name)} {stamp / 1e9:.6f}'
+        stamps = ', '.join(f'{self._resolved(name)} {stamp / NS_PER_S:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
         return (f'stamps never match (last: {stamps}): camera_info and detections must carry '
                 "their image's header; if detections are late, the detector is too slow for "

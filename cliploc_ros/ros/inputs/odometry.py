@@ -18,6 +18,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError, OdometryWindow
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.units import NS_PER_S
 
 # The boxes of a slow detector arrive long after their image was taken.
 _LENGTH_S = 30.0
@@ -140,7 +141,7 @@ class OdometrySource:
         if moment is None:
             return None
         distance_m, angle_deg = pose_error(*moment)
-        seconds = _MOMENT_NS / 1e9
+        seconds = _MOMENT_NS / NS_PER_S
         return distance_m / seconds, math.radians(angle_deg) / seconds
 
     def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

@@ -28,6 +28,7 @@ from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.log import RosLogHandler
 from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, Value
 from cliploc_ros.ros.node.worker import Worker
+from cliploc_ros.units import NS_PER_S
 
 # A transition may load weights for seconds; meanwhile clients can ask for the state.
 _MAX_TRANSITION_REQUESTS = 3
@@ -190,7 +191,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
                 self.bring_up()
             self._starter.cancel()
         except CliplocError:
-            self._starter.timer_period_ns = int(self._pause_s * 1e9)
+            self._starter.timer_period_ns = int(self._pause_s * NS_PER_S)
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
 
     # ---- transitions ----------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publish a recording: the recorded bytes, with the recorded QoS, at the recorded times.
 
-Own code because `ros2 bag play` comes with neither PyPI's ROS nor a minimal robot image.
+Own code, because neither PyPI's ROS nor ROS's base installation has `ros2 bag play`.
 """
 
 import threading
