@@ -24,6 +24,7 @@ from cliploc_ros.mapping.views import Views
 
 # Angles between the rays of a pair: less leaves the depth open, more shows other sides.
 _PARALLAX_DEG = (5.0, 75.0)
+_GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
 _MAX_GAP_S = 30.0
 # The rays of a pair pass each other within this share of the object's radius, and the radii that
 # both boxes suggest differ by at most this factor.
@@ -207,9 +208,6 @@ def _meet(origins, rays, radii, first, second, point):
         miss += (one - other) ** 2
         point[i] = 0.5 * (one + other)
     return radius if miss < (_MAX_MISS * radius) ** 2 else 0.0
-
-
-_GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
 
 
 @compiled
