@@ -37,6 +37,7 @@ setup(
             'huggingface_hub', 'open_clip_torch', 'pillow', 'safetensors', 'torch', 'torchvision',
             'ultralytics-opencv-headless',
         ],
+        'cluster': ['distributed'],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
         'test': ['hypothesis', 'pytest', 'pytest-xdist'],

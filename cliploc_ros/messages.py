@@ -19,6 +19,7 @@ from cliploc_ros.errors import CameraError, ImageError
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
              'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
+_DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 # A small file may declare any size: an image takes 200 MB at most.
 _MAX_PIXELS = 2**26
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
@@ -85,6 +86,33 @@ def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
     pixels = rows.reshape(msg.height, msg.step)[:, :msg.width * channels]
     pixels = pixels.reshape(msg.height, msg.width, channels)
     return np.ascontiguousarray(pixels[:, :, order])
+
+
+def depth_counts_from_msg(msg: ImageMessage) -> NDArray[np.generic]:
+    """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/Image
+        Of encoding 16UC1, mono16 or 32FC1.
+
+    Raises
+    ------
+    ImageError
+        A field is invalid; the message names it.
+    """
+    if msg.encoding not in _DEPTH_TYPES:
+        raise ImageError(f"depth encoding '{msg.encoding}' is none of {', '.join(_DEPTH_TYPES)}")
+    dtype = np.dtype(_DEPTH_TYPES[msg.encoding])
+    dtype = dtype.newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
+    _check_size(msg.width, msg.height)
+    used = msg.width * dtype.itemsize
+    if msg.step < used or len(msg.data) < msg.step * msg.height:
+        raise ImageError(f'depth image of {msg.width}x{msg.height} px with step {msg.step} has '
+                         f'only {len(msg.data)} bytes')
+    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
+    pixels = np.ascontiguousarray(rows.reshape(msg.height, msg.step)[:, :used]).view(dtype)
+    return pixels.astype(dtype.newbyteorder('='))
 
 
 def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:

@@ -11,17 +11,15 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.datasets.frames import tum_frames
+from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
@@ -30,12 +28,13 @@ from cliploc_ros.demo.truth import TrueFrame, read_frames
 from cliploc_ros.evaluation.evaluation import Evaluation
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
-from cliploc_ros.evaluation.recording import record_queries
+from cliploc_ros.evaluation.recording import make_queries_of
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions, import_ultralytics
+from cliploc_ros.recording.networks import Look
+from cliploc_ros.recording.recorder import record_every_frame
 from demo_world import train_detector
 
 
@@ -44,11 +43,10 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
     detector = YoloDetector(YoloOptions(model=str(ASSETS / 'yolo.pt')))
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
-    observer = Observer(*load_encoder(clip, landmark_map.labels))
+    encoder, labels = load_encoder(clip, landmark_map.labels)
     frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
-    return record_queries(frames, landmark_map, detector, observer,
-                          partial(tqdm, total=frames.count, desc='recording', unit='image',
-                                  disable=None))
+    return make_queries_of(record_every_frame(frames, Look(detector, encoder)), landmark_map,
+                           labels)
 
 
 def score_detector(sequence: Path) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 examples:
+  build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \
+            --map-frame map --out office.yaml
+  build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
@@ -39,8 +43,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog='build_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Build a map of ellipsoids from detections with poses. An existing map is '
         'replaced only when the new one is complete. Needs no sourced ROS.')
-    parser.add_argument('--observations', type=Path, required=True, metavar='NPZ',
-                        help='boxes and poses of a recording')
+    add_source_options(parser)
     parser.add_argument('--out', type=Path, required=True, metavar='YAML',
                         help='the map to write')
     parser.add_argument('--report', type=Path, metavar='JSON',
@@ -70,17 +73,19 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.map_file import write_map
-    from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.mapping.building import build_map
 
     begin = time.monotonic()
     _check_folder(options.out)
-    detections = load_observations(options.observations)
+    recorded = read_source(options)
+    detections = recorded.detections
+    if recorded.without_pose:
+        print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     with _ProgressBar() as bar:
         built = build_map(detections, _mapping_options(options), bar.show)
-    head = [f'built by build_map from {options.observations.name}', *built.report.lines()[:2]]
+    head = [f'built by build_map from {source_of(options).name}', *built.report.lines()[:2]]
     write_map(options.out, built.landmark_map, head)
     if options.report is not None:
         _write_report(options.report, built)
@@ -95,7 +100,7 @@ def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
     return MappingOptions(
         pose_errors=_pose_errors(options), min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
-        source=f'build_map {options.observations.name}', random_seed=options.seed)
+        source=f'build_map {source_of(options).name}', random_seed=options.seed)
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':

@@ -174,15 +174,20 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
 
 
 def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
-    from cliploc_ros.evaluation.recording import recorded_once
+    from cliploc_ros.evaluation.recording import recorded_queries
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.yolo_detector import YoloOptions
+    from cliploc_ros.recording.keyframes import EVERY_FRAME
+    from cliploc_ros.recording.recorder import RecordingOptions
 
     frames = _frames(options)
     yolo = YoloOptions(model=options.model, device=options.device)
     clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
                        device=options.device)
-    queries = recorded_once(frames, landmark_map, yolo, clip)
+    reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
+                    options.ground_truth, options.body_from_camera, options.rectified])
+    queries = recorded_queries(frames, landmark_map,
+                               RecordingOptions(yolo, clip, EVERY_FRAME, reading))
     without = frames.count - len(queries)
     if without:
         print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
@@ -191,22 +196,20 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
 
 
 def _frames(options: argparse.Namespace) -> 'Frames':
-    from cliploc_ros.datasets.frames import (
-        BagTopics,
-        bag_frames,
-        mount_from_numbers,
-        tum_frames,
-    )
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, poses_of_topic
+    from cliploc_ros.datasets.folders import tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
+    from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum
 
     if options.tum is not None:
         sequence = read_tum(options.tum).every(options.every)
         return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
     mount = options.body_from_camera
-    return bag_frames(options.bag, BagTopics(options.image, options.camera_info,
-                                             options.ground_truth, options.rectified),
-                      None if mount is None else mount_from_numbers(mount))
+    return bag_frames(
+        options.bag, BagTopics(options.image, options.camera_info, options.rectified),
+        poses_of_topic(options.ground_truth, body_from_camera=None if mount is None
+                       else mount_from_numbers(mount)))
 
 
 def _deviation(text: str) -> float:

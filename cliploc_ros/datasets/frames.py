@@ -1,187 +1,168 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames (image, camera and true pose of one stamp) of TUM folders and recordings."""
+"""Images with their cameras, poses and depth, out of folders and recordings alike.
+
+The one reader of evaluation, mapping and map editor. A source is read as a stream of raw frames:
+what is not wanted is never decoded, and a raw frame can be decoded in another process.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.trajectory import Trajectory
-from cliploc_ros.datasets.tum import TumSequence
-from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.datasets.depth import DepthCamera, DepthImage, depth_from_counts
+from cliploc_ros.datasets.poses import Poses, check_clock
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
-
-_IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-_CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
-# How to get the pose of each message type.
-_POSES: dict[str, Callable[[Any], Any]] = {
-    'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
-    'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
-    'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
-}
 
 
 @dataclass(frozen=True)
 class Frame:
-    """An image (h, w, 3) uint8, red first, with the camera and the true pose of its stamp.
+    """An image (h, w, 3) uint8, red first, with its camera, pose and depth.
 
-    ``map_from_camera`` is None where no ground truth lies within 20 ms of ``stamp_ns``.
+    ``map_from_camera`` is None where no pose is known at ``stamp_ns``.
     """
 
     stamp_ns: int
     image_rgb: NDArray[np.uint8]
     camera: Camera
     map_from_camera: NDArray[np.float64] | None
+    depth: DepthImage | None = None
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """A frame that is not decoded yet; small, and fit for another process.
+
+    Parameters
+    ----------
+    place : int
+        Number of the image in its source.
+    stamp_ns : int
+        [ns].
+    map_from_camera : ndarray (4, 4) or None
+    color : callable
+        Returns the image and its camera.
+    depth : callable, optional
+        Returns the depth image.
+    """
+
+    place: int
+    stamp_ns: int
+    map_from_camera: NDArray[np.float64] | None
+    color: Callable[[], tuple[NDArray[np.uint8], Camera]]
+    depth: Callable[[], DepthImage] | None = None
+
+    def __str__(self) -> str:
+        """Name the frame in messages."""
+        return f'image {self.place} at {self.stamp_ns / NS_PER_S:.6f} s'
+
+    def decode(self) -> Frame:
+        """Return the frame.
+
+        Raises
+        ------
+        DatasetError
+            The image cannot be decoded, or its camera is invalid.
+        """
+        image_rgb, camera = self.color()
+        return Frame(self.stamp_ns, image_rgb, camera, self.map_from_camera,
+                     None if self.depth is None else self.depth())
+
+
+#: Tells whether the frame of a place, stamp [ns] and pose is to be read.
+Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a source. Each iteration reads it again, with one image in memory at a time.
+    """Frames of a source that is read anew each time, one image in memory at a time.
 
     Parameters
     ----------
     source : Path
         Folder or file.
     count : int
-        Number of frames.
-    read : callable
-        Returns a new iterator over the frames.
+        How many images there are.
+    read_raw : callable
+        Returns an iterator over the wanted frames, asked once for each image in order.
     """
 
     source: Path
     count: int
-    read: Callable[[], Iterator[Frame]]
+    read_raw: Callable[[Wanted], Iterator[RawFrame]]
+
+    def read(self) -> Iterator[Frame]:
+        """Yield all frames, decoded."""
+        for raw in self.read_raw(lambda place, stamp_ns, pose: True):
+            yield raw.decode()
 
 
 @dataclass(frozen=True)
-class BagTopics:
-    """The topics of a recording that hold images, intrinsics and ground truth.
+class ImageFile:
+    """An image of a folder, and its depth image if there is one."""
+
+    stamp_ns: int
+    color: Path
+    depth: Path | None = None
+
+
+@dataclass(frozen=True)
+class DepthFormat:
+    """How depth images are to be read.
 
     Parameters
     ----------
-    image, camera_info : str
-        sensor_msgs/Image or CompressedImage, and CameraInfo.
-    ground_truth : str
-        geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: the pose in the
-        map of the camera (optical axes), or of a body on which the camera is mounted.
-    rectified : bool
-        Whether images are rectified: then P of CameraInfo holds, without distortion.
+    unit_m : float, optional
+        Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
+    camera : DepthCamera, optional
+        None: registered to the colour image.
     """
 
-    image: str = '/image'
-    camera_info: str = '/camera_info'
-    ground_truth: str = '/ground_truth'
-    rectified: bool = False
+    unit_m: float | None = None
+    camera: DepthCamera | None = None
 
 
-def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
-    """Return the frames of a TUM folder, taken by one camera."""
-    def read() -> Iterator[Frame]:
-        for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            if image is None:
-                raise DatasetError(f'{path} cannot be read as an image')
-            if image.shape[:2] != (camera.height, camera.width):
-                raise DatasetError(f'{path} has {image.shape[1]}x{image.shape[0]} px, but the '
-                                   f'camera has {camera.width}x{camera.height} px')
-            yield Frame(stamp, np.ascontiguousarray(image[..., ::-1]), camera,
-                        sequence.pose_at(stamp))
-    return Frames(sequence.folder, len(sequence), read)
-
-
-def bag_frames(bag: Path, topics: BagTopics, body_from_camera: NDArray[np.float64] | None = None
-               ) -> Frames:
-    """Return the frames of a recording.
-
-    Parameters
-    ----------
-    bag : Path
-        A rosbag2 folder or file.
-    topics : BagTopics
-    body_from_camera : ndarray (4, 4), optional
-        Mount of the camera on the body whose pose is the ground truth.
+def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Camera,
+                  depth: DepthFormat | None = None) -> Frames:
+    """Return the frames of image files taken by one camera.
 
     Raises
     ------
     DatasetError
-        If a topic is missing, empty or of another type; the message lists the topics.
+        The poses are of another time than the images.
     """
-    mount = np.eye(4) if body_from_camera is None else body_from_camera
-    with BagReader(bag) as reader:
-        for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
-                            (topics.ground_truth, tuple(_POSES))):
-            topic = reader.topic(name)
-            if topic.msgtype not in types:
-                raise DatasetError(f'{bag}: {name} is of type {topic.msgtype}, not '
-                                   f'{" or ".join(types)}')
-            if topic.message_count == 0:
-                raise DatasetError(f'{bag}: {name} has no messages')
-        truth = _read_trajectory(reader, topics.ground_truth)
-        count = reader.topic(topics.image).message_count
+    check_clock(poses, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
+    form = depth or DepthFormat()
 
-    def read() -> Iterator[Frame]:
-        with BagReader(bag) as reader:
-            info = None
-            infos = next(reader.messages([topics.camera_info]), None)
-            if infos is not None:
-                info = reader.deserialize(infos)
-            for recorded in reader.messages([topics.image]):
-                yield _frame(bag, reader.deserialize(recorded), info, topics, truth, mount)
-    return Frames(bag, count, read)
+    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+        for place, file in enumerate(files):
+            pose = poses.pose_at(file.stamp_ns)
+            if is_wanted(place, file.stamp_ns, pose):
+                yield RawFrame(
+                    place, file.stamp_ns, pose, partial(_read_color, file.color, camera),
+                    None if file.depth is None else partial(_read_depth, file.depth, form))
+    return Frames(folder, len(files), read_raw)
 
 
-def _frame(bag: Path, message: Any, info: Any, topics: BagTopics, truth: Trajectory,
-           mount: NDArray[np.float64]) -> Frame:
-    stamp = stamp_ns(message)
-    try:
-        image = image_from_msg(message)
-        camera = camera_from_msg(info, (image.shape[1], image.shape[0]), topics.rectified)
-    except CliplocError as error:
-        raise DatasetError(f'{bag}: {topics.image} at {stamp / NS_PER_S:.6f}: {error}') from error
-    pose = truth.pose_at(stamp)
-    return Frame(stamp, image, camera, None if pose is None else pose @ mount)
+def _read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise DatasetError(f'{path} cannot be read as an image')
+    if image.shape[:2] != (camera.height, camera.width):
+        raise DatasetError(f'{path} has {image.shape[1]}x{image.shape[0]} px, but the '
+                           f'camera has {camera.width}x{camera.height} px')
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
 
 
-def _read_trajectory(reader: BagReader, name: str) -> Trajectory:
-    pose_of = _POSES[reader.topic(name).msgtype]
-    stamps, positions, quats = [], [], []
-    for recorded in reader.messages([name]):
-        message = reader.deserialize(recorded)
-        p, q = pose_of(message).position, pose_of(message).orientation
-        stamps.append(stamp_ns(message))
-        positions.append((p.x, p.y, p.z))
-        quats.append((q.x, q.y, q.z, q.w))
-    order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]
-    quats_xyzw = np.array(quats)[order]
-    norms = np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
-    valid = (np.isfinite(np.array(positions)[order]).all(axis=1)
-             & (np.abs(norms[:, 0] - 1.0) < 0.01))
-    if not valid.all():
-        raise DatasetError(f'{reader.path}: {name}: {int((~valid).sum())} poses are not finite '
-                           'or have no unit quaternion')
-    return Trajectory(np.array(stamps, dtype=np.int64)[order], np.array(positions)[order],
-                      quats_xyzw / norms)
-
-
-def mount_from_numbers(numbers: list[float]) -> NDArray[np.float64]:
-    """Return the mount (4, 4) for x y z [m] and a quaternion qx qy qz qw.
-
-    Raises
-    ------
-    DatasetError
-        If a number is not finite, or the quaternion is far from unit norm.
-    """
-    norm = float(np.linalg.norm(numbers[3:]))
-    if not (np.isfinite(numbers).all() and abs(norm - 1.0) < 0.01):
-        raise DatasetError(f'mount {numbers}: expected x y z and a unit quaternion qx qy qz qw')
-    return transform_from_pose(np.array(numbers[:3]), np.array(numbers[3:]) / norm)
+def _read_depth(path: Path, form: DepthFormat) -> DepthImage:
+    counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if counts is None:
+        raise DatasetError(f'{path} cannot be read as a depth image')
+    return DepthImage(depth_from_counts(counts, form.unit_m, str(path)), form.camera)

@@ -6,6 +6,7 @@ Mapping, evaluation and the map editor read the same file, so that the networks 
 """
 
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,46 @@ LAYOUT = {
     'map_from_camera': (('F', 4, 4), 'fiu'),
     'timestamps': (('F',), 'fiu'),
 }
-_KIND_NAMES = {'fiu': 'numbers', 'iu': 'integers', 'US': 'strings'}
+#: Arrays that a file may have besides.
+OPTIONAL = {
+    'depths': (('n',), 'f'),
+    'depth_spreads': (('n',), 'f'),
+    'embeddings': (('n', 'd'), 'f'),
+    'encoder_key': ((), 'U'),
+    'stamps_ns': (('F',), 'iu'),
+    'detector_ms': (('F',), 'f'),
+    'clip_ms': (('F',), 'f'),
+    'image_counts': ((2,), 'iu'),
+    'described': ((), 'U'),
+}
+_KIND_NAMES = {'f': 'floats', 'U': 'a string', 'fiu': 'numbers', 'iu': 'integers', 'US': 'strings'}
 _MAX_ROTATION_ERROR = 1e-3
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Observations and how they came about: F frames.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+    stamps_ns : ndarray (F,) of int
+        Exact stamps [ns].
+    detector_ms, clip_ms : ndarray (F,)
+        Time that the networks took [ms]; NaN where unknown.
+    images, without_pose : int
+        Images of the source, and those of them without a pose.
+    described : str
+        All that the observations depend on; '' where unknown.
+    """
+
+    detections: PosedDetections
+    stamps_ns: NDArray[np.int64]
+    detector_ms: NDArray[np.float64]
+    clip_ms: NDArray[np.float64]
+    images: int
+    without_pose: int
+    described: str
 
 
 def load_observations(path: str | Path) -> PosedDetections:
@@ -48,12 +87,17 @@ def load_observations(path: str | Path) -> PosedDetections:
     DatasetError
         Names the file, the array, what is wrong with it, and what to do.
     """
+    return load_recorded(path).detections
+
+
+def load_recorded(path: str | Path) -> Recorded:
+    """Read and validate an observation file, and how it came about; see load_observations."""
     path = Path(path)
     try:
         arrays = _read_arrays(path)
         _check_layout(arrays)
         _check_values(arrays)
-        return _make_detections(arrays)
+        return _make_recorded(arrays)
     except (_ArrayError, CameraError) as error:
         raise DatasetError(f'{path}: {error}') from error
 
@@ -66,7 +110,18 @@ def save_observations(path: str | Path, detections: PosedDetections) -> None:
     DatasetError
         The detections are malformed, or the file cannot be written.
     """
-    path = Path(path)
+    _write(Path(path), _arrays_of(detections))
+
+
+def save_recorded(path: str | Path, recorded: Recorded) -> None:
+    """Write an observation file that says how it came about; see save_observations."""
+    _write(Path(path), _arrays_of(recorded.detections) | {
+        'stamps_ns': recorded.stamps_ns, 'detector_ms': recorded.detector_ms,
+        'clip_ms': recorded.clip_ms, 'described': np.array(recorded.described),
+        'image_counts': np.array([recorded.images, recorded.without_pose])})
+
+
+def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
     camera = detections.camera
     names = np.array(detections.class_names, dtype=np.str_)
     arrays: dict[str, NDArray[Any]] = {
@@ -79,11 +134,22 @@ def save_observations(path: str | Path, detections: PosedDetections) -> None:
         'map_from_camera': detections.map_from_camera,
         'timestamps': detections.stamps_s,
     }
+    for name in ('depths', 'depth_spreads', 'embeddings'):
+        if (values := getattr(detections, name)) is not None:
+            arrays[name] = values
+    if detections.encoder_key:
+        arrays['encoder_key'] = np.array(detections.encoder_key)
+    return arrays
+
+
+def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    # embeddings do not compress, and take minutes to try
+    write: Any = np.savez if 'embeddings' in arrays else np.savez_compressed
     try:
         _check_layout(arrays)
         _check_values(arrays)
         with replace_file(path) as partial, partial.open('wb') as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+            write(file, **arrays)
     except _ArrayError as error:
         raise DatasetError(f'{path}: cannot be written: {error}') from error
     except OSError as error:
@@ -109,7 +175,8 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             hint = (' (this is a query file: map from an observation file)'
                     if 'similarities' in content.files else '')
             raise _ArrayError(f'array {missing[0]} is missing{hint}')
-        return {name: _read_array(content, name) for name in LAYOUT}
+        return {name: _read_array(content, name) for name in LAYOUT | OPTIONAL
+                if name in content.files}
 
 
 def _read_array(content: Any, name: str) -> NDArray[Any]:
@@ -128,7 +195,11 @@ def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
             raise _ArrayError(f'array {name} is a single value')
         sizes[letter] = len(arrays[name])
     sizes['F+1'] = sizes['F'] + 1
-    for name, (letters, kinds) in LAYOUT.items():
+    if 'embeddings' in arrays:
+        sizes['d'] = arrays['embeddings'].shape[-1]
+    for name, (letters, kinds) in (LAYOUT | OPTIONAL).items():
+        if name not in arrays:
+            continue
         array, shape = arrays[name], tuple(sizes.get(letter, letter) for letter in letters)
         if array.shape != shape:
             raise _ArrayError(f'array {name} has shape {array.shape}, expected {shape}')
@@ -144,6 +215,10 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
         if kinds == 'fiu':
             rows = arrays[name].reshape(len(arrays[name]), -1)
             _refuse(name, 'is not finite', ~np.isfinite(rows).all(axis=1))
+    if 'embeddings' in arrays:
+        _refuse('embeddings', 'is not finite', ~np.isfinite(arrays['embeddings']).all(axis=1))
+    if 'depths' in arrays:
+        _refuse('depths', 'is not positive', arrays['depths'] <= 0.0)  # NaN is none
     offsets = arrays['frame_offsets'].astype(np.int64)
     boxes, scores = arrays['boxes_xyxy'], arrays['scores']
     if offsets[0] != 0 or offsets[-1] != len(boxes):
@@ -166,11 +241,27 @@ def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
         raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
 
 
+def _make_recorded(arrays: dict[str, NDArray[Any]]) -> Recorded:
+    detections = _make_detections(arrays)
+    order = np.argsort(detections.stamps_s, kind='stable')
+    if (order != np.arange(len(order))).any():
+        detections = detections.select_frames(order)
+    frames = len(order)
+    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
+    rounded = np.round(arrays['timestamps'] * 1e6).astype(np.int64) * 1000
+    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
+                            for name in ('detector_ms', 'clip_ms'))
+    images, without_pose = arrays.get('image_counts', (frames, 0))
+    return Recorded(
+        detections, arrays.get('stamps_ns', rounded).astype(np.int64)[order], detector_ms,
+        clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
+
+
 def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
     width, height = map(int, arrays['image_size'])
     fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
-    detections = PosedDetections(
+    return PosedDetections(
         camera=Camera(width, height, fx, fy, cx, cy),
         map_from_camera=arrays['map_from_camera'].astype(np.float64),
         stamps_s=arrays['timestamps'].astype(np.float64),
@@ -178,8 +269,6 @@ def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
         bboxes_xyxy=arrays['boxes_xyxy'].astype(np.float64),
         class_names=tuple(str(name) for name in names),
         classes=classes.astype(np.int64).reshape(-1),
-        scores=arrays['scores'].astype(np.float64))
-    order = np.argsort(detections.stamps_s, kind='stable')
-    if (order == np.arange(len(order))).all():
-        return detections
-    return detections.select_frames(order)
+        scores=arrays['scores'].astype(np.float64),
+        depths=arrays.get('depths'), depth_spreads=arrays.get('depth_spreads'),
+        embeddings=arrays.get('embeddings'), encoder_key=str(arrays.get('encoder_key', '')))

@@ -35,17 +35,16 @@ class Trajectory:
         """Return the number of samples."""
         return len(self.stamps_ns)
 
-    def pose_at(
-        self, stamp_ns: int, max_distance_ns: int = MAX_SAMPLE_DISTANCE_NS
-    ) -> NDArray[np.float64] | None:
+    def pose_at(self, stamp_ns: int, max_gap_ns: int = 0) -> NDArray[np.float64] | None:
         """Interpolate the pose at a stamp: positions linearly, rotations by slerp.
 
         Parameters
         ----------
         stamp_ns : int
             Time [ns].
-        max_distance_ns : int
-            Greatest distance of the stamp to the nearest sample [ns].
+        max_gap_ns : int
+            Two samples around the stamp may lie this far apart [ns]. One sample within 20 ms is
+            always enough.
 
         Returns
         -------
@@ -59,7 +58,9 @@ class Trajectory:
         low, high = max(after - 1, 0), min(after, len(self) - 1)
         gap_before = abs(stamp_ns - int(self.stamps_ns[low]))
         gap_after = abs(int(self.stamps_ns[high]) - stamp_ns)
-        if min(gap_before, gap_after) > max_distance_ns:
+        is_between = self.stamps_ns[low] <= stamp_ns <= self.stamps_ns[high]
+        if (min(gap_before, gap_after) > MAX_SAMPLE_DISTANCE_NS
+                and not (is_between and gap_before + gap_after <= max_gap_ns)):
             return None
         fraction = 0.0 if low == high else gap_before / (gap_before + gap_after)
         start, end = self.positions_xyz[low], self.positions_xyz[high]

@@ -82,7 +82,7 @@ def read_tum(folder: str | Path) -> TumSequence:
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f'{folder}: no such folder')
-    stamps_ns, image_paths = _read_image_list(folder / 'rgb.txt')
+    stamps_ns, image_paths = read_image_list(folder / 'rgb.txt')
     truth = folder / 'groundtruth.txt'
     trajectory = read_tum_trajectory(truth) if truth.exists() else _empty_trajectory()
     return TumSequence(folder, stamps_ns, image_paths, trajectory)
@@ -155,7 +155,14 @@ def parse_stamp_ns(text: str, where: str) -> int:
     return int((seconds * NS_PER_S).to_integral_value())
 
 
-def _read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
+def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
+    """Return the stamps [ns] and files that a list such as rgb.txt names.
+
+    Raises
+    ------
+    DatasetError
+        Naming the file and line that cannot be used.
+    """
     if not path.exists():
         raise DatasetError(f'{path}: no such file; a TUM folder lists its images in rgb.txt')
     stamps_ns: list[int] = []

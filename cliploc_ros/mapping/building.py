@@ -14,6 +14,12 @@ from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.depth_seeds import (
+    add_depths,
+    correct_scale,
+    depth_scale,
+    options_with_depth,
+)
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence, group_boxes
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.input_checks import check_input
@@ -75,6 +81,9 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     given = make_views(detections, options)
     notes = check_input(detections, given, options)
     rng = np.random.default_rng(options.random_seed)
+    if detections.depths is not None:
+        given, options, depth_notes = _with_depths(detections, given, options, rng, tell)
+        notes += depth_notes
     views = given
     draft = _draft(views, options, rng, tell)
     if options.pose_errors is not None:
@@ -87,6 +96,18 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     if len(draft.landmarks.centers) == 0:
         raise MappingError(_nothing_found(draft))
     return _finish(detections, given, views, draft, options, notes)
+
+
+def _with_depths(detections: PosedDetections, views: Views, options: MappingOptions,
+                 rng: np.random.Generator, tell: Progress
+                 ) -> tuple[Views, MappingOptions, list[str]]:
+    """Return views with depth of the right scale, options that rely on it, and notes."""
+    draft = _draft(views, options, rng, tell)  # of boxes alone
+    evidence = gather_evidence(views, draft.landmarks, draft.shown)
+    with_depths = add_depths(views, detections)
+    scale = depth_scale(with_depths, draft.landmarks, draft.shown, evidence.baseline_deg)
+    with_depths, notes = correct_scale(with_depths, detections, scale)
+    return with_depths, options_with_depth(options), notes
 
 
 class _Draft(NamedTuple):

@@ -4,9 +4,9 @@
 
 Each edge that does not lie at the image border gives a residual: projected edge minus detected
 edge, in standard deviations. An edge at the border only bounds the object: it counts where the
-projection ends inside of it. Residuals r pass through the Cauchy loss c^2/2 log(1 + r^2/c^2). A
-weak prior draws the logarithms of the semi-axes to their mean, since boxes from similar
-directions leave the thickness open.
+projection ends inside of it. A measured depth gives one more residual. Residuals r pass through
+the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the semi-axes to
+their mean, since boxes from similar directions leave the thickness open.
 """
 
 from math import log, sqrt
@@ -147,11 +147,33 @@ def accumulate(views, rows, center, basis, information, gradient):
                 gradient[i] += scaled * residual
                 for j in range(i + 1):
                     information[i, j] += scaled * stiffness * by_landmark[edge, j]
+        cost += share * add_depth(views, row, center, share, information, gradient)
     cost += add_axis_prior(basis, information, gradient)
     for i in range(LANDMARK_SIZE):
         for j in range(i):
             information[j, i] = information[i, j]
     return cost
+
+
+@compiled
+def add_depth(views, row, center, share, information, gradient):
+    """Add the measured depth of a box to the normal equations; return its cost."""
+    stiffness = views.depth_stiffness[row]
+    if stiffness == 0.0:
+        return 0.0
+    frame = views.frames[row]
+    direction = views.rotations[frame, 2]
+    depth = views.translations[frame, 2]
+    for i in range(3):
+        depth += direction[i] * center[i]
+    residual = (depth - views.depths[row]) * stiffness
+    weight = share * robust_weight(residual)
+    for i in range(3):
+        scaled = weight * stiffness * direction[i]
+        gradient[i] += scaled * residual
+        for j in range(i + 1):
+            information[i, j] += scaled * stiffness * direction[j]
+    return robust_cost(residual)
 
 
 @compiled

@@ -34,6 +34,13 @@ class PosedDetections:
         Index of each box's class.
     scores : ndarray (n,)
         Detector confidences, 0 to 1.
+    depths, depth_spreads : ndarray (n,), optional
+        Depth of what each box shows, along z of the camera, and half the distance between its
+        16th and 84th percentile [m]; NaN where unknown.
+    embeddings : ndarray (n, d) float16, optional
+        Of the crops, unit rows.
+    encoder_key : str
+        Identifies the encoder of the embeddings.
     """
 
     camera: Camera
@@ -44,6 +51,10 @@ class PosedDetections:
     class_names: tuple[str, ...]
     classes: NDArray[np.int64]
     scores: NDArray[np.float64]
+    depths: NDArray[np.float32] | None = None
+    depth_spreads: NDArray[np.float32] | None = None
+    embeddings: NDArray[np.float16] | None = None
+    encoder_key: str = ''
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -64,7 +75,10 @@ class PosedDetections:
             self, map_from_camera=self.map_from_camera[frames], stamps_s=self.stamps_s[frames],
             frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
             bboxes_xyxy=self.bboxes_xyxy[boxes], classes=self.classes[boxes],
-            scores=self.scores[boxes])
+            scores=self.scores[boxes],
+            depths=None if self.depths is None else self.depths[boxes],
+            depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
+            embeddings=None if self.embeddings is None else self.embeddings[boxes])
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
         """Return the same detections with other poses (F, 4, 4)."""

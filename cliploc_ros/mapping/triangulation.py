@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.mapping.depth_seeds import depth_hypotheses
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks, no_landmarks
 from cliploc_ros.mapping.options import MappingOptions
@@ -50,7 +51,9 @@ def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
     if len(rows) < options.min_viewpoints:
         return no_landmarks()
     seeds = np.repeat(rows, options.pairs_per_box)
-    centers, bases = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
+    of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
+    centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows),
+                                             strict=True))
     hypotheses = _Hypotheses.of(views, rows, centers, bases)
     found = _take_greatest(views, rows, hypotheses, options.min_viewpoints)
     if not found:

@@ -41,6 +41,9 @@ class Views(NamedTuple):
         The edge lies at the image border: the object may extend beyond it.
     bounds : ndarray (4,)
         Left, top, right, bottom of the image.
+    depths, depth_stiffness : ndarray (n,)
+        Measured depth of the object's centre [m], and its inverse standard deviation; 0 where
+        unknown.
     """
 
     rotations: NDArray[np.float64]
@@ -55,6 +58,8 @@ class Views(NamedTuple):
     stiffness: NDArray[np.float64]
     is_open: NDArray[np.bool_]
     bounds: NDArray[np.float64]
+    depths: NDArray[np.float64]
+    depth_stiffness: NDArray[np.float64]
 
     def between(self, first: int, last: int) -> 'Views':
         """Return the frames from first up to last, last excluded; nothing is copied."""
@@ -65,7 +70,7 @@ class Views(NamedTuple):
             self.viewpoints[frames], self.weights[frames],
             self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
             self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
-            self.bounds)
+            self.bounds, self.depths[boxes], self.depth_stiffness[boxes])
 
 
 def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
@@ -87,7 +92,14 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
         viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints], detections.frame_offsets,
         detections.frames, detections.classes, (boxes_px - principal) / focal,
         focal / deviations_px, is_open,
-        (np.array([0.0, 0.0, camera.width, camera.height]) - principal) / focal)
+        (np.array([0.0, 0.0, camera.width, camera.height]) - principal) / focal,
+        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
+
+
+def with_depths(views: Views, depths: NDArray[np.float64], stiffness: NDArray[np.float64]
+                ) -> Views:
+    """Return the views with measured depths (n,) and their inverse standard deviations (n,)."""
+    return views._replace(depths=depths, depth_stiffness=stiffness)
 
 
 def camera_from_map(map_from_camera: NDArray[np.float64]

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Options that name a recording and say how to look at it, and what comes of them."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cliploc_ros.errors import DatasetError, OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.datasets.bag_frames import ReadPoses
+    from cliploc_ros.datasets.frames import DepthFormat, Frames
+    from cliploc_ros.datasets.observations import Recorded
+
+_NS_PER_S = 1_000_000_000
+# Of a recording, these change how its frames are read.
+_READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
+            'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
+            'depth_baseline', 'intrinsics')
+
+
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of all sources to a parser."""
+    sources = parser.add_mutually_exclusive_group(required=True)
+    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with images and poses')
+    sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder, no depth')
+    sources.add_argument('--rgbd', type=Path, metavar='DIR',
+                         help='a folder with depth: TUM RGB-D or 7-Scenes')
+    sources.add_argument('--observations', type=Path, metavar='NPZ',
+                         help='boxes and poses that were recorded before')
+    _add_pose_options(parser)
+    _add_image_options(parser)
+    _add_network_options(parser)
+
+
+def _add_pose_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('poses of --bag and --tum')
+    group.add_argument('--pose-topic', metavar='TOPIC',
+                       help='PoseStamped, PoseWithCovarianceStamped or Odometry')
+    group.add_argument('--map-frame', metavar='FRAME',
+                       help='take poses from /tf: the coordinate frame of the map')
+    group.add_argument('--camera-frame', metavar='FRAME',
+                       help="the camera's optical coordinate frame in /tf (that of the images)")
+    group.add_argument('--trajectory', type=Path, metavar='FILE',
+                       help='take poses from a file in TUM format')
+    group.add_argument('--mount', type=float, nargs=7, metavar='V',
+                       help='x y z qx qy qz qw of the camera (z forward) on what the poses of a '
+                       'topic or file are of')
+    group.add_argument('--max-gap', type=float, default=0.5, metavar='SECONDS',
+                       help='interpolate between poses at most so far apart (%(default)s)')
+
+
+def _add_image_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+    group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
+    group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
+                       help='(%(default)s)')
+    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
+    group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
+    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
+                       help='camera of --tum and --rgbd, where the folder does not say it')
+    group.add_argument('--depth-unit', type=float, metavar='METRES',
+                       help='one count of a depth image (0.001; 0.0002 for TUM; 1 for floats)')
+    group.add_argument('--depth-intrinsics', type=float, nargs=4,
+                       metavar=('FX', 'FY', 'CX', 'CY'),
+                       help='of a depth camera that is not registered to the images')
+    group.add_argument('--depth-baseline', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+                       help='its origin, seen from the colour camera [m] (0 0 0)')
+
+
+def _add_network_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('detector and CLIP, which run once on a recording')
+    group.add_argument('--keyframes', type=float, nargs=2, default=(0.1, 5.0),
+                       metavar=('METRES', 'DEGREES'),
+                       help='look at an image this far from the last one (0.1 5; 0 0: at all)')
+    group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
+    group.add_argument('--conf', type=float, default=0.25,
+                       help='least confidence of a detection (%(default)s)')
+    group.add_argument('--no-clip', dest='clip', action='store_false',
+                       help='classes and boxes only; no embeddings')
+    group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
+    group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
+    group.add_argument('--device', default='auto', help='(%(default)s)')
+    group.add_argument('--record-to', type=Path, metavar='NPZ',
+                       help='the observation file (next to the recording)')
+    group.add_argument('--workers', type=int, default=1, metavar='N',
+                       help='local processes (%(default)s)')
+    group.add_argument('--scheduler', default='', metavar='ADDRESS',
+                       help='of a Dask cluster, instead of local processes')
+
+
+def read_source(options: argparse.Namespace) -> 'Recorded':
+    """Return the observations of the source that the command line names.
+
+    Raises
+    ------
+    CliplocError
+        The source, the networks or the options cannot be used.
+    """
+    from cliploc_ros.datasets.observations import load_recorded
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.models.yolo_detector import YoloOptions
+    from cliploc_ros.recording.keyframes import KeyframeOptions
+    from cliploc_ros.recording.recorder import RecordingOptions, record_once
+
+    if options.observations is not None:
+        return load_recorded(options.observations)
+    if options.workers < 1:
+        raise OptionsError(f'--workers {options.workers}: give 1 or more')
+    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                       device=options.device) if options.clip else None
+    yolo = YoloOptions(model=options.model, conf=options.conf, device=options.device)
+    reading = repr([str(getattr(options, name)) for name in _READING])
+    return record_once(_frames(options), RecordingOptions(
+        yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,
+        options.scheduler), options.record_to)
+
+
+def source_of(options: argparse.Namespace) -> Path:
+    """Return the folder or file that the command line names."""
+    return Path(options.bag or options.tum or options.rgbd or options.observations)
+
+
+def _frames(options: argparse.Namespace) -> 'Frames':
+    from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+    from cliploc_ros.datasets.intrinsics import find_camera
+    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
+
+    if options.bag is not None:
+        return _bag_frames(options)
+    if options.pose_topic or options.map_frame or options.depth:
+        raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
+    folder = FolderOptions(
+        options.intrinsics,
+        None if options.trajectory is None else read_tum_trajectory(options.trajectory),
+        round(options.max_gap * _NS_PER_S),
+        None if options.mount is None else mount_from_numbers(options.mount),
+        _depth_format(options))
+    if options.rgbd is not None:
+        return rgbd_frames(options.rgbd, folder)
+    return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
+                      folder)
+
+
+def _bag_frames(options: argparse.Namespace) -> 'Frames':
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+
+    topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
+    return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
+
+
+def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
+    """Return what reads the poses of a bag."""
+    from cliploc_ros.datasets.bag_frames import pose_sources, poses_of_topic
+    from cliploc_ros.datasets.poses import TrajectoryPoses, mount_from_numbers
+    from cliploc_ros.datasets.transforms import read_transforms
+    from cliploc_ros.datasets.tum import read_tum_trajectory
+
+    given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
+             if getattr(options, name) is not None]
+    if len(given) != 1:
+        there = ', '.join(pose_sources(options.bag)) or 'none'
+        raise DatasetError(f'{options.bag}: say where the poses are: --pose-topic, --map-frame '
+                           f'(tf) or --trajectory; topics with poses here: {there}')
+    max_gap_ns = round(options.max_gap * _NS_PER_S)
+    mount = None if options.mount is None else mount_from_numbers(options.mount)
+    if options.pose_topic is not None:
+        return poses_of_topic(options.pose_topic, max_gap_ns, mount)
+    if options.trajectory is not None:
+        trajectory = read_tum_trajectory(options.trajectory)
+        return lambda reader, camera_frame: TrajectoryPoses(trajectory, max_gap_ns, mount)
+    if mount is not None:
+        raise OptionsError('--mount is not for --map-frame: tf knows the mount')
+    return lambda reader, camera_frame: read_transforms(
+        reader, options.map_frame, options.camera_frame or camera_frame.removeprefix('/'),
+        max_gap_ns)
+
+
+def _depth_format(options: argparse.Namespace) -> 'DepthFormat':
+    from cliploc_ros.datasets.depth import DepthCamera
+    from cliploc_ros.datasets.frames import DepthFormat
+
+    camera = None
+    if options.depth_intrinsics is not None:
+        x, y, z = options.depth_baseline or (0.0, 0.0, 0.0)
+        fx, fy, cx, cy = options.depth_intrinsics
+        camera = DepthCamera(fx, fy, cx, cy, (x, y, z))
+    elif options.depth_baseline is not None:
+        raise OptionsError('--depth-baseline needs --depth-intrinsics')
+    return DepthFormat(options.depth_unit, camera)

@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The frames of a rosbag2 recording: image, camera_info, pose, and registered depth."""
+
+import struct
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets.bag_messages import stamp_ns
+from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
+from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
+from cliploc_ros.datasets.poses import (
+    POSE_TYPES,
+    Poses,
+    TrajectoryPoses,
+    check_clock,
+    read_pose_topic,
+)
+from cliploc_ros.errors import CliplocError, DatasetError
+from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg, image_from_msg
+from cliploc_ros.units import NS_PER_S
+
+_IMAGE = 'sensor_msgs/msg/Image'
+_IMAGES = (_IMAGE, 'sensor_msgs/msg/CompressedImage')
+_CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+# A depth image belongs to a colour image at most this far away in time.
+_MAX_DEPTH_DELAY_NS = 20_000_000
+# Images that wait for their depth. A depth image is recorded at most this many images later.
+_MAX_WAITING = 15
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Which topics of a recording hold what.
+
+    Parameters
+    ----------
+    image, camera_info : str
+        sensor_msgs/Image or CompressedImage, and CameraInfo.
+    rectified : bool
+        Whether images are rectified, so that P holds, without distortion.
+    depth : str
+        sensor_msgs/Image of depth, 16UC1 or 32FC1; '' for none.
+    """
+
+    image: str = '/image'
+    camera_info: str = '/camera_info'
+    rectified: bool = False
+    depth: str = ''
+
+
+#: Makes the poses of an open recording; given the coordinate frame of its images.
+ReadPoses = Callable[[BagReader, str], Poses]
+
+
+def poses_of_topic(name: str, max_gap_ns: int = 0,
+                   body_from_camera: NDArray[np.float64] | None = None) -> ReadPoses:
+    """Return what reads the poses of a topic, see TrajectoryPoses."""
+    def read(reader: BagReader, camera_frame: str) -> Poses:
+        return TrajectoryPoses(read_pose_topic(reader, name), max_gap_ns, body_from_camera)
+    return read
+
+
+def pose_sources(bag: Path) -> list[str]:
+    """Return the topics of a recording that may hold poses, /tf among them."""
+    with BagReader(bag) as reader:
+        return [topic.name for topic in reader.topics.values()
+                if (topic.msgtype in POSE_TYPES or topic.name == '/tf') and topic.message_count]
+
+
+def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
+               depth: DepthFormat | None = None) -> Frames:
+    """Return the frames of a recording.
+
+    Parameters
+    ----------
+    bag : Path
+        A rosbag2 folder or file.
+    topics : BagTopics
+    read_poses : callable
+        Makes the poses of the open recording.
+    depth : DepthFormat, optional
+        How depth images are to be read.
+
+    Raises
+    ------
+    DatasetError
+        A topic is missing, of another type, or empty, or the poses are of another time.
+    """
+    if topics.depth == topics.image:
+        raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')
+    with BagReader(bag) as reader:
+        for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
+                            *([(topics.depth, (_IMAGE,))] if topics.depth else [])):
+            topic = reader.topic(name)
+            if topic.msgtype not in types:
+                raise DatasetError(f'{bag}: {name} is of type {topic.msgtype}, not '
+                                   f'{" or ".join(types)}')
+            if topic.message_count == 0:
+                raise DatasetError(f'{bag}: {name} has no messages')
+        image = _first(reader, topics.image)
+        poses = read_poses(reader, str(image.header.frame_id))
+        first_ns = stamp_ns(image)
+        check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, str(bag))
+        info = next(reader.messages([topics.camera_info])).data
+        count = reader.topic(topics.image).message_count
+    decode = partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified)
+    decode_depth = partial(_decode_depth, f'{bag}: {topics.depth}', depth or DepthFormat())
+
+    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+        with BagReader(bag) as reader:
+            msgtype = reader.topic(topics.image).msgtype
+            for place, stamp_ns, pose, data, depth_data in _paired(reader, topics, poses,
+                                                                   is_wanted):
+                yield RawFrame(place, stamp_ns, pose, partial(decode, msgtype, data),
+                               None if depth_data is None else partial(decode_depth, depth_data))
+    return Frames(bag, count, read_raw)
+
+
+def _first(reader: BagReader, name: str) -> Any:
+    return reader.deserialize(next(reader.messages([name])))
+
+
+_Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']
+
+
+def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wanted
+            ) -> Iterator[_Selected]:
+    """Yield the wanted images, each with the depth image nearest in time, or None."""
+    waiting: deque[_Selected] = deque()
+    depths: deque[tuple[int, bytes]] = deque(maxlen=2 * _MAX_WAITING)
+    place = 0
+    for recorded in reader.messages([topics.image, *([topics.depth] if topics.depth else [])]):
+        stamp_ns = _peek_stamp_ns(recorded)
+        if topics.depth and recorded.topic == topics.depth:
+            depths.append((stamp_ns, recorded.data))
+        else:
+            pose = poses.pose_at(stamp_ns)
+            if is_wanted(place, stamp_ns, pose):
+                waiting.append((place, stamp_ns, pose, recorded.data, None))
+            place += 1
+        while waiting and (not topics.depth or len(waiting) > _MAX_WAITING
+                           or (depths and depths[-1][0] >= waiting[0][1] + _MAX_DEPTH_DELAY_NS)):
+            yield _with_depth(waiting.popleft(), depths)
+    for selected in waiting:
+        yield _with_depth(selected, depths)
+
+
+def _with_depth(selected: _Selected, depths: deque[tuple[int, bytes]]) -> _Selected:
+    stamp_ns = selected[1]
+    nearest = min(depths, key=lambda depth: abs(depth[0] - stamp_ns), default=None)
+    if nearest is None or abs(nearest[0] - stamp_ns) > _MAX_DEPTH_DELAY_NS:
+        return selected
+    return (*selected[:4], nearest[1])
+
+
+def _peek_stamp_ns(recorded: BagMessage) -> int:
+    """Return the header stamp of a serialized message [ns], without reading the rest of it."""
+    order = '<' if recorded.data[1] & 1 else '>'
+    try:
+        seconds, nanoseconds = struct.unpack_from(f'{order}iI', recorded.data, 4)
+    except struct.error as error:
+        raise DatasetError(f'{recorded.topic}: a message of {len(recorded.data)} bytes has no '
+                           'header') from error
+    return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: bytes
+                  ) -> tuple[NDArray[np.uint8], Camera]:
+    message = _deserialize(data, msgtype, where)
+    try:
+        image = image_from_msg(message)
+        size = (image.shape[1], image.shape[0])
+        return image, camera_from_msg(_deserialize(info, _CAMERA_INFO, where), size, rectified)
+    except CliplocError as error:
+        raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
+
+
+def _decode_depth(where: str, form: DepthFormat, data: bytes) -> DepthImage:
+    message = _deserialize(data, _IMAGE, where)
+    where = f'{where} at {stamp_ns(message) / NS_PER_S:.6f}'
+    try:
+        counts = depth_counts_from_msg(message)
+    except CliplocError as error:
+        raise DatasetError(f'{where}: {error}') from error
+    return DepthImage(depth_from_counts(counts, form.unit_m, where), form.camera)
+
+
+def _deserialize(data: bytes, msgtype: str, where: str) -> Any:
+    try:
+        return typestore().deserialize_cdr(data, msgtype)
+    except Exception as error:  # the library raises what the bytes happen to cause
+        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error

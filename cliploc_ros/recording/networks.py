@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One frame through detector and CLIP: what becomes of it in an observation file."""
+
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.depth import depths_of_boxes
+from cliploc_ros.datasets.frames import RawFrame
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
+from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+
+#: The most detections of an image that are used, as in the relocalizer node.
+MAX_DETECTIONS = 50
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """What detector and CLIP said about a frame: n boxes.
+
+    Parameters
+    ----------
+    place, stamp_ns : int
+        Number of the image in its source, and its stamp [ns].
+    map_from_camera : ndarray (4, 4)
+    image_size, intrinsics : ndarray (2,), (4,)
+        Width and height, and fx, fy, cx, cy of the undistorted image [px].
+    bboxes_xyxy : ndarray (n, 4)
+        Undistorted [px].
+    class_ids, scores : ndarray (n,)
+    embeddings : ndarray (n, d) float16
+        Of the crops; d is 0 without CLIP.
+    depths, depth_spreads : ndarray (n,) float32
+        [m]; NaN where unknown.
+    detector_ms, clip_ms : float
+        Time taken [ms].
+    """
+
+    place: int
+    stamp_ns: int
+    map_from_camera: NDArray[np.float64]
+    image_size: NDArray[np.int64]
+    intrinsics: NDArray[np.float64]
+    bboxes_xyxy: NDArray[np.float64]
+    class_ids: NDArray[np.str_]
+    scores: NDArray[np.float64]
+    embeddings: NDArray[np.float16]
+    depths: NDArray[np.float32]
+    depth_spreads: NDArray[np.float32]
+    detector_ms: float
+    clip_ms: float
+
+    def to_bytes(self) -> bytes:
+        """Return the frame as bytes, without pickles."""
+        buffer = io.BytesIO()
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items()}
+        np.savez(buffer, **arrays)
+        return buffer.getvalue()
+
+    @staticmethod
+    def from_bytes(data: bytes) -> 'SeenFrame':
+        """Return the frame that was written as bytes."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return SeenFrame(**{name: array.item() if array.ndim == 0 else array
+                                for name, array in arrays.items()})
+
+
+@dataclass(frozen=True)
+class LoadNetworks:
+    """Loads detector and CLIP in the process that uses them.
+
+    Parameters
+    ----------
+    yolo : YoloOptions
+    clip : ClipOptions, optional
+        None: classes and boxes only.
+    threads : int
+        Of PyTorch on a CPU; 0 leaves its own choice.
+    """
+
+    yolo: YoloOptions
+    clip: ClipOptions | None
+    threads: int = 0
+
+    def __call__(self) -> Callable[[RawFrame], SeenFrame]:
+        """Return the function that looks at a frame.
+
+        Raises
+        ------
+        ModelError, OptionsError
+            From loading.
+        """
+        if self.threads:
+            import torch
+
+            torch.set_num_threads(self.threads)
+        encoder = (None if self.clip is None
+                   else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
+        return Look(YoloDetector(self.yolo), encoder)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Runs detector and encoder on a raw frame."""
+
+    detector: ObjectDetector
+    encoder: ImageTextEncoder | None = None
+
+    def __call__(self, raw: RawFrame) -> SeenFrame:
+        """Return what the networks say about a frame with a pose.
+
+        Raises
+        ------
+        DatasetError
+            The image or depth image cannot be used.
+        """
+        frame = raw.decode()
+        camera = frame.camera
+        assert frame.map_from_camera is not None
+        start = time.perf_counter()
+        detections = self.detector.detect(frame.image_rgb).usable(camera.width, camera.height,
+                                                                  MAX_DETECTIONS)
+        detected = time.perf_counter()
+        bboxes = _undistorted(detections, camera)
+        rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
+        sound = detections.select(rows)
+        embeddings = (np.empty((len(rows), 0)) if self.encoder is None
+                      else self.encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))
+        embedded = time.perf_counter()
+        depths = spreads = np.full(len(rows), np.nan, dtype=np.float32)
+        if frame.depth is not None:
+            depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
+        return SeenFrame(
+            raw.place, raw.stamp_ns, frame.map_from_camera,
+            np.array([camera.width, camera.height]),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
+            np.array(sound.class_ids, dtype=np.str_), sound.scores,
+            embeddings.astype(np.float16), depths, spreads,
+            (detected - start) * 1e3, (embedded - detected) * 1e3)
+
+
+def _undistorted(detections: Detections, camera: Camera) -> NDArray[np.float64]:
+    if not any(camera.distortion):
+        return detections.bboxes_xyxy
+    bboxes = camera.normalize_bboxes(detections.bboxes_xyxy)
+    return np.asarray(bboxes * [camera.fx, camera.fy] * 2 + [camera.cx, camera.cy] * 2)

@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Record observations once: an observation file next to the recording.
+
+The file's name depends on all that its content depends on: source, networks and keyframes. A run
+that is stopped leaves its partial results beside it, and the next run goes on.
+"""
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets.depth import check_depth_unit
+from cliploc_ros.datasets.frames import Frames, RawFrame, Wanted
+from cliploc_ros.datasets.observations import Recorded, load_recorded, save_recorded
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.parallel import run_tasks
+from cliploc_ros.recording.journal import Journal
+from cliploc_ros.recording.keyframes import EVERY_FRAME, KeyframeFilter, KeyframeOptions
+from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
+from cliploc_ros.units import NS_PER_S
+
+logger = logging.getLogger(__name__)
+
+# The unit of depth is judged by the boxes of so many frames.
+_FRAMES_FOR_UNIT = 10
+_DEFAULT_KEYFRAMES = KeyframeOptions()
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How to look at a recording.
+
+    Parameters
+    ----------
+    yolo : YoloOptions
+    clip : ClipOptions, optional
+        None: no embeddings.
+    keyframes : KeyframeOptions
+    reading : str
+        Says all else that the frames depend on, such as topics, mount and depth format.
+    workers : int
+        Local processes. The result does not depend on it.
+    scheduler : str
+        Address of a Dask scheduler; '' for none.
+    """
+
+    yolo: YoloOptions
+    clip: ClipOptions | None
+    keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
+    reading: str = ''
+    workers: int = 1
+    scheduler: str = ''
+
+    @property
+    def networks(self) -> LoadNetworks:
+        """Return what loads the networks; local workers share the cores."""
+        threads = 0 if self.workers == 1 else max(1, (os.cpu_count() or 1) // self.workers)
+        return LoadNetworks(self.yolo, self.clip, threads)
+
+
+def observation_file(frames: Frames, options: RecordingOptions) -> Path:
+    """Return the observation file beside a source, named after all that it depends on."""
+    source = frames.source.resolve()
+    digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
+    return source.with_name(f'{source.name}.cliploc-{digest}.npz')
+
+
+def describe(frames: Frames, options: RecordingOptions) -> str:
+    """Return all that the observations depend on, as JSON."""
+    clip = options.clip
+    files = [options.yolo.model]
+    if clip is not None:
+        files += [clip.model, clip.pretrained, clip.checkpoint_path]
+    return json.dumps({
+        'source': [frames.source.name, _state(frames.source.resolve()), frames.count],
+        'yolo': _settings(options.yolo), 'clip': None if clip is None else _settings(clip),
+        'files': [_state(Path(file)) for file in files],
+        'keyframes': asdict(options.keyframes), 'reading': options.reading})
+
+
+def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None) -> Recorded:
+    """Return the observations of a source: those of an earlier run, or record them.
+
+    Parameters
+    ----------
+    frames : Frames
+    options : RecordingOptions
+    file : Path, optional
+        The observation file; None: see observation_file.
+
+    Raises
+    ------
+    CliplocError
+        From loading the networks, from reading the source, or from writing the file.
+    """
+    described = describe(frames, options)
+    file = file or observation_file(frames, options)
+    if file.exists():
+        try:
+            recorded = load_recorded(file)
+            if recorded.described == described:
+                logger.warning('using the observations of an earlier run: %s', file)
+                return recorded
+            logger.warning('recording again, with other options: %s', file)
+        except DatasetError as error:
+            logger.warning('recording again: %s', error)
+    with Journal(file.with_name(f'.{file.name}.unfinished'), described.encode()) as journal:
+        recorded = _record(frames, options, journal)
+        save_recorded(file, recorded)
+        journal.remove()
+    logger.warning('wrote %s', file)
+    return recorded
+
+
+def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
+    """Return what networks at hand say of every frame with a pose; nothing is written."""
+    keyframes = KeyframeFilter(EVERY_FRAME)
+    with _progress(frames, keyframes) as is_wanted:
+        seen = [look(raw) for raw in frames.read_raw(is_wanted)]
+    return _assemble(seen, frames.source, keyframes, '', '')
+
+
+def _record(frames: Frames, options: RecordingOptions, journal: Journal) -> Recorded:
+    """Look at all keyframes that are not in the journal."""
+    seen = {one.place: one for one in map(SeenFrame.from_bytes, journal.chunks())}
+    if seen:
+        logger.warning('going on after %d frames of an unfinished run', len(seen))
+    keyframes = KeyframeFilter(options.keyframes)
+    with _progress(frames, keyframes) as is_wanted:
+        tasks = (raw for raw in frames.read_raw(is_wanted) if raw.place not in seen)
+        for _, result in run_tasks(options.networks, tasks, workers=options.workers,
+                                   scheduler=options.scheduler):
+            if result is not None:
+                journal.add(result.to_bytes())
+                seen[result.place] = result
+                _judge_depth(seen, frames.source)
+    encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
+    return _assemble(list(seen.values()), frames.source, keyframes, encoder_key,
+                     describe(frames, options))
+
+
+@contextmanager
+def _progress(frames: Frames, keyframes: KeyframeFilter) -> Iterator[Wanted]:
+    """Yield the filter of keyframes, which shows a bar on a terminal."""
+    with tqdm(total=frames.count, desc='detector and CLIP', unit='image', disable=None) as bar:
+        def is_wanted(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+            bar.update()
+            return keyframes(place, stamp_ns, pose)
+        yield is_wanted
+
+
+def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
+    """Refuse an implausible unit of depth early, before the work of hours is done."""
+    depths = [one.depths for one in islice(seen.values(), _FRAMES_FOR_UNIT + 1)]
+    if len(depths) <= _FRAMES_FOR_UNIT:
+        check_depth_unit(np.concatenate(depths), str(source))
+
+
+def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, encoder_key: str,
+              described: str) -> Recorded:
+    """Return the observations of frames in the order of time.
+
+    Raises
+    ------
+    DatasetError
+        There are no frames, or they are of several cameras.
+    """
+    if not seen:
+        raise DatasetError(f'{source}: none of {keyframes.asked} images has a pose; interpolate '
+                           'over wider gaps with --max-gap, or record poses with the images')
+    seen = sorted(seen, key=lambda one: (one.stamp_ns, one.place))
+    first = seen[0]
+    for one in seen:
+        if (one.image_size != first.image_size).any() or (one.intrinsics
+                                                          != first.intrinsics).any():
+            raise DatasetError(f'{source}: the camera changes at {one.stamp_ns / NS_PER_S:.6f}, '
+                               'but observations have one camera')
+    check_depth_unit(np.concatenate([one.depths for one in seen]), str(source))
+    names = np.concatenate([one.class_ids for one in seen])
+    class_names, classes = np.unique(names, return_inverse=True)
+    depths = np.concatenate([one.depths for one in seen])
+    has_depth = bool(np.isfinite(depths).any())
+    detections = PosedDetections(
+        camera=_camera(first),
+        map_from_camera=np.array([one.map_from_camera for one in seen]),
+        stamps_s=np.array([one.stamp_ns / NS_PER_S for one in seen]),
+        frame_offsets=np.cumsum([0, *(len(one.scores) for one in seen)]),
+        bboxes_xyxy=np.concatenate([one.bboxes_xyxy for one in seen]),
+        class_names=tuple(str(name) for name in class_names), classes=classes.reshape(-1),
+        scores=np.concatenate([one.scores for one in seen]),
+        depths=depths if has_depth else None,
+        depth_spreads=(np.concatenate([one.depth_spreads for one in seen]) if has_depth
+                       else None),
+        embeddings=(np.concatenate([one.embeddings for one in seen])
+                    if any(one.embeddings.shape[1] for one in seen) else None),
+        encoder_key=encoder_key)
+    return Recorded(
+        detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
+        np.array([one.detector_ms for one in seen]), np.array([one.clip_ms for one in seen]),
+        keyframes.asked, keyframes.without_pose, described)
+
+
+def _camera(seen: SeenFrame) -> Camera:
+    width, height = map(int, seen.image_size)
+    fx, fy, cx, cy = map(float, seen.intrinsics)
+    return Camera(width, height, fx, fy, cx, cy)
+
+
+def _settings(options: YoloOptions | ClipOptions) -> dict[str, Any]:
+    """Return the options that change what a network says."""
+    return {name: value for name, value in asdict(options).items()
+            if name not in ('cache_dir', 'max_batch')}
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """Return what changes with a file; None for the name of a published model."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)

@@ -1,0 +1,223 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames with poses and depth, out of recordings made here."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.bag_frames import (
+    BagTopics,
+    bag_frames,
+    pose_sources,
+    poses_of_topic,
+)
+from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.poses import mount_from_numbers
+from cliploc_ros.datasets.transforms import read_transforms
+from cliploc_ros.errors import DatasetError
+
+MS = 1_000_000
+START = 1_700_000_000_000 * MS
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, 'plumb_bob', (0.0,) * 5)
+TF = 'tf2_msgs/msg/TFMessage'
+
+
+def make(name, **fields):
+    return typestore().types[name](**fields)
+
+
+def header(stamp, frame_id):
+    time = make('builtin_interfaces/msg/Time', sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
+
+
+def pose_at(x, turn_deg=0.0):
+    return make_transform(Rotation.from_euler('z', turn_deg, degrees=True).as_matrix(),
+                          np.array([x, 0.0, 0.0]))
+
+
+def pose_field(transform):
+    return bag_messages.pose_message(0, '', transform).pose
+
+
+def transform_message(stamp, parent, child, transform):
+    field = pose_field(transform)
+    offset = make('geometry_msgs/msg/Vector3', x=field.position.x, y=field.position.y,
+                  z=field.position.z)
+    return make('geometry_msgs/msg/TransformStamped', header=header(stamp, parent),
+                child_frame_id=child, transform=make(
+                    'geometry_msgs/msg/Transform', translation=offset,
+                    rotation=field.orientation))
+
+
+def depth_message(stamp, values):
+    return make('sensor_msgs/msg/Image', header=header(stamp, 'camera'), height=values.shape[0],
+                width=values.shape[1], encoding='16UC1' if values.dtype == np.uint16 else '32FC1',
+                is_bigendian=0, step=values.shape[1] * values.itemsize,
+                data=np.frombuffer(values.tobytes(), dtype=np.uint8))
+
+
+def write_bag(path, images_ms, messages):
+    """Write images at stamps [ms], and messages: (time [ms], topic, type, message)."""
+    recorded = [(t, '/image', bag_messages.IMAGE, bag_messages.image_message(
+        START + t * MS, 'camera', np.full((48, 64, 3), t % 200, dtype=np.uint8)))
+        for t in images_ms]
+    recorded += [(t, '/camera_info', bag_messages.CAMERA_INFO,
+                  bag_messages.camera_info_message(START + t * MS, 'camera', CAMERA))
+                 for t in images_ms]
+    recorded += messages
+    with BagWriter(path) as bag:
+        for topic, msgtype in {(topic, msgtype) for _, topic, msgtype, _ in recorded}:
+            bag.add_topic(topic, msgtype)
+        for t, topic, _, message in sorted(recorded, key=lambda one: one[0]):
+            bag.write(topic, START + t * MS, message)
+    return path
+
+
+def drive(stamps_ms=range(0, 1001, 100), offset_ns=0):
+    """Poses of a body that drives 1 m in 1 s, as PoseStamped."""
+    return [(t, '/pose', bag_messages.POSE, bag_messages.pose_message(
+        START + offset_ns + t * MS, 'map', pose_at(t / 1000))) for t in stamps_ms]
+
+
+def positions(frames):
+    return [None if frame.map_from_camera is None
+            else pytest.approx(frame.map_from_camera[0, 3], abs=1e-9) for frame in frames.read()]
+
+
+def test_poses_are_interpolated_within_a_gap(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950],
+                    drive([0, 200, 300, 600, 1000]))
+    frames = bag_frames(bag, BagTopics(), poses_of_topic('/pose', 300 * MS))
+    assert positions(frames) == [0.25, 0.5, None, None]
+    assert positions(bag_frames(bag, BagTopics(), poses_of_topic('/pose'))) == [None] * 4
+    assert frames.count == 4
+    raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
+    assert [one.place for one in raw] == [1]
+    # another process decodes it
+    decoded = pickle.loads(pickle.dumps(raw[0])).decode()
+    assert (decoded.image_rgb == 500 % 200).all() and decoded.camera.fx == 50.0
+
+
+def test_odometry_and_covariance_with_a_mount(tmp_path):
+    zeros = np.zeros(36)
+    with_covariance = [(t, '/amcl_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped', make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped', header=header(START + t * MS, 'map'),
+        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose_field(pose_at(t / 1000, 90.0)),
+                  covariance=zeros))) for t in (0, 100)]
+    zero = make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+    twist = make('geometry_msgs/msg/TwistWithCovariance',
+                 twist=make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
+                 covariance=zeros)
+    odometry = [(t, '/odom', 'nav_msgs/msg/Odometry', make(
+        'nav_msgs/msg/Odometry', header=header(START + t * MS, 'odom'), child_frame_id='base',
+        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose_field(pose_at(t / 500)),
+                  covariance=zeros), twist=twist)) for t in (0, 100)]
+    bag = write_bag(tmp_path / 'bag', [50], [*with_covariance, *odometry])
+    mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+    frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
+    np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
+    frame, = bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
+    np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.1, 0.0, 0.0], atol=1e-9)
+    assert sorted(pose_sources(bag)) == ['/amcl_pose', '/odom']
+
+
+def tf_messages(*, static=True, parent='odom'):
+    """The map corrected once a second, odometry at 10 Hz, the camera 0.2 m ahead."""
+    moving = [(t, '/tf', TF, make(TF, transforms=[transform_message(
+        START + t * MS, 'map', 'odom', pose_at(0.0, 90.0 * t / 1000))]))
+        for t in (0, 1000)] if parent == 'odom' else []
+    moving += [(t, '/tf', TF, make(TF, transforms=[transform_message(
+        START + t * MS, 'odom', 'base', pose_at(t / 1000))])) for t in range(0, 1001, 100)]
+    if static:
+        moving.append((0, '/tf_static', TF, make(TF, transforms=[transform_message(
+            START, 'base', '/camera', pose_at(0.2))])))
+    return moving
+
+
+def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [450], tf_messages())
+    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
+        reader, 'map', camera, 1000 * MS)).read()
+    expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
+    np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
+    # the correction comes too rarely for a smaller gap
+    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
+        reader, 'map', camera, 500 * MS)).read()
+    assert frame.map_from_camera is None
+    # a map that is a leaf of the tree
+    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
+        reader, 'base', camera, 0)).read()
+    np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
+
+
+@pytest.mark.parametrize(('messages', 'frames', 'expected'), [
+    (tf_messages(), ('world', 'camera'), "no coordinate frame 'world'; it has base, camera, map"),
+    (tf_messages(static=False), ('map', 'camera'), "no coordinate frame 'camera'"),
+    (tf_messages(parent=''), ('map', 'camera'), "no coordinate frame 'map'"),
+    (drive(), ('map', 'camera'), 'has neither /tf nor /tf_static'),
+    ([*tf_messages(static=False), (0, '/tf_static', TF, make(TF, transforms=[transform_message(
+        START, 'arm', 'camera', np.eye(4))]))], ('map', 'camera'),
+     "does not connect 'map' and 'camera': their roots are 'map' and 'arm'"),
+    ([*tf_messages(), (900, '/tf', TF, make(TF, transforms=[transform_message(
+        START, 'other_odom', 'base', np.eye(4))]))], ('map', 'camera'),
+     "'base' has two parents, 'odom' and 'other_odom'")])
+def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
+    bag = write_bag(tmp_path / 'bag', [450], messages)
+    with pytest.raises(DatasetError, match=expected):
+        bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
+            reader, *frames, 1000 * MS))
+
+
+def test_stamps_of_another_clock(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
+    with pytest.raises(DatasetError, match=r'images begin at 1700000000.000 s, poses at 1000.000 '
+                       r's, -1699999000.000 s apart, and do not overlap; .*another clock'):
+        bag_frames(bag, BagTopics(), poses_of_topic('/pose', 300 * MS))
+
+
+def test_poses_that_are_missing_or_broken(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [0], drive())
+    with pytest.raises(DatasetError, match=r'no topic /odom; it has .*/pose'):
+        bag_frames(bag, BagTopics(), poses_of_topic('/odom'))
+    with pytest.raises(DatasetError, match=r'/image is of type sensor_msgs/msg/Image, not geo'):
+        bag_frames(bag, BagTopics(), poses_of_topic('/image'))
+    broken = drive()
+    broken[3][3].pose.orientation.w = float('nan')
+    bag = write_bag(tmp_path / 'broken', [0], broken)
+    with pytest.raises(DatasetError, match='1 of 11 poses are not finite'):
+        bag_frames(bag, BagTopics(), poses_of_topic('/pose'))
+
+
+def test_depth_is_paired_with_the_nearest_image(tmp_path):
+    depths = [(t + 4, '/depth', bag_messages.IMAGE, depth_message(
+        START + t * MS, np.full((48, 64), value, dtype=np.uint16)))
+        for t, value in ((0, 1000), (95, 2000), (130, 3000), (400, 0))]
+    bag = write_bag(tmp_path / 'bag', [0, 100, 300, 400], [*drive(), *depths])
+    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose', 200 * MS))
+    shown = [None if frame.depth is None else frame.depth.depths_m[0, 0]
+             for frame in frames.read()]
+    assert shown[:3] == [pytest.approx(1.0), pytest.approx(2.0), None]
+    assert np.isnan(shown[3])
+
+
+def test_depth_as_floats_and_of_another_type(tmp_path):
+    floats = [(0, '/depth', bag_messages.IMAGE, depth_message(
+        START, np.full((48, 64), 1.5, dtype=np.float32)))]
+    color = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
+    bag = write_bag(tmp_path / 'bag', [0], [*drive(), *floats,
+                                            (0, '/color', bag_messages.IMAGE, color)])
+    topics = BagTopics(depth='/depth')
+    frame, = bag_frames(bag, topics, poses_of_topic('/pose')).read()
+    assert (frame.depth.depths_m == 1.5).all()
+    with pytest.raises(DatasetError, match=r"/color at 1700000000.0000.*depth encoding 'rgb8'"):
+        list(bag_frames(bag, BagTopics(depth='/color'), poses_of_topic('/pose')).read())
+    with pytest.raises(DatasetError, match='cannot be both the image and its depth'):
+        bag_frames(bag, BagTopics(depth='/image'), poses_of_topic('/pose'))

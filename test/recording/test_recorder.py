@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Observations of the demo's walk, with its real networks: once, resumed, by two workers."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.build_map import main
+from cliploc_ros.datasets.observations import load_recorded
+
+PROJECT = Path(__file__).resolve().parents[2]
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
+CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors')
+# A short walk shows objects from one side: this test is about what the networks say.
+ALL = ('--min-baseline', '1', '--frame-id', 'room')
+TIMEOUT_S = 600.0  # with networks, on a machine under load
+
+
+def arguments(*parts):
+    return [*map(str, parts)]
+
+
+@pytest.fixture(scope='module')
+def walk(tmp_path_factory):
+    """A third of the demo's walk, with a pose for all but the last image, and flat depth."""
+    folder = tmp_path_factory.mktemp('walk') / 'tum'
+    shutil.copytree(ASSETS / 'sequence', folder)
+    rows = [line for line in (folder / 'rgb.txt').read_text().splitlines()
+            if not line.startswith('#')][::3]
+    (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
+    last = float(rows[-1].split()[0])
+    truth = (folder / 'groundtruth.txt').read_text().splitlines()
+    (folder / 'groundtruth.txt').write_text('\n'.join(
+        line for line in truth if line.startswith('#') or float(line.split()[0]) < last - 0.25))
+    (folder / 'depth').mkdir()
+    cv2.imwrite(str(folder / 'depth/flat.png'), np.full((480, 640), 10000, dtype=np.uint16))
+    (folder / 'depth.txt').write_text(''.join(f'{row.split()[0]} depth/flat.png\n'
+                                              for row in rows))
+    return folder
+
+
+@pytest.fixture(scope='module')
+def recorded(walk):
+    """The observations of a run without interruption, as the executable leaves them."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.cli.build_map', *arguments(
+            '--tum', walk, *NETWORKS, *CLIP, *ALL, '--out', walk.parent / 'map.yaml')],
+        cwd=PROJECT, text=True, capture_output=True, timeout=TIMEOUT_S)
+    assert done.returncode == 0, done.stderr
+    assert 'no pose: 1 of 16 images' in done.stdout
+    file, = walk.parent.glob('tum.cliploc-*.npz')
+    assert not list(walk.parent.glob('.*.unfinished'))
+    return file
+
+
+def assert_equal(one, other):
+    for name in ('bboxes_xyxy', 'classes', 'scores', 'map_from_camera', 'stamps_s'):
+        # PyTorch adds up in another order on another number of threads
+        np.testing.assert_allclose(getattr(one.detections, name),
+                                   getattr(other.detections, name), atol=1e-2)
+    np.testing.assert_allclose(one.detections.embeddings.astype(float),
+                               other.detections.embeddings.astype(float), atol=1e-3)
+    assert (one.stamps_ns == other.stamps_ns).all()
+
+
+def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
+    content = load_recorded(recorded)
+    assert (content.images, content.without_pose, len(content.detections)) == (16, 1, 15)
+    embeddings = content.detections.embeddings
+    assert embeddings.shape == (len(content.detections.scores), 128)
+    np.testing.assert_allclose(np.linalg.norm(embeddings.astype(float), axis=1), 1.0, atol=1e-3)
+    assert content.detections.encoder_key
+    before = recorded.stat().st_mtime_ns
+    begin = time.process_time()
+    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--seed', 3, '--out',
+                          walk.parent / 'second.yaml')) == 0
+    print(f'a second map takes {time.process_time() - begin:.1f} s of processor time')
+    assert recorded.stat().st_mtime_ns == before
+    assert main(arguments('--observations', recorded, *ALL, '--seed', 3, '--out',
+                          walk.parent / 'third.yaml')) == 0
+    second, third = ((walk.parent / name).read_text().replace('tum', recorded.name).splitlines()
+                     for name in ('second.yaml', 'third.yaml'))
+    assert [line for line in second if 'center' in line] == [
+        line for line in third if 'center' in line]
+
+
+def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
+    file = tmp_path / 'resumed.npz'
+    command = arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--record-to', file, '--out',
+                        tmp_path / 'map.yaml')
+    process = subprocess.Popen([sys.executable, '-m', 'cliploc_ros.cli.build_map', *command],
+                               cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    journal = tmp_path / '.resumed.npz.unfinished'
+    deadline = time.monotonic() + TIMEOUT_S
+    while not (journal.exists() and journal.stat().st_size > 15_000):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not file.exists()
+    with journal.open('ab') as cut_off:
+        cut_off.write(b'\x00\x10')
+    assert main(command) == 0
+    assert_equal(load_recorded(file), load_recorded(recorded))
+    assert not journal.exists()
+
+
+def test_two_workers_say_the_same(walk, recorded, tmp_path):
+    file = tmp_path / 'two.npz'
+    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--workers', 2, '--record-to',
+                          file, '--out', tmp_path / 'map.yaml')) == 0
+    assert_equal(load_recorded(file), load_recorded(recorded))
+
+
+def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path, capsys):
+    file = tmp_path / 'depth.npz'
+    command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
+               tmp_path / 'map.yaml')
+    assert main(arguments(*command, '--depth-unit', '1')) == 1
+    assert 'wrong unit? give --depth-unit' in capsys.readouterr().err
+    code = main(arguments(*command, '--keyframes', '1', '180'))
+    assert code in (0, 1)  # few keyframes may give no map
+    content = load_recorded(file).detections
+    assert 2 <= len(content) < 15
+    assert content.embeddings is None
+    # 10,000 counts of TUM are 2 m, spread by nothing
+    np.testing.assert_allclose(content.depths, 2.0, atol=1e-6)
+    np.testing.assert_allclose(content.depth_spreads, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(('options', 'expected'), [
+    (('--bag', 'none'), 'none: no such recording'),
+    (('--tum', '{walk}', '--pose-topic', '/pose'), 'are for --bag'),
+    (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap; one of them uses another'),
+    (('--tum', '{walk}', '--workers', '0'), '--workers 0: give 1 or more'),
+    (('--tum', '{walk}', '--keyframes', '-1', '5'), 'give 0 or more'),
+    (('--tum', '{walk}', '--depth-baseline', '0', '0', '0'), 'needs --depth-intrinsics'),
+    (('--rgbd', '{folder}'), 'has neither rgb.txt'),
+    (('--tum', '{walk}', '--record-to', '/proc/none.npz'), 'cannot be written'),
+    (('--observations', '{cut}'), 'is no complete npz file; record the observations again')])
+def test_refusals(walk, recorded, tmp_path, capsys, options, expected):
+    other = tmp_path / 'other.txt'
+    other.write_text('5000 0 0 0 0 0 0 1\n5001 1 0 0 0 0 0 1\n')
+    cut = tmp_path / 'cut.npz'
+    cut.write_bytes(recorded.read_bytes()[:-200])
+    filled = [one.format(walk=walk, other=other, folder=tmp_path, cut=cut) for one in options]
+    handler = signal.getsignal(signal.SIGTERM)
+    code = main(arguments(*filled, *NETWORKS, '--no-clip', '--out', tmp_path / 'map.yaml'))
+    signal.signal(signal.SIGTERM, handler)
+    error = capsys.readouterr().err
+    assert code == 1 and expected in error, error
+    assert len([line for line in error.splitlines() if line.startswith('error:')]) == 1
+    assert not (tmp_path / 'map.yaml').exists()
+    assert os.listdir(tmp_path)  # noqa: PTH208
+
+
+def test_a_truncated_observation_file_is_recorded_again(walk, recorded, tmp_path, caplog):
+    file = tmp_path / 'cut.npz'
+    file.write_bytes(recorded.read_bytes()[:-200])
+    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--keyframes', '0.5', '15',
+                          '--record-to', file, '--out', tmp_path / 'map.yaml')) in (0, 1)
+    assert 'recording again' in caplog.text
+    assert len(load_recorded(file).detections) > 0

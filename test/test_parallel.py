@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Independent tasks on processes, some of which die."""
+
+import importlib.util
+import logging
+import os
+import signal
+from dataclasses import dataclass
+
+import pytest
+
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.parallel import WorkersError, run_tasks
+
+
+@dataclass(frozen=True)
+class Square:
+    """Squares numbers; dies at one of them, once or always."""
+
+    folder: str = ''
+    deadly: int = -1
+    always: bool = False
+
+    def __call__(self):
+        return self.square
+
+    def square(self, number):
+        if number == self.deadly and self.may_die():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number * number, os.getpid()
+
+    def may_die(self):
+        marker = os.path.join(self.folder, 'died')  # noqa: PTH118 (in the worker)
+        if self.always:
+            return True
+        try:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            return False
+        return True
+
+
+def results(make_work, count=12, **options):
+    return {task: None if result is None else result[0]
+            for task, result in run_tasks(make_work, range(count), **options)}
+
+
+SQUARES = {number: number * number for number in range(12)}
+
+
+def test_in_this_process():
+    finished = list(run_tasks(Square(), range(3)))
+    assert finished == [(number, (number * number, os.getpid())) for number in range(3)]
+
+
+def test_in_two_processes():
+    finished = dict(run_tasks(Square(), range(12), workers=2))
+    assert {task: result[0] for task, result in finished.items()} == SQUARES
+    assert os.getpid() not in {result[1] for result in finished.values()}
+
+
+def test_tasks_are_taken_as_workers_become_free():
+    taken = []
+
+    def tasks():
+        for number in range(100):
+            taken.append(number)
+            yield number
+    stream = run_tasks(Square(), tasks(), workers=2)
+    next(stream)
+    assert len(taken) < 10
+    stream.close()
+
+
+def test_a_dead_worker_costs_time_only(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        assert results(Square(str(tmp_path), deadly=5), workers=2) == SQUARES
+    assert 'a worker process died; its tasks run again' in caplog.text
+
+
+def test_a_deadly_task_is_given_up_alone(caplog):
+    with caplog.at_level(logging.WARNING):
+        assert results(Square(deadly=5, always=True), workers=2) == SQUARES | {5: None}
+    assert 'left out' in caplog.text
+
+
+def test_without_dask():
+    if importlib.util.find_spec('distributed'):
+        with pytest.raises(WorkersError, match='no Dask scheduler answers'):
+            results(Square(), scheduler='tcp://127.0.0.1:9')
+    else:
+        with pytest.raises(OptionsError, match='--scheduler needs Dask: pip install distributed'):
+            results(Square(), scheduler='tcp://127.0.0.1:9')
