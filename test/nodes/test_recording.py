@@ -9,7 +9,7 @@ import pytest
 import yaml
 from processes import PROJECT
 from tester import make_frame, transform_of
-from wake_ups import judge, wake_up_on_every_frame
+from wake_ups import judge, wake_up_on_frames
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -63,7 +63,7 @@ def test_recorded_detections(office, convert, limits, start, tester, monkeypatch
     tester.connect()
     start('cli.replay', recording, '--loop', '--rate', '3')
     with tester.hearing_detections() as heard:
-        answers = wake_up_on_every_frame(tester, FRAMES)
+        answers = wake_up_on_frames(tester, FRAMES)
         # a busy machine may drop a message on its way here; the recording comes round again
         tester.wait(lambda: set(answers) <= set(heard), 'the detections of every answer')
     for stamp, (answer, hypotheses) in answers.items():
@@ -111,7 +111,7 @@ def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, lim
     tester.connect()
     start('cli.replay', recording, '--loop', '--rate', '2')
     with tester.hearing_detections() as detected:
-        answers = wake_up_on_every_frame(tester, FRAMES)
+        answers = wake_up_on_frames(tester, FRAMES)
         tester.wait(lambda: len(detected) == FRAMES, 'detections of every frame')
     recall = recall_of(json.loads((office / 'detections.json').read_text()), detected)
     print(f'recall over all classes {recall:.2f}')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Waking up on every frame of a recording, and judging the answers by the true poses."""
+"""Requests on the frames of a recording, and their answers against the true poses."""
 
 import numpy as np
 from tester import transform_of
@@ -9,8 +9,8 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import stamp_ns
 
 
-def wake_up_on_every_frame(tester, frames):
-    """Ask until every frame of a looping recording was answered; the answers by stamp.
+def wake_up_on_frames(tester, frames):
+    """Request until so many different frames of a looping recording are answered; by stamp.
 
     Which frame an answer is about stands in the stamp of the hypotheses published with it.
     """
