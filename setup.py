@@ -51,7 +51,6 @@ setup(
         'console_scripts': [
             f'build_map = {PACKAGE}.cli.build_map:main',
             f'check_map = {PACKAGE}.cli.check_map:main',
-            f'check_map = {PACKAGE}.cli.check_map:main',
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
