@@ -36,7 +36,7 @@ MAP_FROM_BASE = MAP_FROM_CAMERA @ invert_transform(BASE_FROM_CAMERA)
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
                                np.array([3.0, -4.0, 1.0]))
 START_S = 100.0
-# Of each view only so many boxes, those nearest to its middle: one less than is believed.
+# Boxes per view, those nearest to its middle: one less than min_inliers.
 BOXES = 3
 PARAMETERS = {'base_frame': 'base_link', 'base_from_camera': MOUNT, 'algorithm': 'auto',
               'min_inliers': BOXES + 1, 'timeout_s': 20.0, 'max_turn_rad_s': 1.0}

@@ -52,7 +52,7 @@ def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift)
     truth = MAP_FROM_CAMERA @ invert_transform(base_from_camera(1.5))
     for pose in (tester.poses[0], tester.initial_poses[0]):
         assert pose_error(transform_of(pose.pose.pose), truth) < (0.08, 1.0)
-    # nobody has told of that time, and nobody will
+    # no transform covers that time
     answer = tester.relocalize(make_frame(stamp_s=104.0))
     assert not answer.success
     assert "no transform from 'base_link' to 'camera_optical_frame'" in answer.message
