@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.build_map import main
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.datasets.observations import load_recorded
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -136,6 +137,20 @@ def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path
     # 10,000 counts of TUM are 2 m, spread by nothing
     np.testing.assert_allclose(content.depths, 2.0, atol=1e-6)
     np.testing.assert_allclose(content.depth_spreads, 0.0, atol=1e-6)
+
+
+def test_a_bag_says_the_same_and_asks_where_its_poses_are(walk, recorded, tmp_path, capsys):
+    bag, file = tmp_path / 'bag', tmp_path / 'bag.npz'
+    assert tum_to_bag(arguments(walk, bag)) == 0
+    command = ('--bag', bag, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
+               tmp_path / 'map.yaml')
+    assert main(arguments(*command)) == 1
+    error = capsys.readouterr().err
+    assert 'say where the poses are' in error and 'here: /ground_truth' in error
+    assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
+    from_bag, from_folder = load_recorded(file).detections, load_recorded(recorded).detections
+    np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
+    np.testing.assert_allclose(from_bag.map_from_camera, from_folder.map_from_camera, atol=1e-6)
 
 
 @pytest.mark.parametrize(('options', 'expected'), [
