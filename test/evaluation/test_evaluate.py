@@ -323,7 +323,7 @@ def test_bad_query_files_are_named(files, tmp_path, arrays, named, evaluate_here
 @pytest.mark.parametrize(('arguments', 'named'), [
     (('--image', '/camera'), 'has no topic /camera; it has /image (sensor_msgs'),
     (('--ground-truth', '/image'), '/image is of type sensor_msgs/msg/Image, not'),
-    (('--body-from-camera', *'0000000'), 'expected x y z and a unit quaternion'),
+    (('--body-from-camera', *'0000000'), 'x y z and a unit quaternion'),
     (('--clip-model', 'ViT-L-15'), 'ViT-L-15'), (('--model', '/nowhere.pt'), '/nowhere.pt'),
     (('--save-queries', '/nowhere/q.npz'), '/nowhere/q.npz'),
 ])

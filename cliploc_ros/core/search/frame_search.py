@@ -28,7 +28,8 @@ from cliploc_ros.core.search.strategies import (
 )
 from cliploc_ros.errors import OptionsError
 
-#: So many of the best are refined. On the recorded frames, worse ones never led afterwards.
+#: The number of best hypotheses that are refined. On the recorded frames, worse ones never led
+#: afterwards.
 REFINED = 32
 # The map's third axis is up (REP 103), and the optical frame's second is down.
 _UP_IN_MAP = (0.0, 0.0, 1.0)

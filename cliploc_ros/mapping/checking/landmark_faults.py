@@ -193,7 +193,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     ----------
     landmark_map : LandmarkMap
     witness : Witness, optional
-        Without a recording, the map's own fields tell of support.
+        Without a recording, support comes from the map's own fields.
     overlaps : list of Overlap
     options : MappingOptions
         Its limits for landmarks.
@@ -235,7 +235,7 @@ def _check(landmark_map: LandmarkMap, row: int, witness: Witness | None,
 
 
 class _Numbers(NamedTuple):
-    """What a recording, or the map itself, tells of a landmark; None where nothing does."""
+    """Figures of a landmark from a recording or from the map itself; None where unknown."""
 
     support: int | None
     expected: int | None

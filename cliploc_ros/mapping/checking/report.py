@@ -41,7 +41,7 @@ class BlockQuality:
 
 @dataclass(frozen=True)
 class RecordingCheck:
-    """What a recording tells of a map.
+    """The check of a map against a recording.
 
     Parameters
     ----------
