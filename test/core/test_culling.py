@@ -143,8 +143,9 @@ def test_far_landmarks_appear_too_small():
         assert np.sqrt(exx * eyy - exy * exy) < iou_threshold * 0.4 * 0.3
 
 
+@pytest.mark.clock
 def test_a_hypothesis_costs_little_more_in_a_large_map():
-    """With what a search sets up; 1.6 on an idle core, and here others work beside it."""
+    """With what a search sets up; 1.6 on an idle core."""
     times_us = {}
     for count in (100, 100_000):
         scene = make_storey(count)

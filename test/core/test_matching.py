@@ -184,6 +184,7 @@ for count in (60, 400):
 """
 
 
+@pytest.mark.clock
 def test_the_first_request_finds_all_compiled():
     """In a process of its own: 1.5 times as long as later ones at most, on an idle core."""
     here = Path(__file__).parent
