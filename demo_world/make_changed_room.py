@@ -3,8 +3,8 @@
 """Make a room before and after changes: ``python -m demo_world.make_changed_room DIR``.
 
 The room is the demo's, without the objects that its map lacks. The folder gets two walks, before/
-and after/, the exact map of before, map.yaml, and what changed, changes.json: four objects exchange
-their places in pairs, two are taken away, three appear, and the light is another one. With
+and after/, the exact maps of both, and what changed, changes.json: four objects exchange their
+places in pairs, two are taken away, three appear, and the light is another one. With
 ``--free-places`` the four move to places that were empty.
 """
 
