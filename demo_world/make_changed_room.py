@@ -22,7 +22,7 @@ from demo_world.make_demo_world import SEED
 from demo_world.recording import record, write_true_map
 from demo_world.renderer import Light, Renderer
 from demo_world.room import Room, find_places, make_room, move_objects
-from demo_world.trajectories import CAMERA, mapping_walk, walk
+from demo_world.trajectories import CAMERA, walk
 
 _COUNTS = dict.fromkeys(CLASSES, 8)
 _MOVED, _REMOVED, _NEW = 4, 2, 3
@@ -62,14 +62,28 @@ def _move_to_free_places(room: Room, moved: list[str], seed: int) -> Room:
         for item in room.objects))
 
 
-def second_walk(count: int) -> npt.NDArray[np.float64]:
-    """Return a walk about the centre that looks across the room, lower than the mapping walk."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 13) + 0.9
-    eyes = np.c_[3.0 - 1.0 * np.cos(turn + 0.5), 2.5 - 0.7 * np.sin(turn + 0.5),
-                 1.3 + 0.1 * np.sin(2.0 * turn)]
-    gazes = np.c_[3.0 + 3.1 * np.cos(turn), 2.5 + 2.5 * np.sin(turn),
-                  1.0 - 0.2 * np.sin(3.0 * turn)]
-    return walk(count, eyes, gazes)
+def round_walk(count: int, start: float, height_m: float) -> npt.NDArray[np.float64]:
+    """Return a walk around the room and back that looks ahead, so that each object has two sides.
+
+    Parameters
+    ----------
+    count : int
+        Number of poses.
+    start : float
+        Where it starts on the round [rad].
+    height_m : float
+        Of the camera [m].
+    """
+    loops = []
+    for sign, poses in ((1.0, count // 2), (-1.0, count - count // 2)):
+        turn = start + sign * np.linspace(0.0, 2.0 * np.pi, 13)
+        ahead = turn + 1.1 * sign
+        eyes = np.c_[3.0 + 1.2 * np.cos(turn), 2.5 + 0.9 * np.sin(turn),
+                     height_m + 0.1 * np.sin(2.0 * turn)]
+        gazes = np.c_[3.0 + 3.1 * np.cos(ahead), 2.5 + 2.5 * np.sin(ahead),
+                      0.95 - 0.15 * np.sin(3.0 * ahead)]
+        loops.append(walk(poses, eyes, gazes))
+    return np.concatenate(loops)
 
 
 def make_changed_room(folder: Path, images: int, seed: int, free_places: bool = False) -> None:
@@ -81,8 +95,8 @@ def make_changed_room(folder: Path, images: int, seed: int, free_places: bool = 
         after, objects=tuple(replace(o, in_map=True) for o in after.objects)))
     (folder / 'changes.json').write_text(json.dumps(changes, indent=1))
     for name, room, light, poses in (
-            ('before', before, _LIGHT_BEFORE, mapping_walk(images)),
-            ('after', after, _LIGHT_AFTER, second_walk(images))):
+            ('before', before, _LIGHT_BEFORE, round_walk(images, 0.0, 1.45)),
+            ('after', after, _LIGHT_AFTER, round_walk(images, 0.9, 1.3))):
         with tqdm(total=images, desc=name, unit='image') as bar:
             record(folder / name, room, Renderer(room, CAMERA, light), poses, seed=seed + 5,
                    rate_hz=2.0, advance=bar.update)
@@ -93,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='make_changed_room', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folder', type=Path, metavar='DIR')
-    parser.add_argument('--images', type=int, default=120, help='of each walk (%(default)s)')
+    parser.add_argument('--images', type=int, default=80, help='of each walk (%(default)s)')
     parser.add_argument('--seed', type=int, default=SEED + 1, help='(%(default)s)')
     parser.add_argument('--free-places', action='store_true', help='see above')
     options = parser.parse_args()

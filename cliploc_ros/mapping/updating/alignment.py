@@ -26,6 +26,10 @@ _OFFSET_SIGMA_M, _OFFSET_SIGMA_DEG = 0.5, 5.0
 # Objects that were nudged by this much do not disturb it [m]. A guess.
 _NUDGE_M = 0.02
 _SETTLED_M = 1e-3
+_LOSS_SCALE = 2.0
+# The median length of a normal vector of three numbers, and the square that one of six exceeds
+# once in a thousand times: a smaller offset is none.
+_MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 
 
 class Alignment(NamedTuple):
@@ -71,14 +75,14 @@ def align(given: Views, known: Known, options: UpdateOptions) -> Alignment:
                      float(np.degrees(np.sqrt(changes[:, 3:].sum(axis=1).mean()))))
 
 
-def _offset(known: Known, found: Refits) -> NDArray[np.float64]:
+def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     """Return map_from_recording (4, 4): the rigid motion of fitted landmarks onto old ones."""
-    rows = found.is_known
-    fitted, old = found.landmarks.centers[rows], known.landmarks.centers[rows]
+    rows = refits.is_known
+    fitted, old = refits.landmarks.centers[rows], known.landmarks.centers[rows]
     middle = fitted.mean(axis=0)
     own = np.square(known.sigmas[rows]) + _NUDGE_M ** 2
     whiten = np.linalg.inv(np.linalg.cholesky(
-        found.covariances[rows] + own[:, None, None] * np.eye(3)))
+        refits.covariances[rows] + own[:, None, None] * np.eye(3)))
     scales = np.repeat([_OFFSET_SIGMA_M, np.radians(_OFFSET_SIGMA_DEG)], 3)
 
     def residuals(motion: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,8 +91,13 @@ def _offset(known: Known, found: Refits) -> NDArray[np.float64]:
         lengths = np.linalg.norm(np.einsum('lij,lj->li', whiten, turned - old), axis=1)
         return np.concatenate([lengths, motion / scales])
 
-    motion = least_squares(residuals, np.zeros(6), loss='cauchy', f_scale=2.0).x
-    step = np.eye(4)
+    found = least_squares(residuals, np.zeros(6), loss='cauchy', f_scale=_LOSS_SCALE)
+    lengths, step = found.fun[:-6], np.eye(4)
+    # positions err more than their deviations say: objects are no ellipsoids
+    inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
+    if float(found.x @ (found.jac.T @ found.jac) @ found.x) < _SIGNIFICANT * inflation ** 2:
+        return step
+    motion = found.x
     step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
     step[:3, 3] = middle + motion[:3] - step[:3, :3] @ middle
     return step
@@ -120,13 +129,13 @@ def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:
 def has_moved(known: Known, found: Refits, options: UpdateOptions) -> NDArray[np.bool_]:
     """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
     offsets = found.landmarks.centers - known.landmarks.centers
-    distances = np.linalg.norm(offsets, axis=1)
-    sizes = np.linalg.norm(known.landmarks.bases, axis=(1, 2))
-    far = found.is_known & (distances > np.maximum(options.least_move_m,
-                                                   options.least_move_share * sizes))
+    far = found.is_known & (np.linalg.norm(offsets, axis=1) > options.least_move_m)
     rows = np.nonzero(far)[0]
-    far[rows] = deviations(known, found, rows) > options.least_move_sigmas
-    return np.asarray(far)
+    shapes = sum(one.bases[rows] @ one.bases[rows].transpose(0, 2, 1)
+                 for one in (known.landmarks, found.landmarks))
+    far[rows] = ((_lengths(offsets[rows], shapes) > options.least_move_shapes)
+                 & (deviations(known, found, rows) > options.least_move_sigmas))
+    return far
 
 
 def deviations(known: Known, found: Refits, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -134,5 +143,10 @@ def deviations(known: Known, found: Refits, rows: NDArray[np.int64]) -> NDArray[
     offsets = found.landmarks.centers[rows] - known.landmarks.centers[rows]
     covariances = (found.covariances[rows]
                    + np.square(known.sigmas[rows])[:, None, None] * np.eye(3))
+    return _lengths(offsets, covariances)
+
+
+def _lengths(offsets: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths (k,) of offsets (k, 3) in units of shape matrices (k, 3, 3)."""
     return np.asarray(np.sqrt(np.einsum(
-        'li,li->l', offsets, np.linalg.solve(covariances, offsets[..., None])[..., 0])))
+        'li,li->l', offsets, np.linalg.solve(shapes, offsets[..., None])[..., 0])))

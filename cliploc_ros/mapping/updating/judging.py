@@ -67,19 +67,28 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Upda
     is_gone = displaced | _is_absent(known, sight, options)
     finds = find_new(detections, views, _held(shown, is_gone) < 0, mapping)
     finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
+    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), ~is_gone,
+                           mapping)
+    _, sight = _look(views, known, finds, shown, is_gone, options)
+    finds = finds.select(np.nonzero(sight.seen_ratio[count:] >= options.min_new_ratio)[0])
     both = shown
     for _ in range(_ROUNDS):
-        own = _held(shown, is_gone)
-        finds = without_copies(views, finds, refits.landmarks, own, ~is_gone, mapping)
-        both = np.where((own < 0) & (finds.shown >= 0), count + finds.shown, own)
-        sight = look_for(views, join_landmarks(known.landmarks, finds.landmarks), both,
-                         np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)]),
-                         options)
+        both, sight = _look(views, known, finds, shown, is_gone, options)
         is_gone = displaced | _is_absent(known, sight.select(slice(count)), options)
     own_sight = sight.select(slice(count))
     there = probability_there(own_sight, usual_ratios(known, own_sight, options), options)
-    is_there = ~is_gone & (own_sight.seen > 0) & (there > options.there_above)
+    is_there = ~is_gone & (own_sight.seen > 0) & (refits.is_known | (there > options.there_above))
     return Judged(both, refits, finds, sight, is_gone, is_there)
+
+
+def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
+          is_gone: NDArray[np.bool_], options: UpdateOptions) -> tuple[NDArray[np.int64], Sight]:
+    """Return the landmark or find that each box shows, and the sight of all their places."""
+    own = _held(shown, is_gone)
+    both = np.where((own < 0) & (finds.shown >= 0), len(is_gone) + finds.shown, own)
+    is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
+    return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid,
+                          options)
 
 
 def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -90,11 +99,9 @@ def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.in
 def _is_absent(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np.bool_]:
     """Tell which objects (L,) are not in their place.
 
-    A detector that never found a class in this recording may not know it. That counts only where
-    a detector made the landmark.
+    A detector that never found a class in this recording may not know it, or not at these sizes.
     """
-    is_told = (known.landmarks.classes >= 0) | np.array(
-        [one.support is not None for one in known.details], dtype=np.bool_)
+    is_told = known.landmarks.classes >= 0
     there = probability_there(sight, usual_ratios(known, sight, options), options)
     return np.asarray(is_told & (there < options.gone_below))
 

@@ -17,9 +17,10 @@ class UpdateOptions:
         How new landmarks are built; with its pose_errors, the poses are refined against the map.
     unknown_sigma_m : float
         Deviation of a centre where the map does not say it [m].
-    least_move_m, least_move_share, least_move_sigmas : float
-        An object has moved if it is farther away than all three: [m], as a share of its size, and
-        in standard deviations of both positions. A smaller change is a better fit.
+    least_move_m, least_move_shapes, least_move_sigmas : float
+        An object has moved if it is farther away than all three: [m], in units of its old and new
+        shape (1: they touch), and in standard deviations of both positions. A smaller change is a
+        better fit.
     least_offset_m, least_offset_deg : float
         A larger offset of the recording's coordinate frame from the map's is noted.
     stays : float
@@ -27,7 +28,8 @@ class UpdateOptions:
     seen_ratio : float
         Share of the views in which an object is detected, where neither map nor recording tell.
     prior_views : float
-        So many views the seen ratio is worth, as an object may be hard to see from one side.
+        So many views the seen ratio is worth at most, as an object may be hard to see from one
+        side.
     chance_ratio : float
         Share of the views in which a wrong box appears in an empty place.
     gone_below, there_above : float
@@ -48,18 +50,18 @@ class UpdateOptions:
     mapping: MappingOptions = field(default_factory=MappingOptions)
     unknown_sigma_m: float = 0.05
     least_move_m: float = 0.1
-    least_move_share: float = 0.3
+    least_move_shapes: float = 0.6
     least_move_sigmas: float = 4.0
     least_offset_m: float = 0.03
     least_offset_deg: float = 1.0
     stays: float = 0.9
-    seen_ratio: float = 0.6
+    seen_ratio: float = 0.9
     prior_views: float = 4.0
     chance_ratio: float = 0.03
     gone_below: float = 0.05
     there_above: float = 0.95
     beside_deg: float = 20.0
     hidden_share: float = 0.4
-    min_new_ratio: float = 0.2
+    min_new_ratio: float = 0.1
     min_confirmed: int = 3
     min_confirmed_share: float = 0.3

@@ -4,7 +4,8 @@
 
 Of N viewpoints that show the place, K show the object. If it is there, K is binomial with a ratio
 that is a beta variable: about the ratio at which it was seen before, with few views' worth of
-certainty, since some objects are hard to see from one side. If it is not there, K counts wrong
+certainty, since some objects are hard to see from one side; the landmarks that were seen tell how
+few. If it is not there, K counts wrong
 boxes only. Both with the prior that most objects stay give the probability.
 """
 
@@ -19,6 +20,9 @@ from cliploc_ros.mapping.updating.sight import Sight
 # A recording in which objects are seen more rarely than before lowers all ratios, by at most this.
 _LEAST_FACTOR = 0.3
 _RATIO_RANGE = (0.02, 0.95)
+# Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
+# that a usual ratio is worth [views]. Guesses.
+_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_VIEWS = 5, 3, 0.5
 
 
 def probability_there(sight: Sight, ratios: NDArray[np.float64], options: UpdateOptions
@@ -32,7 +36,7 @@ def probability_there(sight: Sight, ratios: NDArray[np.float64], options: Update
         Share of the views in which each object is usually detected.
     options : UpdateOptions
     """
-    there = _log_evidence(sight, ratios, options.prior_views)
+    there = _log_evidence(sight, ratios, _certainty(sight, ratios, options))
     away = _log_evidence(sight, np.full(len(ratios), options.chance_ratio), options.prior_views)
     return np.asarray(expit(np.log(options.stays / (1.0 - options.stays)) + there - away))
 
@@ -41,6 +45,19 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
     """Return the logarithm of the beta-binomial probability, without the binomial coefficient."""
     a, b = views * ratios, views * (1.0 - ratios)
     return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
+
+
+def _certainty(sight: Sight, ratios: NDArray[np.float64], options: UpdateOptions) -> float:
+    """Return how many views the usual ratios are worth: few if this recording scatters about them.
+
+    A beta variable of mean r and n views has the variance r (1 - r) / (n + 1).
+    """
+    rows = (sight.seen > 0) & (sight.expected >= _FEW_VIEWS)
+    if np.count_nonzero(rows) < _FEW_LANDMARKS:
+        return options.prior_views
+    shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
+    scatter = float(np.mean(np.square(shares - usual) / (usual * (1.0 - usual))))
+    return float(np.clip(1.0 / max(scatter, 1e-3) - 1.0, _LEAST_VIEWS, options.prior_views))
 
 
 def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np.float64]:

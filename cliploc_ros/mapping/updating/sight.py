@@ -22,7 +22,7 @@ from cliploc_ros.mapping.views import Views
 _SHOWN_SHARE = 0.6
 # A landmark as near as this share of a place's distance is beside the place, not before it.
 _BESIDE_SHARE = 0.8
-# A class with fewer boxes is taken to be seen at the sizes of all classes.
+# A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
 _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
 # Points in a box at which the kernel asks whether something hides it: a 5 x 5 grid in the ellipse.
@@ -109,6 +109,8 @@ def least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
         own = extents[whole & (views.classes == number)]
         if len(own) >= _FEW_BOXES:
             result[number] = np.quantile(own, _LEAST_QUANTILE)
+        elif len(own):
+            result[number] = max(overall, float(own.min()))
     return result
 
 

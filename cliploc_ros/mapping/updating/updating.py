@@ -145,8 +145,8 @@ def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: Posed
                      'degrees off the map as a whole; this is corrected')
     unseen = sorted({old.class_ids[row] for row in np.nonzero(known.landmarks.classes < 0)[0]})
     if unseen:
-        notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; the '
-                     'detector may not know it')
+        notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; '
+                     'landmarks of it are kept: the detector may not know it')
     last_seen = max((one.last_seen or 0.0 for one in known.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
         notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
