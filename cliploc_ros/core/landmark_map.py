@@ -4,7 +4,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -59,6 +59,16 @@ class LandmarkMap:
     def __len__(self) -> int:
         """Return the number of landmarks."""
         return len(self.landmark_ids)
+
+    def select(self, rows: Sequence[int]) -> 'LandmarkMap':
+        """Return a map of some landmarks, at least one, in the order given."""
+        chosen = list(rows)
+        ids, labels, class_ids = (tuple(column[row] for row in chosen) for column in (
+            self.landmark_ids, self.labels, self.class_ids))
+        return LandmarkMap(
+            self.frame_id, ids, labels, class_ids, self.centers[chosen],
+            self.semi_axes[chosen], self.quats_xyzw[chosen],
+            tuple(self.details[row] for row in chosen) if self.details else ())
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

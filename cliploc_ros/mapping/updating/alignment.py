@@ -131,8 +131,8 @@ def has_moved(known: Known, found: Refits, options: UpdateOptions) -> NDArray[np
     offsets = found.landmarks.centers - known.landmarks.centers
     far = found.is_known & (np.linalg.norm(offsets, axis=1) > options.least_move_m)
     rows = np.nonzero(far)[0]
-    shapes = sum(one.bases[rows] @ one.bases[rows].transpose(0, 2, 1)
-                 for one in (known.landmarks, found.landmarks))
+    bases, others = known.landmarks.bases[rows], found.landmarks.bases[rows]
+    shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
     far[rows] = ((_lengths(offsets[rows], shapes) > options.least_move_shapes)
                  & (deviations(known, found, rows) > options.least_move_sigmas))
     return far

@@ -8,7 +8,6 @@ look and size, plus a bonus for an object that is where the landmark was. A land
 stays alone if it gains nothing.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.mapping.updating.known import Known
+from cliploc_ros.mapping.updating.looks import Looks
 from cliploc_ros.mapping.updating.objects import Objects
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
@@ -34,29 +34,6 @@ _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
 _FEWEST_LOOKS = 8
 # A landmark in its place is doubted if its look fits worse than usual by so many deviations.
 _DOUBT = 1.0
-
-
-@dataclass(frozen=True)
-class Looks:
-    """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown.
-
-    Parameters
-    ----------
-    landmarks : ndarray (L, d)
-    objects : ndarray (m, d)
-    """
-
-    landmarks: NDArray[np.float32]
-    objects: NDArray[np.float32]
-
-    def similarities(self, rows: NDArray[np.int64], objects: NDArray[np.int64]
-                     ) -> NDArray[np.float64]:
-        """Return cosines (k, j) of landmarks and objects; NaN if one is unknown."""
-        first, second = self.landmarks[rows], self.objects[objects]
-        cosines = (first @ second.T).astype(np.float64)
-        cosines[~first.any(axis=1)] = np.nan
-        cosines[:, ~second.any(axis=1)] = np.nan
-        return cosines
 
 
 class Identities(NamedTuple):

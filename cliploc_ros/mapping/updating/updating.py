@@ -10,16 +10,20 @@ from numpy.typing import NDArray
 from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.evidence import group_boxes
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.updating.alignment import Alignment, align
 from cliploc_ros.mapping.updating.describing import describe
 from cliploc_ros.mapping.updating.fates import decide_fates
-from cliploc_ros.mapping.updating.identity import Looks, identify
+from cliploc_ros.mapping.updating.identity import identify
 from cliploc_ros.mapping.updating.judging import Judged, judge
 from cliploc_ros.mapping.updating.known import Known, known_landmarks
-from cliploc_ros.mapping.updating.objects import Objects, gather_objects
+from cliploc_ros.mapping.updating.looks import (
+    compare_looks,
+    renew_embeddings,
+    why_not_comparable,
+)
+from cliploc_ros.mapping.updating.objects import gather_objects
 from cliploc_ros.mapping.updating.options import UpdateOptions
 from cliploc_ros.mapping.updating.renewal import renew
 from cliploc_ros.mapping.updating.report import UpdateReport
@@ -41,6 +45,8 @@ class UpdatedMap:
         Row of the first new landmark.
     map_from_camera : ndarray (F, 4, 4)
         The poses in the coordinate frame of the map.
+    embeddings : LandmarkEmbeddings, optional
+        Image embeddings of the new map.
     """
 
     landmark_map: LandmarkMap
@@ -48,6 +54,7 @@ class UpdatedMap:
     shown: NDArray[np.int64]
     first_new: int
     map_from_camera: NDArray[np.float64]
+    embeddings: LandmarkEmbeddings | None
 
 
 def update_map(old: LandmarkMap, detections: PosedDetections,
@@ -78,12 +85,16 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     judged = judge(detections, aligned.views, known, options)
     _check_belongs(judged, options)
     objects = gather_objects(aligned.views, known, judged, options)
-    looks, look_notes = _looks(old, embeddings, detections, objects)
+    unlike = why_not_comparable(embeddings, detections)
+    looks = None if embeddings is None or unlike else compare_looks(
+        embeddings, old.landmark_ids, detections, objects.shown, len(objects.owners))
     fates = decide_fates(known, judged, objects,
                          identify(known, objects, judged.is_gone, looks), options)
     updated = renew(old, known, objects, fates, detections.class_names, options)
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
-    notes += [*look_notes, *_notes(old, known, aligned, detections, options)]
+    if unlike:
+        notes.append(f'looks are not compared: {unlike}')
+    notes += _notes(old, known, aligned, detections, options)
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints[-1]) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
@@ -94,8 +105,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
-    return UpdatedMap(updated, report, rows_of[objects.shown], len(kept),
-                      map_from_cameras(aligned.views))
+    shown = rows_of[objects.shown]
+    return UpdatedMap(updated, report, shown, len(kept), map_from_cameras(aligned.views),
+                      renew_embeddings(embeddings, updated.landmark_ids, detections, shown))
 
 
 def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
@@ -114,26 +126,6 @@ def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
         f'the recording does not belong to this map: {there} landmarks are where the map says, '
         f'{gone} are not, {len(judged.is_gone) - there - gone} were not in view; check the map, '
         'the coordinate frame of the poses, and the detector, or build a new map')
-
-
-def _looks(old: LandmarkMap, embeddings: LandmarkEmbeddings | None, detections: PosedDetections,
-           objects: Objects) -> tuple[Looks | None, list[str]]:
-    """Return how old landmarks and objects look, if one encoder saw both; and notes."""
-    crops = detections.embeddings
-    if embeddings is None or crops is None:
-        return None, ['looks are not compared: ' + (
-            'the map has no image embeddings' if embeddings is None
-            else 'the recording has no embeddings; let CLIP look at it')]
-    if embeddings.encoder_key != detections.encoder_key or \
-            embeddings.means.shape[1] != crops.shape[1]:
-        return None, [f"looks are not compared: the map's encoder is {embeddings.encoder_key}, "
-                      f"the recording's {detections.encoder_key}"]
-    means = np.zeros((len(objects.owners), crops.shape[1]), dtype=np.float32)
-    for number, rows in enumerate(group_boxes(objects.shown, len(means))):
-        if len(rows):
-            mean = crops[rows].astype(np.float32).mean(axis=0)
-            means[number] = mean / max(float(np.linalg.norm(mean)), 1e-6)
-    return Looks(embeddings.in_order(old.landmark_ids).means.astype(np.float32), means), []
 
 
 def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections,
