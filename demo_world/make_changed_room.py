@@ -96,7 +96,7 @@ def make_changed_room(folder: Path, images: int, seed: int, free_places: bool = 
     (folder / 'changes.json').write_text(json.dumps(changes, indent=1))
     for name, room, light, poses in (
             ('before', before, _LIGHT_BEFORE, round_walk(images, 0.0, 1.45)),
-            ('after', after, _LIGHT_AFTER, round_walk(images, 0.9, 1.3))):
+            ('after', after, _LIGHT_AFTER, round_walk(images, 0.7, 1.3))):
         with tqdm(total=images, desc=name, unit='image') as bar:
             record(folder / name, room, Renderer(room, CAMERA, light), poses, seed=seed + 5,
                    rate_hz=2.0, advance=bar.update)

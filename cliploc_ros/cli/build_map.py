@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cliploc_ros.cli.map_labels import Labeller, add_label_options, prepare_labels
-from cliploc_ros.cli.map_update import OldMap, read_old_map, update_old_map
+from cliploc_ros.cli.map_update import OldMap, read_old_map, update_old_map, with_usual_noise
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
@@ -66,7 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise is given)')
+                       '--pose-noise or --update is given)')
     poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
@@ -129,7 +129,10 @@ def _build(options: argparse.Namespace, detections: 'PosedDetections', labeller:
 
 def _update(options: argparse.Namespace, old: OldMap, detections: 'PosedDetections',
             labeller: Labeller) -> _Made:
-    updated = update_old_map(old, detections, _mapping_options(options), labeller)
+    mapping = _mapping_options(options)
+    if mapping.pose_errors is None and options.joint is None:
+        mapping = with_usual_noise(mapping)
+    updated = update_old_map(old, detections, mapping, labeller)
     head = [f'{options.update.name}, updated by build_map from {source_of(options).name}',
             updated.report.lines()[0]]
     return _Made(updated.landmark_map, updated.embeddings, head, updated.report)

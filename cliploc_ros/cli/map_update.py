@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from cliploc_ros.mapping.updating.updating import UpdatedMap
 
 
+# Standard deviations of poses that a localizer gives [m] [deg]. Guesses; the map holds on to exact
+# ones all the same.
+_USUAL_NOISE = (0.05, 1.0)
+
+
 @dataclass(frozen=True)
 class OldMap:
     """A map to update, and the image embeddings next to it."""
@@ -38,6 +43,13 @@ def read_old_map(path: Path) -> OldMap:
 
     landmark_map = LandmarkMap.from_file(path)
     return OldMap(landmark_map, load_embeddings_of_map(path, landmark_map.landmark_ids))
+
+
+def with_usual_noise(mapping: 'MappingOptions') -> 'MappingOptions':
+    """Return options with which poses are refined against the old map."""
+    from cliploc_ros.mapping.options import PoseErrors
+
+    return replace(mapping, pose_errors=PoseErrors(*_USUAL_NOISE))
 
 
 def update_old_map(old: OldMap, detections: 'PosedDetections', mapping: 'MappingOptions',

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import join_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.updating.alignment import has_moved
@@ -20,6 +21,7 @@ from cliploc_ros.mapping.views import Views
 
 # New objects hide old places, and objects that are gone no longer do.
 _ROUNDS = 2
+_NEAR_IOU = 0.02
 
 
 class Judged(NamedTuple):
@@ -65,19 +67,26 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Upda
     displaced = has_moved(known, refits, options)
     sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_), options)
     is_gone = displaced | _is_absent(known, sight, options)
-    finds = find_new(detections, views, _held(shown, is_gone) < 0, mapping)
+    # a box that is only near a landmark is no proof of it, and none of a new object
+    is_near = _held(find_known(views, known, _NEAR_IOU), is_gone) >= 0
+    finds = find_new(detections, views, ~is_near & (_held(shown, is_gone) < 0), mapping)
     finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
     finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), ~is_gone,
                            mapping)
     _, sight = _look(views, known, finds, shown, is_gone, options)
-    finds = finds.select(np.nonzero(sight.seen_ratio[count:] >= options.min_new_ratio)[0])
+    usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    often = sight.seen_ratio[count:] >= options.min_new_share * (np.median(usual) if len(usual)
+                                                                 else 1.0)
+    finds = finds.select(np.nonzero(often)[0])
     both = shown
     for _ in range(_ROUNDS):
         both, sight = _look(views, known, finds, shown, is_gone, options)
         is_gone = displaced | _is_absent(known, sight.select(slice(count)), options)
     own_sight = sight.select(slice(count))
     there = probability_there(own_sight, usual_ratios(known, own_sight, options), options)
-    is_there = ~is_gone & (own_sight.seen > 0) & (refits.is_known | (there > options.there_above))
+    fits = gather_evidence(views, refits.landmarks, _held(shown, is_gone)).median_iou
+    is_there = (~is_gone & (fits >= mapping.min_median_iou)
+                & (refits.is_known | (there > options.there_above)))
     return Judged(both, refits, finds, sight, is_gone, is_there)
 
 
@@ -101,7 +110,7 @@ def _is_absent(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np
 
     A detector that never found a class in this recording may not know it, or not at these sizes.
     """
-    is_told = known.landmarks.classes >= 0
+    is_told = (known.landmarks.classes >= 0) & (sight.expected >= options.least_views)
     there = probability_there(sight, usual_ratios(known, sight, options), options)
     return np.asarray(is_told & (there < options.gone_below))
 

@@ -34,13 +34,15 @@ class UpdateOptions:
         Share of the views in which a wrong box appears in an empty place.
     gone_below, there_above : float
         An object is gone, or there, if the probability of being there is so small, or large.
+    least_views : int
+        A place must be in view from so many viewpoints before its object can be missing.
     beside_deg : float
         A place is in view if the frame shows another landmark this close to its direction, and
         not nearer: otherwise a wall may hide it.
     hidden_share : float
         A place of which landmarks or boxes hide so much is not in view.
-    min_new_ratio : float
-        Share of the views in which a new landmark must be detected.
+    min_new_share : float
+        A new landmark must be detected so often, in units of how often the old ones are.
     min_confirmed : int
     min_confirmed_share : float
         A recording that confirms fewer landmarks, or a smaller share of those whose place it
@@ -60,8 +62,9 @@ class UpdateOptions:
     chance_ratio: float = 0.03
     gone_below: float = 0.05
     there_above: float = 0.95
+    least_views: int = 5
     beside_deg: float = 20.0
     hidden_share: float = 0.4
-    min_new_ratio: float = 0.1
+    min_new_share: float = 0.4
     min_confirmed: int = 3
     min_confirmed_share: float = 0.3

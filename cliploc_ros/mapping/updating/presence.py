@@ -17,11 +17,12 @@ from cliploc_ros.mapping.updating.known import Known
 from cliploc_ros.mapping.updating.options import UpdateOptions
 from cliploc_ros.mapping.updating.sight import Sight
 
-# A recording in which objects are seen more rarely than before lowers all ratios, by at most this.
-_LEAST_FACTOR = 0.3
+# A recording in which objects are seen more rarely or more often than before changes all ratios.
+_FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
 # Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
 # that a usual ratio is worth [views]. Guesses.
+_MEDIAN_SQUARE = 0.455  # of a standard normal variable
 _FEW_LANDMARKS, _FEW_VIEWS, _LEAST_VIEWS = 5, 3, 0.5
 
 
@@ -56,15 +57,16 @@ def _certainty(sight: Sight, ratios: NDArray[np.float64], options: UpdateOptions
     if np.count_nonzero(rows) < _FEW_LANDMARKS:
         return options.prior_views
     shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-    scatter = float(np.mean(np.square(shares - usual) / (usual * (1.0 - usual))))
-    return float(np.clip(1.0 / max(scatter, 1e-3) - 1.0, _LEAST_VIEWS, options.prior_views))
+    # the median, since objects that are gone are no scatter
+    scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
+    return float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_VIEWS, options.prior_views))
 
 
 def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np.float64]:
     """Return the share of views (L,) in which this recording should show each old landmark.
 
-    It is the share of the old recording, lowered where the new one shows all objects more
-    rarely; without an old one, the share of the landmarks seen in this recording.
+    It is the share of the old recording, times how much more often the new one shows all objects;
+    without an old one, the share of the landmarks seen in this recording.
     """
     seen = sight.seen > 0
     overall = min(options.seen_ratio, _share(sight, seen))
@@ -74,7 +76,7 @@ def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[
     told = seen & ~np.isnan(given)
     if told.any():
         expected = float((given[told] * sight.expected[told]).sum())
-        factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), _LEAST_FACTOR, 1.0)
+        factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
     return np.clip(ratios, *_RATIO_RANGE)
 

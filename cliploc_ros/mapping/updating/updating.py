@@ -118,14 +118,15 @@ def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
     MappingError
         Names the numbers.
     """
-    there, gone = int(judged.is_there.sum()), int(judged.is_gone.sum())
-    if there >= min(options.min_confirmed, len(judged.is_gone)) and \
-            there >= options.min_confirmed_share * (there + gone):
+    count, there = len(judged.is_there), int(judged.is_there.sum())
+    in_view = int((judged.is_there | (judged.sight.expected[:count] >= options.least_views)).sum())
+    if there >= min(options.min_confirmed, count) and \
+            there >= options.min_confirmed_share * in_view:
         return
     raise MappingError(
-        f'the recording does not belong to this map: {there} landmarks are where the map says, '
-        f'{gone} are not, {len(judged.is_gone) - there - gone} were not in view; check the map, '
-        'the coordinate frame of the poses, and the detector, or build a new map')
+        f'the recording does not belong to this map: of {in_view} landmarks in view, {there} are '
+        'where the map says; check the map, the coordinate frame of the poses and the detector, '
+        'give --pose-noise if the poses have errors, or build a new map')
 
 
 def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections,
