@@ -10,6 +10,10 @@ from typing import Any
 from cliploc_ros.errors import MapError
 
 
+#: A detection of a class with a smaller share of a landmark's boxes is no candidate of it. A guess.
+LEAST_CLASS_SHARE = 0.1
+
+
 @dataclass(frozen=True)
 class LandmarkDetails:
     """Optional fields of one landmark. Each is None where the map has none.
@@ -42,6 +46,12 @@ class LandmarkDetails:
     baseline_deg: float | None = None
     last_seen: float | None = None
     source: str | None = None
+
+    def likely_classes(self) -> tuple[str, ...]:
+        """Return the classes whose share is great enough for a correspondence candidate."""
+        weights = dict(self.class_weights or ())
+        least = LEAST_CLASS_SHARE * sum(weights.values())
+        return tuple(name for name, weight in weights.items() if weight >= least)
 
 
 OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))

@@ -71,13 +71,15 @@ class LandmarkMap:
 
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return the landmarks by class."""
-        return ClassIndex.of(self.class_ids)
+        """Return the landmarks by class: by their own, and by others that they are taken for."""
+        others = [(row, name) for row, one in enumerate(self.details)
+                  for name in one.likely_classes() if name != self.class_ids[row]]
+        return ClassIndex.of(self.class_ids, others)
 
     @cached_property
     def sorted_landmarks(self) -> SortedLandmarks:
         """Return the landmarks sorted by place."""
-        return sort_landmarks(self.centers, self.shapes, self.classes.of_landmarks)
+        return sort_landmarks(self.centers, self.shapes, self.classes.members)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':
