@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
-from cliploc_ros.core.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
+from cliploc_ros.core.landmark_details import (
+    OPTIONAL_FIELDS,
+    LandmarkDetails,
+    WeightedLabels,
+    read_details,
+)
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
@@ -68,6 +73,14 @@ class LandmarkMap:
     def shapes(self) -> NDArray[np.float64]:
         """Return the shape matrices (L, 6), see cliploc_ros.core.geometry.ellipsoid."""
         return shape_matrices(self.semi_axes, self.quats_xyzw)
+
+    @property
+    def weighted_labels(self) -> tuple[WeightedLabels, ...]:
+        """Return all labels that describe each landmark, with their weights."""
+        if not self.details:
+            return tuple(((label, 1.0),) for label in self.labels)
+        return tuple(one.labels_with(label)
+                     for one, label in zip(self.details, self.labels, strict=True))
 
     @cached_property
     def classes(self) -> ClassIndex:
