@@ -41,13 +41,20 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
     rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
     for start in range(0, len(labels), PART):
         part = slice(start, start + PART)
-        embeddings = encode(labels[part])
-        for block in _blocks(len(rows)):
-            rows[block] += weights[block, part] @ embeddings
+        # passed on, not kept: the next part is encoded after this one is freed
+        rows = _plus(rows, weights[:, part], encode(labels[part]))
     is_mixed = np.diff(weights.indptr) > 1
     for block in _blocks(len(rows)):
         lengths = np.sqrt(np.einsum('ij,ij->i', rows[block], rows[block]))
         rows[block] /= np.where(is_mixed[block], np.maximum(lengths, 1e-12), 1.0)[:, None]
+    return rows
+
+
+def _plus(rows: NDArray[np.float32], weights: csr_matrix, embeddings: NDArray[np.float32]
+          ) -> NDArray[np.float32]:
+    """Return rows with the weighted sums of some embeddings added, in the same memory."""
+    for block in _blocks(len(rows)):
+        rows[block] += weights[block] @ embeddings
     return rows
 
 
