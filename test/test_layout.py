@@ -32,7 +32,7 @@ LAYERS = (
     ('core',),
     ('mapping',),
     ('messages', 'command', 'parallel'),
-    ('models', 'datasets'),
+    ('models', 'datasets', 'vocabulary'),
     ('recording',),
     ('evaluation',),
     ('benchmark',),

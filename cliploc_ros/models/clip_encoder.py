@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from cliploc_ros.core.index.similarities import LabelEmbeddings
 from cliploc_ros.core.landmark_details import WeightedLabels
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
+from cliploc_ros.models.clip_towers import (
+    cut_padding,
+    load_image_tower,
+    load_text_tower,
+    quiet_root_logger,
+)
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory, resolve_device, resolve_precision
 from cliploc_ros.models.files import resolve_cache_dir
@@ -229,11 +234,10 @@ def _run_text_tower(
     with quiet_root_logger():
         tokenizer = open_clip.get_tokenizer(weights.model)
     _warn_of_long_labels(tokenizer, labels)
-    model = load_text_tower(weights, device)
+    model, tokens = cut_padding(load_text_tower(weights, device), tokenizer(list(labels)))
     with torch.inference_mode():
-        batches = [tokenizer(list(labels[start:start + _LABEL_BATCH])).to(device)
-                   for start in range(0, len(labels), _LABEL_BATCH)]
-        return [_normalize(model.encode_text(batch, normalize=False)) for batch in batches]
+        return [_normalize(model.encode_text(batch.to(device), normalize=False))
+                for batch in tokens.split(_LABEL_BATCH)]
 
 
 def _warn_of_long_labels(tokenizer: Any, labels: Sequence[str]) -> None:
