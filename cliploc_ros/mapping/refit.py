@@ -217,10 +217,11 @@ def _reasons(views: Views, settled: _Settled, evidence: Evidence, chosen: NDArra
             other = landmark_map.landmark_ids[settled.part_of[row]]
             reasons[row] = f"is one object with '{other}'"
         elif settled.landmarks.classes[row] < 0:
-            reasons[row] = f"the recording has no boxes of the class '{landmark_map.class_ids[row]}'"
+            name = landmark_map.class_ids[row]
+            reasons[row] = f"the recording has no boxes of its class, '{name}'"
         elif evidence.support[row] == 0:
-            reasons[row] = _why_unseen(views, settled.landmarks, row)
-    return [reason if is_chosen else None for reason, is_chosen in zip(reasons, chosen, strict=True)]
+            reasons[row] = _why_unseen(views, settled.landmarks, int(row))
+    return [reason if chosen[row] else None for row, reason in enumerate(reasons)]
 
 
 def _why_unseen(views: Views, landmarks: Landmarks, row: int) -> str:
