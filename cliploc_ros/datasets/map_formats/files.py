@@ -27,6 +27,6 @@ def read_bytes(path: Path) -> bytes:
         raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
     if len(content) > MAX_FILE_BYTES:
         raise DatasetError(f'{path}: is larger than {MAX_FILE_BYTES // 2**20} MiB; split it')
-    if not content.strip():
+    if not content:
         raise DatasetError(f'{path}: is empty')
     return content

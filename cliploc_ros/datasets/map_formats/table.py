@@ -46,7 +46,7 @@ def read_table(path: Path) -> GivenMap:
     given = GivenMap([], [], [])
     lines: dict[str, int] = {}
     try:
-        header = _read_header(next(reader), path)
+        header = _read_header(next(reader, []), path)
         if ignored := [name for name in header if name not in COLUMNS]:
             given.notes.append(f'ignored columns: {", ".join(ignored)[:200]}')
         for cells in reader:
