@@ -190,9 +190,6 @@ def _refit(imported: 'ImportedMap', options: argparse.Namespace) -> _Result:
             kept.append(row)
         else:
             left_out.append(LeftOut(imported.landmark_map.landmark_ids[row], reason))
-    if not kept:
-        raise MappingError(f'{options.refit}: no landmark can be fitted; the first one: '
-                           f'{left_out[-len(refit.reasons)].reason}')
     return _Result(refit.landmark_map.select(kept), tuple(left_out),
                    tuple(_refit_lines(imported, refit, options.refit)))
 

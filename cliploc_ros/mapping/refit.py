@@ -115,12 +115,16 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     evidence = gather_evidence(views, settled.landmarks, shown)
     reasons = _reasons(views, settled, evidence, chosen, landmark_map, options)
     is_fitted = np.array([reason is None for reason in reasons]) & chosen
+    before = _explained(views, given, known)
+    if not (is_fitted | ~chosen).any():
+        raise MappingError(
+            f'no landmark can be fitted, the first one because: {reasons[0]}; as given, the map '
+            f'explains {before[0]:.0%} of the boxes: is it in their coordinate frame?')
     # boxes of what is not fitted may belong to what is
     landmarks = _replace_rows(given, settled.landmarks, is_fitted)
     shown = _associate_some(views, landmarks, is_fitted | ~chosen, options.association_iou)
     landmarks = _fit(views, landmarks, shown, is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
-    before = _explained(views, given, known)
     after = _explained(views, landmarks.select(is_fitted | ~chosen), known)
     _check_coordinate_frame(before[0], after[0])
     return RefitMap(_make_map(landmark_map, landmarks, evidence, is_fitted), tuple(reasons),
@@ -141,11 +145,11 @@ def _check_classes(detections: PosedDetections, landmark_map: LandmarkMap, given
 
 def _check_coordinate_frame(before: float, after: float) -> None:
     """Refuse a map that did not lie where the boxes are: it is fitted to other objects."""
-    if after == 0.0 or before < _LEAST_EXPLAINED * after:
+    if before < _LEAST_EXPLAINED * after:
         raise MappingError(
-            f'the map does not lie where the boxes are: it explains {before:.0%} of them as given, '
-            f"and {after:.0%} after fitting; bring it into the recording's coordinate frame and to "
-            'metres first')
+            f'the map does not lie where the boxes are: it explains {before:.0%} of them as '
+            f"given, and {after:.0%} after fitting; bring it into the recording's coordinate "
+            'frame and to metres first')
 
 
 def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: MappingOptions

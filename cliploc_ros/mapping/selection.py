@@ -29,8 +29,7 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
     if baseline < options.min_baseline_deg:
         return f'seen from one side only: {baseline:.0f} degrees, not ' \
                f'{options.min_baseline_deg:.0f}'
-    # a covariance that is not positive definite has no deviation: NaN
-    if not sigma <= max(options.max_position_sigma_m, options.max_position_sigma_share * size_m):
+    if sigma > max(options.max_position_sigma_m, options.max_position_sigma_share * size_m):
         return f'its position is uncertain: {sigma:.2f} m'
     if evidence.median_iou[number] < options.min_median_iou:
         return f'its boxes do not fit one ellipsoid: median IoU {evidence.median_iou[number]:.2f}'

@@ -116,7 +116,10 @@ def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
 
 def test_one_side_is_not_enough(table):
     detections = see(table, walk_around(frames=12, turn_deg=12.0))
-    chosen = np.arange(len(table)) < 8  # one stays, and explains boxes
+    with pytest.raises(MappingError, match=r'no landmark can be fitted, the first one because: '
+                                           r'seen from one side only: .* explains 100% of the'):
+        refit_map(detections, table)
+    chosen = np.arange(len(table)) < 8
     refit = refit_map(detections, table, chosen)
     assert refit.reasons[8] is None
     assert all(reason.startswith('seen from one side only') for reason in refit.reasons[:8])
@@ -130,7 +133,7 @@ def test_a_map_in_another_coordinate_frame_is_refused(table, detections, turn_de
         table, centers=turn.apply(table.centers * scale) + np.array([shift_m, 0.0, 0.0]),
         semi_axes=table.semi_axes * scale,
         quats_xyzw=(turn * Rotation.from_quat(table.quats_xyzw)).as_quat())
-    with pytest.raises(MappingError, match='the map does not lie where the boxes are: it expl'):
+    with pytest.raises(MappingError, match=r'where the boxes are: it expl|coordinate frame\?$'):
         refit_map(detections, elsewhere)
 
 
