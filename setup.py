@@ -55,6 +55,7 @@ setup(
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
+            f'import_map = {PACKAGE}.cli.import_map:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',

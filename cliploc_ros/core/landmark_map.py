@@ -4,7 +4,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -64,6 +64,16 @@ class LandmarkMap:
     def __len__(self) -> int:
         """Return the number of landmarks."""
         return len(self.landmark_ids)
+
+    def select(self, rows: Sequence[int]) -> 'LandmarkMap':
+        """Return the map of some of the landmarks, at least one, in the order given."""
+        def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(values[row] for row in rows)
+
+        return LandmarkMap(
+            self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
+            self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
+            pick(self.details) if self.details else ())
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

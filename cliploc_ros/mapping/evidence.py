@@ -91,11 +91,12 @@ def _evidence_of(views: Views, center: NDArray[np.float64], basis: NDArray[np.fl
     distances = np.linalg.norm(offsets, axis=1)
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-    covariance = np.linalg.inv(information)[:3, :3]
+    # of an ellipsoid that no box restrains, the information is not positive definite
+    variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
     return (len(rows), len(np.unique(views.viewpoints[frames])),
             count_expected(views, center, basis, _REACH * distances.max()),
             widest_angle_deg(offsets / distances[:, None]),
-            float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+            float(np.sqrt(variance)) if variance > 0.0 else np.inf,
             float(np.median(ious_with(views, rows, center, basis))),
             float(views.stamps_s[frames].max()))
 
