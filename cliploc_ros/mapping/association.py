@@ -14,7 +14,7 @@ from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import box_iou, project_box
 from cliploc_ros.mapping.views import Views
 
-_GROUP_SIZE = 16
+_GROUP_SIZE = 8
 # Rounding must not hide a landmark [m].
 _SLACK = 1e-6
 
@@ -47,7 +47,7 @@ class _Groups(NamedTuple):
     """Near landmarks of one class with a sphere about them, so that most need no projection.
 
     Class k has the groups from starts[k] up to starts[k + 1], group g the landmarks
-    members[offsets[g]:offsets[g + 1]].
+    members[offsets[g]:offsets[g + 1]]. Landmark l lies within sizes[l] of its centre.
     """
 
     starts: NDArray[np.int64]
@@ -55,6 +55,7 @@ class _Groups(NamedTuple):
     members: NDArray[np.int64]
     centers: NDArray[np.float64]
     radii: NDArray[np.float64]
+    sizes: NDArray[np.float64]
 
 
 def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
@@ -66,13 +67,14 @@ def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
     starts = np.concatenate([[0], np.cumsum(-(-np.diff(first) // _GROUP_SIZE))])
     group_of = starts[own] + (np.arange(len(own)) - first[own]) // _GROUP_SIZE
     offsets = np.searchsorted(group_of, np.arange(starts[-1] + 1))
+    sizes = np.linalg.norm(landmarks.bases, axis=(1, 2))  # never below a semi-axis
     if len(members) == 0:
-        return _Groups(starts, offsets, members, np.empty((0, 3)), np.empty(0))
+        return _Groups(starts, offsets, members, np.empty((0, 3)), np.empty(0), sizes)
     points = landmarks.centers[members]
-    sizes = np.linalg.norm(landmarks.bases[members], axis=(1, 2))  # never below a semi-axis
     centers = np.add.reduceat(points, offsets[:-1]) / np.diff(offsets)[:, None]
-    reaches = np.linalg.norm(points - centers[group_of], axis=1) + sizes
-    return _Groups(starts, offsets, members, centers, np.maximum.reduceat(reaches, offsets[:-1]))
+    reaches = np.linalg.norm(points - centers[group_of], axis=1) + sizes[members]
+    return _Groups(starts, offsets, members, centers,
+                   np.maximum.reduceat(reaches, offsets[:-1]), sizes)
 
 
 def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -102,6 +104,8 @@ def _overlaps(views, centers, bases, groups, min_iou):
             if not _may_show(views, row, groups.centers[group], groups.radii[group]):
                 continue
             for landmark in groups.members[groups.offsets[group]:groups.offsets[group + 1]]:
+                if not _may_show(views, row, centers[landmark], groups.sizes[landmark]):
+                    continue
                 if projected_in[landmark] != frame:
                     projected_in[landmark] = frame
                     visible[landmark] = project_box(

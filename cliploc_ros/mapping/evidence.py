@@ -93,13 +93,24 @@ def _evidence_of(views: Views, cameras: NDArray[np.float64], center: NDArray[np.
     distances = np.linalg.norm(offsets, axis=1)
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-    covariance = np.linalg.inv(information)[:3, :3]
     return (len(rows), len(np.unique(views.viewpoints[frames])),
             count_expected(views, cameras, center, basis, _REACH * distances.max()),
             widest_angle_deg(offsets / distances[:, None]),
-            float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+            _position_sigma(information),
             float(np.median(ious_with(views, rows, center, basis))),
             float(views.stamps_s[frames].max()))
+
+
+def _position_sigma(information: NDArray[np.float64]) -> float:
+    """Return the deviation [m] of a centre on its worst axis; inf where its boxes leave it open.
+
+    A box that the image cuts on all sides tells nothing about the centre.
+    """
+    try:
+        covariance = np.linalg.inv(information)[:3, :3]
+        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    except np.linalg.LinAlgError:
+        return np.inf
 
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
