@@ -89,7 +89,7 @@ def make_floor(objects: int, seed: int = 0) -> Floor:
     """Return a floor with some number of objects, which grows with it in rooms."""
     rng = np.random.default_rng(seed)
     rooms = -(-objects // (_IN_ROOM + _IN_CORRIDOR))
-    pitch = _ROOM_M + [0.2, _CORRIDOR_M]
+    pitch = _ROOM_M + np.array([0.2, _CORRIDOR_M])
     room_centers = np.array([_grid_place(room) for room in range(rooms)]) * pitch
     places = np.repeat(np.arange(2 * rooms), np.tile([_IN_ROOM, _IN_CORRIDOR], rooms))[:objects]
     typical = np.array([_CLASSES[name] for name in CLASS_NAMES])

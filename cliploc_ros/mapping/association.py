@@ -36,7 +36,7 @@ class Overlaps(NamedTuple):
 
 def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
     """Return the pairs of equal class that overlap more than min_iou."""
-    classes = max(views.classes.max(initial=0), landmarks.classes.max(initial=0)) + 1
+    classes = int(max(views.classes.max(initial=0), landmarks.classes.max(initial=0))) + 1
     boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases,
                                      _make_groups(landmarks, classes), min_iou)
     order = np.lexsort((numbers, boxes))
