@@ -14,17 +14,10 @@ import multiprocessing
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -42,7 +35,7 @@ _TASKS_A_WORKER = 2
 _MOST_DEATHS_IN_A_ROW = 3
 # A cluster that lost all its workers starts new ones in this time, or never.
 _CHECK_S, _RESTART_S = 5.0, 60.0
-_CONNECT_S = 10
+_CONNECT_S = 5
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -106,8 +99,7 @@ def _on_processes(make_work: MakeWork, tasks: Iterator[Any], workers: int
         alone = bool(suspects)
         source = iter(suspects) if alone else tasks
         with _local_pool(make_work, 1 if alone else workers) as pool:
-            stream = _Stream(lambda task: pool.submit(_do, task), source,
-                             1 if alone else _TASKS_A_WORKER * workers)
+            stream = _Stream(_LocalPool(pool), source, 1 if alone else _TASKS_A_WORKER * workers)
             try:
                 for finished in stream:
                     deaths = 0
@@ -133,31 +125,35 @@ def _given_up(task: Any) -> tuple[Any, Any]:
     return task, None
 
 
+class _Workers(Protocol):
+    """What tasks are handed to."""
+
+    #: Exceptions of a task that say that its workers died.
+    deaths: tuple[type[Exception], ...]
+
+    def submit(self, task: Any) -> Any:
+        """Hand over a task; return its future."""
+
+    def wait(self, futures: list[Any]) -> Collection[Any]:
+        """Return those of some futures that are done, as soon as there are any."""
+
+
 class _Stream:
-    """Tasks on their way through workers.
+    """Tasks on their way through workers, so many of them at once.
 
     Parameters
     ----------
-    submit : callable
-        Hands a task to the workers.
+    workers : _Workers
     tasks : iterator
     most : int
-        So many tasks are with the workers at once.
-    deaths : tuple of type
-        Exceptions that say that workers died while they had a task.
-    check : callable, optional
-        Called while no task ends; raises when none will.
     """
 
-    def __init__(self, submit: Callable[[Any], Future[Any]], tasks: Iterator[Any], most: int,
-                 deaths: tuple[type[Exception], ...] = (),
-                 check: Callable[[], object] = lambda: None) -> None:
-        self._submit, self._tasks, self._most = submit, tasks, most
-        self._deaths, self._check = deaths, check
+    def __init__(self, workers: _Workers, tasks: Iterator[Any], most: int) -> None:
+        self._workers, self._tasks, self._most = workers, tasks, most
+        self._in_flight: dict[Any, Any] = {}
+        self._next: list[Any] = []
         #: Tasks whose workers died.
         self.lost: list[Any] = []
-        self._in_flight: dict[Future[Any], Any] = {}
-        self._next: list[Any] = []
 
     @property
     def unfinished(self) -> list[Any]:
@@ -170,18 +166,16 @@ class _Stream:
             room = self._most - len(self._in_flight)
             self._next = list(islice(self._tasks, room))
             while self._next:
-                future = self._submit(self._next[0])
+                future = self._workers.submit(self._next[0])
                 self._in_flight[future] = self._next.pop(0)
             if not self._in_flight:
                 return
-            done, _ = wait(self._in_flight, timeout=_CHECK_S, return_when=FIRST_COMPLETED)
-            if not done:
-                self._check()
-            for future in done:
-                if isinstance(future.exception(), self._deaths):
+            for future in self._workers.wait([*self._in_flight]):
+                try:
+                    result = future.result()
+                except self._workers.deaths:
                     self.lost.append(self._in_flight.pop(future))
                 else:
-                    result = future.result()  # raises before the task is forgotten
                     yield self._in_flight.pop(future), result
 
 
@@ -222,6 +216,19 @@ def _local_pool(make_work: MakeWork, workers: int) -> Iterator[ProcessPoolExecut
         pool.shutdown(cancel_futures=True)
 
 
+class _LocalPool:
+    deaths: tuple[type[Exception], ...] = ()  # the death of one breaks the pool
+
+    def __init__(self, pool: ProcessPoolExecutor) -> None:
+        self._pool = pool
+
+    def submit(self, task: Any) -> Any:
+        return self._pool.submit(_do, task)
+
+    def wait(self, futures: list[Any]) -> Collection[Any]:
+        return wait(futures, return_when=FIRST_COMPLETED).done
+
+
 _work: _Work
 
 
@@ -248,24 +255,53 @@ def _on_dask(make_work: MakeWork, tasks: Iterator[Any], address: str
         raise OptionsError('--scheduler needs Dask: pip install distributed') from error
     with _connect(address) as client:
         _check_package(client, address)
-        # a task of its own: what makes the work reaches each worker once, and Dask makes it again
-        # if the workers that hold it die
-        work = client.submit(_Work, make_work, pure=False)
-        executor = client.get_executor(pure=False)
+        cluster = _Cluster(client, address, make_work, (KilledWorker,))
         threads = sum(client.nthreads().values())
-        stream = partial(_Stream, lambda task: executor.submit(_call, work, task),
-                         deaths=(KilledWorker,), check=_Watch(client, address).look)
         try:
-            together = stream(tasks, _TASKS_A_WORKER * threads)
+            together = _Stream(cluster, tasks, _TASKS_A_WORKER * threads)
             yield from together
             # Dask itself runs again what a dead worker had. After some deaths it blames all the
             # tasks that waited there, not only the one that killed.
-            alone = stream(iter(together.lost), 1)
+            alone = _Stream(cluster, iter(together.lost), 1)
             yield from alone
         except CancelledError as error:
             raise WorkersError(f'the Dask scheduler at {address} is gone; start it and run again '
                                'to go on') from error
-        yield from map(_given_up, alone.lost)
+    yield from map(_given_up, alone.lost)
+
+
+class _Cluster:
+    # Client.get_executor loses results of workers that die right after a task.
+
+    def __init__(self, client: 'Client', address: str, make_work: MakeWork,
+                 deaths: tuple[type[Exception], ...]) -> None:
+        self.deaths = deaths
+        self._client, self._address = client, address
+        # a task of its own: what makes the work reaches each worker once, and Dask makes it again
+        # if the workers that hold it die
+        self._work = client.submit(_Work, make_work, pure=False)
+        self._last_seen = time.monotonic()
+
+    def submit(self, task: Any) -> Any:
+        return self._client.submit(_call, self._work, task, pure=False)
+
+    def wait(self, futures: list[Any]) -> Collection[Any]:
+        from distributed import TimeoutError as NoneYet
+        from distributed import wait
+
+        while True:
+            try:
+                with self._client.as_current():
+                    return wait(futures, timeout=_CHECK_S, return_when='FIRST_COMPLETED').done
+            except NoneYet:
+                self._look_for_workers()
+
+    def _look_for_workers(self) -> None:
+        if self._client.nthreads():
+            self._last_seen = time.monotonic()
+        elif time.monotonic() - self._last_seen > _RESTART_S:
+            raise WorkersError(f'all workers of the Dask scheduler at {self._address} are gone; '
+                               'start some and run again to go on')
 
 
 def _call(work: _Work, task: Any) -> Any:
@@ -289,22 +325,6 @@ def _connect(address: str) -> Iterator['Client']:
             raise WorkersError(f'the Dask scheduler at {address} has no workers; start some with '
                                f'"dask worker {address}"') from error
         yield client
-
-
-class _Watch:
-    """Sees that a cluster has lost all its workers for good."""
-
-    def __init__(self, client: 'Client', address: str) -> None:
-        self._client, self._address = client, address
-        self._last_seen = time.monotonic()
-
-    def look(self) -> None:
-        """Raise WorkersError where there have been no workers for a while."""
-        if self._client.nthreads():
-            self._last_seen = time.monotonic()
-        elif time.monotonic() - self._last_seen > _RESTART_S:
-            raise WorkersError(f'all workers of the Dask scheduler at {self._address} are gone; '
-                               'start some and run again to go on')
 
 
 def _check_package(client: 'Client', address: str) -> None:
