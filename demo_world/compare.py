@@ -110,7 +110,7 @@ def run(arguments: list[str]) -> int:
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
     Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
-            workers=options.workers).compare(
+               options.workers).compare(
         parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
         frames=queries.frames)
     return 0
