@@ -45,13 +45,14 @@ def run_map_demo(options: DemoOptions) -> None:
                         'a hybrid_ or clip_ method')
     prepare(options)
     walk = options.assets / 'mapping'
-    if not (walk / 'truth.json').is_file():
-        raise DemoError(f'{walk / "truth.json"} is missing: run script/setup again, or choose '
-                        'another folder with --assets')
+    if not walk.is_dir():
+        raise DemoError(f'{walk} is missing: run script/setup again, or choose another folder '
+                        'with --assets')
+    objects = read_objects(walk)
     built = _build(options, walk)
     built_map = LandmarkMap.from_file(built.map_file)
     review = review_map(
-        built_map, read_objects(walk),
+        built_map, objects,
         count_sightings(tuple(read_frames(walk)), built.recorded.detections),
         built.report['left_out'])
     print('\n'.join(map_page.console_lines(review)), flush=True)

@@ -21,6 +21,7 @@ _MARGIN_M = 0.35
 _MISSED = '#E69F00'
 _TRUTH = '#222222'
 _HEADING_M = 0.2
+_NAME_OFFSET_M = 0.2
 # Axes of the map across and up in each panel, and where these meet in a symmetric matrix that is
 # stored as xx, xy, xz, yy, yz, zz.
 _PANELS = ((0, 1, (0, 1, 3)), (0, 2, (0, 2, 5)), (1, 2, (3, 4, 5)))
@@ -80,9 +81,9 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
                                edgecolor=_MISSED if is_missed else _TRUTH,
                                linewidth=2.0 if is_missed else 0.6))
         if is_missed:
-            _name(axes, one.center[[*plane]], one.object_id, '#8A5A00')
+            _name(axes, one.center[[*plane]] + (0.0, _NAME_OFFSET_M), one.object_id, '#8A5A00')
     for landmark in review.false:
-        _name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, 0.12),
+        _name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, _NAME_OFFSET_M),
               landmark_map.landmark_ids[landmark], REFUSED)
 
 

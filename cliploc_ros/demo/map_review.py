@@ -147,7 +147,7 @@ def count_sightings(frames: Sequence[TrueFrame], detections: PosedDetections
             continue  # the image was no keyframe
         rows = slice(*detections.frame_offsets[number:number + 2])
         ids = true_ids(detections.bboxes_xyxy[rows], frame.boxes)
-        for one, class_number in zip(ids, detections.classes[rows], strict=True):
+        for one, class_number in sorted(set(zip(ids, detections.classes[rows], strict=True))):
             detected.setdefault(one, Counter())[detections.class_names[class_number]] += 1
     return {one: Sightings(count, detected.get(one, Counter())) for one, count in shown.items()}
 

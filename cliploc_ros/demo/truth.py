@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from cliploc_ros.errors import DatasetError
+
 #: A detector need not find a box that shows less of its object than this share.
 LEAST_VISIBILITY = 0.3
 _SAME_OBJECT_IOU = 0.5
@@ -49,11 +51,24 @@ class TrueFrame:
 
 
 def read_objects(world: Path) -> tuple[TrueObject, ...]:
-    """Return the objects of a world, whether they are in its map or not."""
-    truth = json.loads((world / 'truth.json').read_text())
-    return tuple(TrueObject(item['id'], item['class_id'], item['label'], *(
-        np.array(item[name]) for name in ('center', 'semi_axes', 'orientation')))
-        for item in truth['objects'])
+    """Return the objects of a world, whether they are in its map or not.
+
+    Raises
+    ------
+    DatasetError
+        truth.json is missing or lacks them.
+    """
+    file = world / 'truth.json'
+    try:
+        objects = tuple(TrueObject(item['id'], item['class_id'], item['label'], *(
+            np.array(item[name], dtype=float) for name in ('center', 'semi_axes', 'orientation')))
+            for item in json.loads(file.read_text())['objects'])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f'{file}: the objects of the room cannot be read ({error!r}); make it '
+                           'with python -m demo_world.make_demo_world') from error
+    if not objects:
+        raise DatasetError(f'{file}: the room has no objects')
+    return objects
 
 
 def read_frames(world: Path, least_visibility: float = LEAST_VISIBILITY) -> Iterator[TrueFrame]:
