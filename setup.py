@@ -40,7 +40,7 @@ setup(
         'cluster': ['distributed'],
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
-        'test': ['hypothesis', 'pytest', 'pytest-xdist'],
+        'test': ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist'],
     },
     zip_safe=False,
     maintainer='the cliploc_ros authors',
