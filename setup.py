@@ -21,6 +21,7 @@ setup(
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
         f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
+        f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -24,8 +24,8 @@ from cliploc_ros.evaluation.recording import make_queries_of
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import make_queries
-from cliploc_ros.models.clip_encoder import embed_labels
 from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.yolo_detector import YoloOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
@@ -50,13 +50,12 @@ def run_map_demo(options: DemoOptions) -> None:
                         'with --assets')
     objects = read_objects(walk)
     built = _build(options, walk)
-    built_map = LandmarkMap.from_file(built.map_file)
     review = review_map(
-        built_map, objects,
+        LandmarkMap.from_file(built.map_file), objects,
         count_sightings(tuple(read_frames(walk)), built.recorded.detections),
         built.report['left_out'])
     print('\n'.join(map_page.console_lines(review)), flush=True)
-    successes = _judge(options, built_map)
+    successes = _judge(options, built.map_file)
     print('\n' + '\n'.join(map_page.success_lines(successes)) + '\n', flush=True)
     poses = built.recorded.detections.map_from_camera
     draw_map_review(review, poses, options.out / map_page.PICTURE)
@@ -91,7 +90,7 @@ def _build(options: DemoOptions, walk: Path) -> _Built:
                   load_recorded(files['npz']))
 
 
-def _judge(options: DemoOptions, built_map: LandmarkMap) -> dict[str, Summary]:
+def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     """Return the success of one look at each image of the wake-ups, in the built and true map."""
     clip = ClipOptions(model=str(options.assets / 'clip.json'),
                        pretrained=str(options.assets / 'clip.safetensors'))
@@ -102,10 +101,10 @@ def _judge(options: DemoOptions, built_map: LandmarkMap) -> dict[str, Summary]:
         tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
     method = Method(options.method, relocalizer_options(options.values))
     summaries = {}
-    for name, landmark_map in (
-            ('built map', built_map),
-            ('true map', LandmarkMap.from_file(options.assets / 'map.yaml'))):
-        queries = make_queries_of(recorded, landmark_map, embed_labels(clip, landmark_map.labels))
+    for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):
+        landmark_map = LandmarkMap.from_file(file)
+        queries = make_queries_of(recorded, landmark_map, embed_map(
+            clip, landmark_map, str(file), options.values['landmark_embeddings']))
         summaries[name], = summarize(run_methods(
             landmark_map, [method], make_queries(queries, landmark_map), trials=1))
     return summaries

@@ -268,12 +268,12 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
 
     observe: Observe = observe_classes
     if method.needs_similarities:
-        from cliploc_ros.models.clip_encoder import load_encoder
+        from cliploc_ros.models.map_rows import load_encoder_for_map
         from cliploc_ros.models.observer import Observer
-        observe = Observer(*load_encoder(
+        observe = Observer(*load_encoder_for_map(
             ClipOptions(model=str(values['clip_model']),
                         pretrained=str(values['clip_pretrained'])),
-            landmark_map.labels)).observe
+            landmark_map, str(values['map_file']), values['landmark_embeddings'])).observe
     return Reviewer(sequence, camera, observe, Relocalizer(landmark_map, method).relocalize,
                     values['max_detections'],
                     str if options.wake_up_map is None else options.wake_up_map.landmark_of)
