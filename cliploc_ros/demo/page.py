@@ -27,7 +27,8 @@ table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabul
 th, td {{ text-align: left; padding: .25rem .8rem; border-bottom: 1px solid #ddd }}
 .accepted {{ color: {ACCEPTED} }} .refused {{ color: {REFUSED} }}
 .note {{ background: #fff6e5; border-left: 4px solid #E69F00; padding: .6rem 1rem }}
-details {{ margin: 1rem 0 }} figure {{ margin: 2rem 0 }} figcaption {{ font-size: 14px; color: #555 }}
+figure {{ margin: 2rem 0 }} details {{ margin: 1rem 0 }}
+figcaption {{ font-size: 14px; color: #555 }}
 """
 
 _SYNTHETIC = """\
