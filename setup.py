@@ -20,7 +20,7 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
+        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
