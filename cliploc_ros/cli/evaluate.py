@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.core.options import COMPARED
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
@@ -111,6 +112,9 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
     group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
     group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
+    group.add_argument('--landmark-embeddings', choices=COMPARED, default='both',
+                       help="compare crops with the map's labels (text), with the images next to "
+                       'it, or with both (%(default)s)')
     group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--every', type=_positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
@@ -189,8 +193,10 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
                        device=options.device)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified])
-    queries = recorded_queries(frames, landmark_map, RecordingOptions(
-        yolo, clip, EVERY_FRAME, reading, options.workers or 1, options.scheduler))
+    recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,
+                                 options.scheduler)
+    queries = recorded_queries(frames, landmark_map, recording, str(options.map),
+                               options.landmark_embeddings)
     without = frames.count - len(queries)
     if without:
         print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',

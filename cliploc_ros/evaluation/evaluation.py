@@ -130,6 +130,7 @@ class Evaluation:
             digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
             digest.update(repr(query.number).encode())
         world = hashlib.sha256(repr((self.landmark_map.landmark_ids, self.landmark_map.class_ids,
+                                     self.landmark_map.classes.members.tolist(),
                                      self.landmark_map.centers.tolist(),
                                      self.landmark_map.shapes.tolist())).encode())
         return {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': self.trials,

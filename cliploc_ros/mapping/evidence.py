@@ -107,10 +107,11 @@ def _position_sigma(information: NDArray[np.float64]) -> float:
     A box that the image cuts on all sides tells nothing about the centre.
     """
     try:
-        covariance = np.linalg.inv(information)[:3, :3]
-        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
     except np.linalg.LinAlgError:
         return np.inf
+    # rounding makes what no box restrains negative
+    return float(np.sqrt(variance)) if variance > 0.0 else np.inf
 
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
