@@ -20,7 +20,8 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
+        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
+        f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
