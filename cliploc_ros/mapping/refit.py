@@ -40,6 +40,9 @@ _FIRST_IOUS = (0.05, 0.1)
 # that it explains after fitting. On the frames of TUM fr3, maps with errors of 10 cm on each axis
 # reach .70; maps that are off by 30 cm, 30 degrees or a scale of .8 reach at most .37.
 _LEAST_EXPLAINED = 0.45
+# A landmark that moves farther than this, and than twice its greatest semi-axis, shows another
+# object. On the same frames, with errors of 15 cm on each axis, right ones move .49 m at most.
+_MAX_MOVE_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -113,9 +116,17 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     is_own = settled.part_of == np.arange(len(chosen))
     shown = _associate_some(views, settled.landmarks, is_own, options.association_iou)
     evidence = gather_evidence(views, settled.landmarks, shown)
-    reasons = _reasons(views, settled, evidence, chosen, landmark_map, options)
+    reasons = _reasons(views, given, settled, evidence, landmark_map, options)
+    reasons = [reason if is_chosen else None
+               for reason, is_chosen in zip(reasons, chosen, strict=True)]
     is_fitted = np.array([reason is None for reason in reasons]) & chosen
     before = _explained(views, given, known)
+    settled_share, _ = _explained(views, settled.landmarks.select(is_own), known)
+    if before[0] < _LEAST_EXPLAINED * settled_share:
+        raise MappingError(
+            f'the map does not lie where the boxes are: it explains {before[0]:.0%} of them as '
+            f"given, and {settled_share:.0%} after fitting; bring it into the recording's "
+            'coordinate frame and to metres first')
     if not (is_fitted | ~chosen).any():
         raise MappingError(
             f'no landmark can be fitted, the first one because: {reasons[0]}; as given, the map '
@@ -126,7 +137,6 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     landmarks = _fit(views, landmarks, shown, is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
     after = _explained(views, landmarks.select(is_fitted | ~chosen), known)
-    _check_coordinate_frame(before[0], after[0])
     return RefitMap(_make_map(landmark_map, landmarks, evidence, is_fitted), tuple(reasons),
                     settled.part_of, tuple(notes), before[0], after[0], before[1], after[1])
 
@@ -141,15 +151,6 @@ def _check_classes(detections: PosedDetections, landmark_map: LandmarkMap, given
             f'{", ".join(sorted(set(landmark_map.class_ids)))}; recording: '
             f'{", ".join(sorted(detections.class_names))}; rename the classes of the map')
     return known
-
-
-def _check_coordinate_frame(before: float, after: float) -> None:
-    """Refuse a map that did not lie where the boxes are: it is fitted to other objects."""
-    if before < _LEAST_EXPLAINED * after:
-        raise MappingError(
-            f'the map does not lie where the boxes are: it explains {before:.0%} of them as '
-            f"given, and {after:.0%} after fitting; bring it into the recording's coordinate "
-            'frame and to metres first')
 
 
 def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: MappingOptions
@@ -196,20 +197,24 @@ def _replace_rows(landmarks: Landmarks, others: Landmarks, rows: NDArray[np.bool
                      landmarks.classes)
 
 
-def _reasons(views: Views, settled: _Settled, evidence: Evidence, chosen: NDArray[np.bool_],
+def _reasons(views: Views, given: Landmarks, settled: _Settled, evidence: Evidence,
              landmark_map: LandmarkMap, options: MappingOptions) -> list[str | None]:
-    """Return why each landmark could not be fitted; None where it was, or was not chosen."""
-    reasons = reasons_against(settled.landmarks, evidence, options)
-    for row in np.nonzero(chosen)[0]:
-        if settled.part_of[row] != row:
-            other = landmark_map.landmark_ids[settled.part_of[row]]
-            reasons[row] = f"is one object with '{other}'"
-        elif settled.landmarks.classes[row] < 0:
+    """Return why each landmark could not be fitted; None where it was."""
+    landmarks, part_of = settled
+    reasons = reasons_against(landmarks, evidence, options)
+    moved_m = np.linalg.norm(landmarks.centers - given.centers, axis=1)
+    sizes_m = np.linalg.norm(given.bases, axis=1).max(axis=1)
+    for row in range(len(reasons)):
+        if part_of[row] != row:
+            reasons[row] = f"is one object with '{landmark_map.landmark_ids[part_of[row]]}'"
+        elif landmarks.classes[row] < 0:
             name = landmark_map.class_ids[row]
             reasons[row] = f"the recording has no boxes of its class, '{name}'"
         elif evidence.support[row] == 0:
-            reasons[row] = _why_unseen(views, settled.landmarks, int(row))
-    return [reason if chosen[row] else None for row, reason in enumerate(reasons)]
+            reasons[row] = _why_unseen(views, landmarks, row)
+        elif reasons[row] is None and moved_m[row] > max(_MAX_MOVE_M, 2.0 * sizes_m[row]):
+            reasons[row] = f'its boxes are {moved_m[row]:.2f} m away: they show another object'
+    return reasons
 
 
 def _why_unseen(views: Views, landmarks: Landmarks, row: int) -> str:

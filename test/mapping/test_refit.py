@@ -142,3 +142,15 @@ def test_a_map_of_other_classes_is_refused(table, detections):
     with pytest.raises(MappingError, match="no boxes of the map's classes; map: tvmonitor; "
                                            'recording: book, bottle, cup'):
         refit_map(detections, foreign)
+
+
+def test_a_landmark_does_not_become_a_distant_object(table):
+    """A landmark behind an object, seen from the front, overlaps the boxes of the object."""
+    table = table.select([0, 2, 3, 4, 5, 6, 7, 8])
+    detections = see(table, walk_around(turn_deg=50.0))
+    stray = replace(table.select([3]), centers=table.centers[[3]] + [-0.6, -0.25, -0.15],
+                    semi_axes=np.full((1, 3), 0.2))
+    refit = refit_map(detections, join(table.select([0, 1, 2, 4, 5, 6, 7]), stray, '_stray'))
+    assert refit.reasons[:-1] == (None,) * 7
+    assert refit.reasons[-1].endswith('m away: they show another object')
+    assert (refit.landmark_map.centers[-1] == stray.centers[0]).all()
