@@ -94,7 +94,7 @@ class MappingOptions:
     class_merge_distance: float = 0.4
     max_seen_apart: float = 0.15
     merge_loss: float = 0.1
-    min_seen_ratio: float = 0.03
+    min_seen_ratio: float = 0.07
     min_baseline_deg: float = 20.0
     max_position_sigma_m: float = 0.05
     max_position_sigma_share: float = 0.1
