@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.map_labels import add_label_options, prepare_labels
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
@@ -28,6 +29,7 @@ examples:
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
+  build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
 """
 
@@ -55,6 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    add_label_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
@@ -88,13 +91,17 @@ def build(options: argparse.Namespace) -> int:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
+    labeller = prepare_labels(options, detections)
     with _ProgressBar() as bar:
         built = build_map(detections, _mapping_options(options), bar.show)
     head = [f'built by build_map from {source_of(options).name}', *built.report.lines()[:2]]
-    write_map(options.out, built.landmark_map, head)
+    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+    write_map(options.out, landmark_map, head, embeddings)
     if options.report is not None:
         _write_report(options.report, built)
     print('\n'.join(built.report.lines()))
+    if labeller.note:
+        print(f'note: {labeller.note}')
     if built.mount is not None:
         print(_mount_option(options, built.mount.given_from_corrected))
     print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')

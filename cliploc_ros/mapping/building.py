@@ -289,9 +289,10 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
     semi_axes = np.linalg.norm(landmarks.bases, axis=1)
     rotations = landmarks.bases / semi_axes[:, None, :]
     rotations[np.linalg.det(rotations) < 0.0] *= -1.0
+    boxes_of = group_boxes(shown, len(names))
     details = tuple(
         LandmarkDetails(
-            class_weights=_class_weights(detections, shown == row),
+            class_weights=_class_weights(detections, boxes_of[row]),
             position_sigma=float(evidence.position_sigma[row]),
             support=int(evidence.support[row]), seen_ratio=float(evidence.seen_ratio[row]),
             baseline_deg=float(evidence.baseline_deg[row]),
@@ -301,7 +302,7 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
                        semi_axes, Rotation.from_matrix(rotations).as_quat(), details)
 
 
-def _class_weights(detections: PosedDetections, rows: NDArray[np.bool_]
+def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
                    ) -> tuple[tuple[str, float], ...] | None:
     """Return the classes of some boxes with their shares, the greatest first; None for one."""
     counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))
