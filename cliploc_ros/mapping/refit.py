@@ -31,7 +31,7 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
-from cliploc_ros.mapping.views import Views, make_views
+from cliploc_ros.mapping.views import Views, camera_centers, make_views
 
 # Boxes overlap less with a landmark that is off than with a fitted one. The first rounds take
 # them from this IoU on.
@@ -218,7 +218,9 @@ def _reasons(views: Views, given: Landmarks, settled: _Settled, evidence: Eviden
 
 
 def _why_unseen(views: Views, landmarks: Landmarks, row: int) -> str:
-    expected = count_expected(views, landmarks.centers[row], landmarks.bases[row], np.inf)
+    cameras = camera_centers(views, np.arange(len(views.rotations)))
+    expected = count_expected(views, cameras, landmarks.centers[row], landmarks.bases[row],
+                              np.inf)
     if expected == 0:
         return 'its place is in no image'
     return f'its place is in {expected} images, and no box shows it: hidden, missed or gone'

@@ -97,3 +97,16 @@ def test_hybrid_matching_verifies_each_pair_once():
     assert set(scene.sorted_landmarks.numbers) == set(range(len(landmark_map)))
     assert len(np.unique(scene.pairs, axis=0)) == len(scene.pairs)
     assert scene.pairs[:len(ROOM)].tolist() == [[row, row] for row in range(len(ROOM))]
+
+
+def test_a_class_that_a_landmark_is_only_taken_for_is_not_expected():
+    """A person who walks through the view does not count against the pose."""
+    seen = see_room(ROOM)
+    detections = Detections(np.r_[seen.bboxes_xyxy, [[5.0, 5, 60, 90]]],
+                            (*seen.class_ids, 'z'), np.ones(len(seen) + 1))
+    frame = Observation(CAMERA, detections)
+    for landmark_map in (ROOM, weighted(ROOM, 0.3)):
+        found = Relocalizer(landmark_map, BY_CLASS).relocalize([frame])
+        assert found.accepted and found.evidence.unexplained == 0
+    named = replace(ROOM, class_ids=('z', *ROOM.class_ids[1:]))
+    assert Relocalizer(named, BY_CLASS).relocalize([frame]).evidence.unexplained > 0

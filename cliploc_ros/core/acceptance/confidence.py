@@ -163,9 +163,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
 
 
 def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Sequence[Match]) -> int:
-    """Return how many detections of the map's classes match no landmark."""
-    classes = landmark_map.classes.classes_of(frame.class_ids)
-    known = set(np.nonzero(classes >= 0)[0])
+    """Return how many detections of the map's classes match no landmark.
+
+    A class that a landmark is only taken for does not count: a real person is not expected in a
+    map because a teddy bear sometimes looks like one.
+    """
+    index = landmark_map.classes
+    known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
     return len(known - {match.detection for match in matches})
 
 

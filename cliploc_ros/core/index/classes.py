@@ -19,7 +19,7 @@ class ClassIndex:
     Parameters
     ----------
     numbers : mapping
-        Number of each class name, 0 to C - 1.
+        Number of each class name, 0 to C - 1; own classes come first.
     of_landmarks : ndarray (L,) of int
         Number of each landmark's own class.
     landmarks : ndarray (m,) of int
@@ -59,6 +59,10 @@ class ClassIndex:
         classes = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
         order = np.argsort(self.landmarks, kind='stable')
         return np.column_stack([self.landmarks[order], classes[order]])
+
+    def are_own(self, classes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether each class (n,) is a landmark's own, not one that it is taken for."""
+        return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
              ) -> NDArray[np.bool_]:
