@@ -20,7 +20,7 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
+        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
@@ -55,6 +55,7 @@ setup(
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
+            f'import_map = {PACKAGE}.cli.import_map:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',

@@ -17,12 +17,13 @@ from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_arg
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
     from cliploc_ros.core.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.mapping.posed_detections import PosedDetections
-    from cliploc_ros.mapping.report import MappingReport
-    from cliploc_ros.mapping.updating.report import UpdateReport
 
 EPILOG = """\
 examples:
@@ -66,12 +67,14 @@ def make_parser() -> argparse.ArgumentParser:
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise or --update is given)')
+                       '--pose-noise or --update is given, or estimated from the boxes)')
     poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
     poses.add_argument('--pose-correlation', type=_seconds, default=3.0, metavar='SECONDS',
                        help='time after which a pose error is another one (%(default)s)')
+    poses.add_argument('--refine-mount', action='store_true',
+                       help='correct a mount of the camera that is off by centimetres or degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
     limits.add_argument('--min-viewpoints', type=_positive_int, default=3, metavar='N',
                         help='10 cm or 5 degrees apart (%(default)s)')
@@ -99,8 +102,8 @@ def build(options: argparse.Namespace) -> int:
         options, old, detections, labeller)
     write_map(options.out, made.landmark_map, made.comments, made.embeddings)
     if options.report is not None:
-        _write_report(options.report, made.report.as_dict())
-    print('\n'.join(made.report.lines()))
+        _write_report(options.report, made.report)
+    print('\n'.join(made.lines))
     if labeller.note:
         print(f'note: {labeller.note}')
     print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')
@@ -108,12 +111,13 @@ def build(options: argparse.Namespace) -> int:
 
 
 class _Made(NamedTuple):
-    """A map, what belongs next to it and to its head, and the report."""
+    """A map, what belongs next to it and to its head, and the report: as text and for JSON."""
 
     landmark_map: 'LandmarkMap'
     embeddings: 'LandmarkEmbeddings | None'
     comments: list[str]
-    report: 'MappingReport | UpdateReport'
+    lines: list[str]
+    report: dict[str, Any]
 
 
 def _build(options: argparse.Namespace, detections: 'PosedDetections', labeller: Labeller
@@ -122,33 +126,41 @@ def _build(options: argparse.Namespace, detections: 'PosedDetections', labeller:
 
     with _ProgressBar() as bar:
         built = build_map(detections, _mapping_options(options), bar.show)
-    head = [f'built by build_map from {source_of(options).name}', *built.report.lines()[:2]]
-    return _Made(*labeller.describe(built.landmark_map, detections, built.shown), head,
-                 built.report)
+    lines = built.report.lines()
+    head = [f'built by build_map from {source_of(options).name}', *lines[:2]]
+    if built.mount is not None:
+        lines.append(_mount_option(options, built.mount.given_from_corrected))
+    return _Made(*labeller.describe(built.landmark_map, detections, built.shown), head, lines,
+                 built.report.as_dict())
 
 
 def _update(options: argparse.Namespace, old: OldMap, detections: 'PosedDetections',
             labeller: Labeller) -> _Made:
+    if options.refine_mount:
+        raise OptionsError('--refine-mount is for new maps, not for --update')
     mapping = _mapping_options(options)
     if mapping.pose_errors is None and options.joint is None:
         mapping = with_usual_noise(mapping)
     updated = update_old_map(old, detections, mapping, labeller)
+    lines = updated.report.lines()
     head = [f'{options.update.name}, updated by build_map from {source_of(options).name}',
-            updated.report.lines()[0]]
-    return _Made(updated.landmark_map, updated.embeddings, head, updated.report)
+            lines[0]]
+    return _Made(updated.landmark_map, updated.embeddings, head, lines,
+                 updated.report.as_dict())
 
 
 def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
     from cliploc_ros.mapping.options import MappingOptions
 
     return MappingOptions(
-        pose_errors=_pose_errors(options), min_viewpoints=options.min_viewpoints,
+        pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
+        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {source_of(options).name}', random_seed=options.seed)
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return how the poses may be off; None where they are not to be refined."""
+    """Return how the poses may be off; None where that is unknown, or not to be refined."""
     from cliploc_ros.mapping.options import PoseErrors
 
     if options.joint is False:
@@ -159,6 +171,16 @@ def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
         return None
     sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
     return PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
+
+
+def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
+    """Return the corrected mount as the option --mount takes it."""
+    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.datasets.poses import mount_from_numbers
+
+    given = correction if options.mount is None else mount_from_numbers(options.mount) @ correction
+    numbers = [*given[:3, 3], *quaternion_from_transform(given)]
+    return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 
 
 def _check_folder(path: Path) -> None:

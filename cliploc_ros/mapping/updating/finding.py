@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objects of the recording that no old landmark explains."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +71,8 @@ def find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool
         return nothing
     posed = detections.with_poses(map_from_cameras(views)).select_boxes(is_free)
     try:
-        built = build_map(posed, options)
+        built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
+                                         refine_mount=False))
     except NothingFoundError:
         return nothing
     shown[is_free] = built.shown
