@@ -98,7 +98,8 @@ def _on_landmarks(report: CheckReport) -> Iterator[str]:
               and 'same object as' not in one.faults[0]]
     for one in faulty[:_MOST_OF_A_KIND]:
         yield f'{one.landmark_id} {one.faults[0]}'
-    yield from _more(len(faulty), 'landmarks with a serious fault')
+    yield from _more(len(faulty), 'landmarks with a serious fault: record the place again, and '
+                     'update the map')
 
 
 def _on_corrections(report: CheckReport) -> Iterator[str]:
