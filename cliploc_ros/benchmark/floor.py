@@ -8,11 +8,11 @@ Each step runs in a process of its own, so that its peak memory is its own.
 """
 
 import argparse
-import contextlib
 import json
 import multiprocessing
 import os
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -209,9 +209,7 @@ def _write_queries(options: argparse.Namespace, floor: Floor, built: LandmarkMap
 
 def evaluate(folder: Path, workers: int) -> str:
     """Run evaluate; return its results in a line."""
-    from cliploc_ros.cli.evaluate import main as run
-
-    _run(run, folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map',
+    _run('evaluate', folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map',
          folder / 'map.yaml', '--methods', 'auto', '--trials', 1, '--no-figures', '--workers',
          workers, '--out', folder)
     results = json.loads((folder / 'results.json').read_text())
@@ -224,15 +222,14 @@ def evaluate(folder: Path, workers: int) -> str:
 
 def check(folder: Path) -> None:
     """Run check_map."""
-    from cliploc_ros.cli.check_map import main as run
-
-    _run(run, folder / 'check_map.log', folder / 'map.yaml', '--observations',
+    _run('check_map', folder / 'check_map.log', folder / 'map.yaml', '--observations',
          folder / 'observations.npz', '--out', folder / 'check')
 
 
-def _run(command: Callable[[Sequence[str]], int], log: Path, *arguments: object) -> None:
-    with log.open('w') as file, contextlib.redirect_stdout(file):
-        command([str(argument) for argument in arguments])
+def _run(executable: str, log: Path, *arguments: object) -> None:
+    with log.open('w') as file:  # check_map ends with 1 if the map misses a threshold
+        subprocess.call([sys.executable, '-m', f'cliploc_ros.cli.{executable}',
+                         *map(str, arguments)], stdout=file)
 
 
 if __name__ == '__main__':
