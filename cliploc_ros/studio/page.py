@@ -93,7 +93,7 @@ class Page:
         spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0
         camera = self.server.initial_camera
         camera.look_at = tuple(middle)
-        camera.position = tuple(middle + np.array([-1.0, -1.0, 0.8]) * max(1.0, spread))
+        camera.position = tuple(middle + np.array([-0.6, -0.6, 0.6]) * max(1.0, spread))
 
     # ---- actions --------------------------------------------------------------------------------
 
@@ -139,7 +139,12 @@ class Page:
             camera.fov = 2.2 * float(np.arctan(intrinsics.height / (2.0 * intrinsics.fy)))
 
     def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
-        if event.modifier == 'shift':
+        self.select(event, landmark_id,
+                    event.modifier == 'shift' or self._table_panel.selects_several)
+
+    def select(self, event: Any, landmark_id: str, joins: bool) -> None:
+        """Select a landmark, alone or together with those that are selected."""
+        if joins:
             self.act(event, lambda: self.studio.toggle(landmark_id))
         else:
             self.act(event, lambda: self.studio.document.select([landmark_id]))

@@ -219,6 +219,9 @@ class TablePanel:
         with gui.add_folder('Landmarks'):
             self._search = gui.add_text('Find', '')
             self._search.on_update(lambda event: self._turn(-len(self._studio.rows())))
+            self._several = gui.add_checkbox(
+                'Select several', False, hint='a row or an ellipsoid joins the selection or '
+                'leaves it; in the scene, shift and a click do the same')
             self._rows = [gui.add_button('', visible=False) for _ in range(_ROWS)]
             self._pages = gui.add_button_group('Rows', ('previous', 'next'))
             _button(page, 'Check against the recording', self._studio.check)
@@ -232,8 +235,12 @@ class TablePanel:
     def _clicked(self, number: int, event: Any) -> None:
         if number < len(self._ids):
             key = self._ids[number]
-            self._page.act(event, lambda: self._studio.document.select([key]))
-            self._page.look_at_selection(event)
+            self._page.select(event, key, self.selects_several)
+
+    @property
+    def selects_several(self) -> bool:
+        """Return whether a click joins the selection."""
+        return bool(self._several.value)
 
     def _turn(self, rows: int) -> None:
         self._first = max(0, self._first + rows)

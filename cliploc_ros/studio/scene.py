@@ -19,6 +19,7 @@ from cliploc_ros.studio.studio import Studio, color_of
 # More labels than these hide the map, and slow the browser down.
 _MAX_LABELS = 150
 _MAX_LABEL_LENGTH = 60
+_LABEL_M = 0.05
 _MAX_CAMERAS = 1000
 _FRUSTUM_M = 0.08
 #: The image of the selected view lies this far in front of its camera [m].
@@ -111,7 +112,9 @@ class Labels:
             position = one.center + np.array([0.0, 0.0, one.semi_axes.max()])
             if handle is None:
                 # ids may hold any characters, names of nodes not
-                handle = self._scene.add_label(f'/labels/{self._count}', text, position=position)
+                handle = self._scene.add_label(
+                    f'/labels/{self._count}', text, position=position, anchor='bottom-center',
+                    font_size_mode='scene', font_scene_height=_LABEL_M)
                 self._count += 1
             handle.text, handle.position = text, position
             self._handles[key] = (one, handle)
@@ -169,7 +172,8 @@ def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
     poses = detections.map_from_camera
     if len(poses) > 1:
         path = np.stack([poses[:-1, :3, 3], poses[1:, :3, 3]], axis=1)
-        scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5)
+        scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
+                                thickness_units='screen')
     shown = np.arange(0, len(poses), max(1, -(-len(poses) // _MAX_CAMERAS)))
     camera = detections.camera
     half = np.array([camera.width / camera.fx, camera.height / camera.fy]) * 0.5 * _FRUSTUM_M
@@ -179,7 +183,7 @@ def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
     lines = np.concatenate([np.stack([tips, points], axis=2),
                             np.stack([points, np.roll(points, 1, axis=1)], axis=2)], axis=1)
     scene.add_line_segments('/cameras', lines.reshape(-1, 2, 3), (120, 120, 200),
-                            thickness=1.0)
+                            thickness=1.0, thickness_units='screen')
     handle = scene.add_batched_meshes_simple(
         '/camera_centers', _SPHERE.vertices * 0.012, _SPHERE.faces,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(shown), 1)), poses[shown, :3, 3],
