@@ -31,7 +31,7 @@ from cliploc_ros.studio.studio import Studio
 
 _REDRAW_INTERVAL_S = 0.05
 _GRID_M = 20.0
-_GIZMO = 0.3
+_GIZMO = 0.4
 
 
 class Page:

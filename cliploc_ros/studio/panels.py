@@ -107,8 +107,8 @@ class LandmarkPanel:
             self._label: Any = gui.add_text('Label', '')
             self._phrases: Any = gui.add_dropdown('Phrases', (_NO_PHRASE,))
             self._class: Any = gui.add_text('Class', '')
-            self._center = gui.add_vector3('Position [m]', (0.0, 0.0, 0.0), step=0.01)
-            self._angles = gui.add_vector3('Roll pitch yaw [deg]', (0.0, 0.0, 0.0), step=1.0)
+            self._center = gui.add_vector3('Position [m]', (0.0, 0.0, 0.0), step=0.001)
+            self._angles = gui.add_vector3('Roll pitch yaw [deg]', (0.0, 0.0, 0.0), step=0.1)
             self._sliders: list[Any] = [gui.add_slider(f'Semi-axis {name} [m]', LEAST_SEMI_AXIS_M,
                                             _SLIDER_MAX_M, 0.001, 0.1) for name in 'xyz']
             self._buttons = [_button(page, label, action, hotkey) for label, action, hotkey in (

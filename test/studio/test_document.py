@@ -3,19 +3,15 @@
 """The document of the map studio: edits, undo, saving and the journal; no browser."""
 
 import json
-import re
-import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from studio_map import TEXT
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.parameter_file import read_parameter_file
@@ -24,49 +20,6 @@ from cliploc_ros.studio import edits
 from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.map_source import ChangedOnDiskError
-
-TEXT = """\
-# The office on the second floor.   Measured by hand.
-other_node:
-  ros__parameters:
-    rate: 5.0   # Hz
-/**:
-  ros__parameters:
-    map:
-      frame_id: map
-      landmarks:
-        # the red one, from the kitchen
-        cup_1:
-          label: 'a red cup'   # Ann's
-          class_id: cup
-          center: [1.0, 2.0, 0.5]   # from the plan
-          semi_axes: [0.05, 0.05, 0.08]
-          orientation: [0.0, 0.0, 0.0, 1.0]
-
-        # shelf
-        book_1:
-          labels:
-            text: ["a thick book", "a novel"]
-            weight: [0.7, 0.3]
-          class_id: book
-          center:
-            - 2.0
-            - 2.0
-            - 0.5
-          semi_axes: [0.1, 0.15, 0.03]
-          orientation: [0.0, 0.0, 0.0, 1.0]
-          position_sigma: 0.01
-          class_weights: {book: 0.9, tv: 0.1}
-        plant_1:
-          label: >
-            a plant
-            in a pot
-          class_id: plant
-          center: [3.0, 2.0, 0.5]
-          semi_axes: [0.1, 0.15, 0.3]
-          orientation: [0.0, 0.0, 0.0, 1.0]
-    map_file: ''  # the relocalizer's own
-"""
 
 
 @pytest.fixture
@@ -360,95 +313,6 @@ def test_hostile_maps_end_in_a_message(path, text):
     with pytest.raises(MapError, match=r'office\.yaml'):
         Document(path)
     assert list(path.parent.iterdir()) == [path]
-
-
-# ---- the journal
-
-EDITOR = """
-import sys, numpy as np
-from pathlib import Path
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
-document = Document(Path(sys.argv[1]))
-document.apply(edits.lock(document.landmarks, ['book_1']))
-document.apply(edits.delete(document.landmarks, ['plant_1']))
-document.save()
-document.apply(edits.relabel(document.landmarks, ['cup_1'], 'undone'))
-document.undo()
-x = 0
-while True:
-    x += 1
-    document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag')
-    print(x, flush=True)
-"""
-
-
-def test_a_killed_studio_loses_nothing(path):
-    editor = subprocess.Popen([sys.executable, '-c', EDITOR, path], stdout=subprocess.PIPE,
-                              text=True, cwd=Path(__file__).parents[2])
-    for line in editor.stdout:
-        if int(line) >= 100:
-            editor.send_signal(signal.SIGKILL)
-            break
-    last = int([line, *editor.stdout.readlines()][-1])
-    editor.wait()
-    document = Document(path)
-    assert document.landmarks['cup_1'].center[0] >= last
-    assert document.landmarks['book_1'].is_locked and 'plant_1' not in document.landmarks
-    assert any('restored' in note for note in document.notes)
-    document.undo()
-    assert document.is_saved, 'the drag is one edit'
-    document.close()
-
-
-def journal_of(path):
-    return path.with_name(f'.{path.name}.studio')
-
-
-def test_replay_between_announcing_and_writing(path):
-    """A studio that was killed while it saved: either content has the right edits."""
-    document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'first'))
-    document._journal.append({'writing': document._source.with_landmarks(
-        document.landmarks).digest})
-    written = document._source.with_landmarks(document.landmarks).text
-    document._journal.close()
-    again = Document(path)
-    assert again.landmarks['cup_1'].label == 'first' and not again.is_saved
-    again._journal.close()
-    path.write_text(written)
-    again = Document(path)
-    assert again.landmarks['cup_1'].label == 'first' and again.is_saved
-
-
-def test_edits_of_another_content_are_set_aside(path):
-    document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
-    document.close()
-    path.write_text(TEXT.replace('a red cup', 'theirs'))
-    document = Document(path)
-    assert document.landmarks['cup_1'].label == 'theirs'
-    (note,) = document.notes
-    aside = path.with_name(re.search(r'lie in (\S+)', note)[1])
-    assert '"mine"' in aside.read_text()
-
-
-@pytest.mark.parametrize('tail', [b'{"do": "edit", "what": "cu', b'\xff\xfe\n', b'[]\n', b'{}\n',
-                                  b'{"do": "edit"}\n', b'{"do": "undo", "what": 3}\n',
-                                  b'[' * 100_000 + b'\n',
-                                  b'{"do": "edit", "what": "x", "before": {"a": null}, '
-                                  b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n'])
-def test_a_broken_journal_loses_its_end_only(path, tail):
-    document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
-    document.close()
-    with journal_of(path).open('ab') as file:
-        file.write(tail)
-    document = Document(path)
-    assert document.landmarks['cup_1'].label == 'mine'
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine, too'))
-    document.close()
-    assert Document(path).landmarks['cup_1'].label == 'mine, too'
 
 
 def act(document, action, number):
