@@ -20,6 +20,7 @@ from cliploc_ros.studio import edits
 from cliploc_ros.studio.panels import LandmarkPanel, MapPanel, TablePanel, ViewPanel
 from cliploc_ros.studio.picture import SELECTED_RGB
 from cliploc_ros.studio.scene import (
+    Answers,
     Ellipsoids,
     Labels,
     ViewImage,
@@ -81,6 +82,7 @@ class Page:
         self._view_panel: ViewPanel | None = None
         if recording is not None:
             draw_recording(server.scene, recording.detections, self._clicked_camera)
+            self._answers = Answers(server.scene, recording.detections)
             self._image = ViewImage(server.scene, recording.detections.camera)
             self._image.handle.on_click(self._clicked_image)
             self._image.handle.on_drag('left')(self._dragged_image)
@@ -99,10 +101,17 @@ class Page:
 
     def act(self, event: Any, action: Callable[[], str | None]) -> None:
         """Do something with the studio locked, and tell the person who did it the outcome."""
+        def locked() -> str | None:
+            with self.studio.document.lock:
+                return action()
+
+        self.ask(event, locked)
+
+    def ask(self, event: Any, action: Callable[[], str | None]) -> None:
+        """Do something that takes long and only reads the document; tell the outcome."""
         client = getattr(event, 'client', None)
         try:
-            with self.studio.document.lock:
-                message = action()
+            message = action()
         except CliplocError as error:
             self._notify(client, 'Not done', str(error), 'red')
             return
@@ -212,6 +221,7 @@ class Page:
         self._landmark_panel.show()
         self._table_panel.show()
         if self._view_panel is not None and self._image is not None:
+            self._answers.show(self.studio.answers)
             key = (self.studio.document.revision, self.studio.view,
                    self.studio.drawn.get(self.studio.view))
             if key != self._shown_picture:

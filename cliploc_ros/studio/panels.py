@@ -275,6 +275,8 @@ class ViewPanel:
             self._view = gui.add_slider('View', 0, max(1, self._studio.views - 1), 1, 0)
             self._picture = gui.add_image(np.zeros((3, 4, 3), dtype=np.uint8), format='jpeg')
             look = gui.add_button('Look through this view')
+            here = gui.add_button('Relocalize here')
+            everywhere = gui.add_button('Relocalize the recording')
             with gui.add_folder('New landmark from boxes'):
                 self._drawing = gui.add_checkbox(
                     'Draw boxes', False, hint='drag on the image in the scene, or click a '
@@ -290,6 +292,8 @@ class ViewPanel:
                 _button(page, 'Forget the boxes', self._studio.clear_boxes)
         panel.dock_left()
         look.on_click(page.look_through)
+        here.on_click(lambda event: page.ask(event, self._studio.relocalize_here))
+        everywhere.on_click(lambda event: page.ask(event, self._studio.relocalize_all))
         self._view.on_update(self._chosen)
         self._drawing.on_update(self._toggled)
 

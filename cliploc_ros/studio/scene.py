@@ -15,6 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.studio import Studio, color_of
+from cliploc_ros.studio.trials import Answer
 
 # More labels than these hide the map, and slow the browser down.
 _MAX_LABELS = 150
@@ -22,6 +23,7 @@ _MAX_LABEL_LENGTH = 60
 _LABEL_M = 0.05
 _MAX_CAMERAS = 1000
 _FRUSTUM_M = 0.08
+_VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
 #: The image of the selected view lies this far in front of its camera [m].
 IMAGE_DEPTH_M = 0.3
 #: Landmarks with their ids.
@@ -159,6 +161,32 @@ class ViewImage:
         x, y, _ = (first + along * step) / IMAGE_DEPTH_M
         camera = self._camera
         return np.array([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
+
+
+class Answers:
+    """The relocalizer's answers: a sphere where it was asked, a line to the pose it found."""
+
+    def __init__(self, scene: viser.SceneApi, detections: PosedDetections):
+        self._scene, self._poses = scene, detections.map_from_camera
+        self._shown: tuple[Answer, ...] = ()
+
+    def show(self, answers: tuple[Answer, ...]) -> None:
+        """Show these answers instead of the last ones."""
+        if answers is self._shown:
+            return
+        self._shown = answers
+        asked = np.array([self._poses[one.view, :3, 3] for one in answers])
+        colors = np.array([_VERDICT_RGB[one.verdict] for one in answers], dtype=np.uint8)
+        self._scene.add_batched_meshes_simple(
+            '/answers', _SPHERE.vertices * 0.03, _SPHERE.faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(answers), 1)), asked, batched_colors=colors,
+            cast_shadow=False, receive_shadow=False)
+        pairs = [(asked[row], one.result.map_from_camera[:3, 3], colors[row])
+                 for row, one in enumerate(answers) if one.result.map_from_camera is not None]
+        points = np.array([pair[:2] for pair in pairs]).reshape(-1, 2, 3)
+        line_colors = np.array([[pair[2]] * 2 for pair in pairs], dtype=np.uint8)
+        self._scene.add_line_segments('/answers/lines', points, line_colors.reshape(-1, 2, 3),
+                                      thickness=2.0, thickness_units='screen')
 
 
 def wxyz_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.checking.relocalization import sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
 from cliploc_ros.studio.changes import EditError
@@ -21,8 +22,11 @@ from cliploc_ros.studio.images import Images
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.picture import Outline, Pixel, box_at, draw, landmark_at, project
 from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.trials import Answer, relocalize
 
 Rgb = tuple[int, int, int]
+# Views of the whole recording that the relocalizer is asked in.
+_MAX_TRIALS = 100
 # Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
 _PALETTE: tuple[Rgb, ...] = (
     (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75),
@@ -58,6 +62,9 @@ class Studio:
         self.accepted: set[str] = set()
         self._images = images
         self._checks: dict[str, LandmarkCheck] = {}
+        #: The relocalizer's answers that are shown; an edit leaves them as they are.
+        self.answers: tuple[Answer, ...] = ()
+        self._counts: dict[str, int] = {}
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -288,6 +295,25 @@ class Studio:
         here = ids.index(self.document.selection[0]) if self.document.selection else -1
         self.document.select([ids[(here + 1) % len(ids)]])
         return f'selected {self.document.selection[0]}'
+
+    # ---- the relocalizer ------------------------------------------------------------------------
+
+    def relocalize_here(self) -> str:
+        """Ask the relocalizer in the selected view."""
+        self.answers = tuple(relocalize(self.document.landmarks, self._recording(), [self.view]))
+        return self.answers[0].text(self.document.to_map())
+
+    def relocalize_all(self) -> str:
+        """Ask in views along the trajectory, and compare with the time before."""
+        recording = self._recording()
+        views = sample_frames(self.views, _MAX_TRIALS).tolist()
+        self.answers = tuple(relocalize(self.document.landmarks, recording, views))
+        before = self._counts
+        self._counts = {verdict: sum(one.verdict == verdict for one in self.answers)
+                        for verdict in ('accepted', 'refused', 'wrong')}
+        counts = ', '.join(f'{count} {verdict}' + (f' (was {before[verdict]})' if before else '')
+                           for verdict, count in self._counts.items())
+        return f'{len(views)} views: {counts}; similarities are simulated'
 
     def phrases(self) -> tuple[str, ...]:
         """Return up to five phrases for the selected landmark: its own, then its class's."""

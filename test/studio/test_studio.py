@@ -135,6 +135,23 @@ def test_a_box_of_the_detector_is_taken(office):
         office.take_box((-1.0, -1.0))
 
 
+def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
+    document = office.document
+    before = office.relocalize_all()
+    accepted = sum(one.verdict == 'accepted' for one in office.answers)
+    assert 'simulated' in before and '(was' not in before and accepted > 30
+    accepted_view = next(one.view for one in office.answers if one.verdict == 'accepted')
+    office.show_view(accepted_view)
+    assert f'view {accepted_view}: accepted' in office.relocalize_here()
+    assert len(office.answers) == 1 and office.answers[0].error_m < 1.0
+    document.select(list(document.landmarks)[::2])
+    office.delete()
+    after = office.relocalize_all()
+    assert f'(was {accepted})' in after
+    assert sum(one.verdict == 'accepted' for one in office.answers) < accepted
+    print(f'as given: {before}; every other landmark deleted: {after}')
+
+
 @pytest.mark.parametrize('folder', ['missing', '.'])
 def test_images_that_are_none(tmp_path, folder):
     from cliploc_ros.datasets.bag_frames import BagTopics
