@@ -20,7 +20,8 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/sequence/*.*', 'assets/sequence/rgb/*.jpg'],
+        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
+        f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -41,7 +42,7 @@ setup(
         'datasets': ['rosbags'],
         'demo': ['matplotlib'],
         'studio': ['viser==1.1.1'],
-        'test': ['hypothesis', 'pytest', 'pytest-xdist'],
+        'test': ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist'],
     },
     zip_safe=False,
     maintainer='the cliploc_ros authors',
@@ -55,6 +56,7 @@ setup(
             f'demo = {PACKAGE}.cli.demo:main',
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
+            f'import_map = {PACKAGE}.cli.import_map:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'studio = {PACKAGE}.cli.studio:main',

@@ -37,6 +37,11 @@ def run_command(command: Callable[[], int]) -> int:
         return EXIT_INTERRUPTED
 
 
+def printable(text: str) -> str:
+    """Return text for a terminal: ids in a map may hold any characters."""
+    return ''.join(char if char.isprintable() else ' ' for char in text)
+
+
 def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
     """Split off the arguments from each ``--ros-args`` to its ``--``, which launch appends.
 

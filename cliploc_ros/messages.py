@@ -19,7 +19,6 @@ from cliploc_ros.errors import CameraError, ImageError
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
              'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
-_DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 # A small file may declare any size: an image takes 200 MB at most.
 _MAX_PIXELS = 2**26
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
@@ -75,7 +74,7 @@ def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
     if msg.encoding not in _CHANNELS:
         raise ImageError(f"image encoding '{msg.encoding}' is none of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]
-    _check_size(msg.width, msg.height)
+    check_size(msg.width, msg.height)
     if msg.step < msg.width * channels:
         raise ImageError(f'image step {msg.step} is shorter than a row of {msg.width} '
                          f'{msg.encoding} pixels')
@@ -88,35 +87,8 @@ def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[:, :, order])
 
 
-def depth_counts_from_msg(msg: ImageMessage) -> NDArray[np.generic]:
-    """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
-
-    Parameters
-    ----------
-    msg : sensor_msgs/Image
-        Of encoding 16UC1, mono16 or 32FC1.
-
-    Raises
-    ------
-    ImageError
-        A field is invalid; the message names it.
-    """
-    if msg.encoding not in _DEPTH_TYPES:
-        raise ImageError(f"depth encoding '{msg.encoding}' is none of {', '.join(_DEPTH_TYPES)}")
-    dtype = np.dtype(_DEPTH_TYPES[msg.encoding])
-    dtype = dtype.newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
-    _check_size(msg.width, msg.height)
-    used = msg.width * dtype.itemsize
-    if msg.step < used or len(msg.data) < msg.step * msg.height:
-        raise ImageError(f'depth image of {msg.width}x{msg.height} px with step {msg.step} has '
-                         f'only {len(msg.data)} bytes')
-    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
-    pixels = np.ascontiguousarray(rows.reshape(msg.height, msg.step)[:, :used]).view(dtype)
-    return pixels.astype(dtype.newbyteorder('='))
-
-
 def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
-    _check_size(*_declared_size(bytes(msg.data), msg.format))
+    check_size(*declared_size(bytes(msg.data), msg.format))
     data = np.frombuffer(msg.data, dtype=np.uint8)
     try:
         # EXIF may ask to turn the image, but the intrinsics are those of the sensor.
@@ -129,8 +101,14 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image[:, :, ::-1])
 
 
-def _declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
-    """Return width and height as a JPEG or PNG declares them, before it is decoded."""
+def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
+    """Return width and height as a JPEG or PNG declares them, before it is decoded.
+
+    Raises
+    ------
+    ImageError
+        The data is neither.
+    """
     if data.startswith(_PNG) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
     at = 2 if data.startswith(_JPEG) else len(data)
@@ -142,7 +120,8 @@ def _declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
                      'it is no JPEG or PNG, or it is cut off')
 
 
-def _check_size(width: int, height: int) -> None:
+def check_size(width: int, height: int) -> None:
+    """Refuse an image that is empty or larger than any camera's with an ImageError."""
     if not (width > 0 and height > 0 and width * height <= _MAX_PIXELS):
         raise ImageError(f'image size {width}x{height} must have 1 to {_MAX_PIXELS} pixels')
 

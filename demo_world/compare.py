@@ -43,7 +43,7 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
     detector = YoloDetector(YoloOptions(model=str(ASSETS / 'yolo.pt')))
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
-    encoder, labels = load_encoder(clip, landmark_map.labels)
+    encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
     frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
     return make_queries_of(record_every_frame(frames, Look(detector, encoder)), landmark_map,
                            labels)
@@ -110,7 +110,7 @@ def run(arguments: list[str]) -> int:
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
     Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
-            workers=options.workers).compare(
+               options.workers).compare(
         parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
         frames=queries.frames)
     return 0

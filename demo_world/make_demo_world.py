@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the world of the demo: ``python -m demo_world.make_demo_world DIR``.
 
-No model was trained on this room. The map comes from a walk around its centre. Then some objects
-move and the light changes, and another walk yields the images of the wake-ups.
+No model was trained on this room. The true map comes from the true boxes of a walk around its
+centre. The mapping walk yields the images to build a map from. Then some objects move and the
+light changes, and another walk yields the images of the wake-ups.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from demo_world.appearance import CLASSES
 from demo_world.recording import record, write_fitted_map
 from demo_world.renderer import Light, Renderer
 from demo_world.room import make_room, move_objects
-from demo_world.trajectories import CAMERA, mapping_walk, query_walk
+from demo_world.trajectories import CAMERA, mapping_walk, query_walk, true_map_walk
 
 #: Not among the seeds of the training worlds, which start at 1000.
 SEED = 7
@@ -23,14 +24,18 @@ _MAPPING_LIGHT = Light()
 _QUERY_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 
 
-def make_demo_world(folder: Path, images: int, seed: int = SEED) -> None:
-    """Write the map (map.yaml) and the images of the wake-ups (sequence/) to a folder."""
+def make_demo_world(folder: Path, images: int, mapping_images: int, seed: int = SEED) -> None:
+    """Write the true map (map.yaml), the mapping walk (mapping/) and the wake-ups (sequence/)."""
     room = make_room(seed, dict.fromkeys(CLASSES, 8))
+    renderer = Renderer(room, CAMERA, _MAPPING_LIGHT)
     folder.mkdir(parents=True, exist_ok=True)
-    mapping = mapping_walk(120)
-    with tqdm(total=len(mapping), desc='mapping', unit='image') as bar:
-        write_fitted_map(folder / 'map.yaml', room, Renderer(room, CAMERA, _MAPPING_LIGHT),
-                         mapping, seed=seed, advance=bar.update)
+    poses = true_map_walk(120)
+    with tqdm(total=len(poses), desc='true map', unit='image') as bar:
+        write_fitted_map(folder / 'map.yaml', room, renderer, poses, seed=seed,
+                         advance=bar.update)
+    with tqdm(total=mapping_images, desc='mapping', unit='image') as bar:
+        record(folder / 'mapping', room, renderer, mapping_walk(mapping_images), seed=seed + 5,
+               advance=bar.update)
     later = move_objects(room, 4, seed + 1)
     with tqdm(total=images, desc='waking up', unit='image') as bar:
         record(folder / 'sequence', later, Renderer(later, CAMERA, _QUERY_LIGHT),
@@ -43,10 +48,12 @@ def main() -> None:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folder', type=Path, metavar='DIR')
     parser.add_argument('--images', type=int, default=48,
-                        help='images of the second walk (%(default)s)')
+                        help='images of the wake-ups (%(default)s)')
+    parser.add_argument('--mapping-images', type=int, default=30,
+                        help='images of the mapping walk (%(default)s)')
     parser.add_argument('--seed', type=int, default=SEED)
     options = parser.parse_args()
-    make_demo_world(options.folder, options.images, options.seed)
+    make_demo_world(options.folder, options.images, options.mapping_images, options.seed)
 
 
 if __name__ == '__main__':

@@ -59,12 +59,33 @@ def walk(count: int, way_points: npt.ArrayLike, targets: npt.ArrayLike) -> \
     return np.array([look_at(*pose) for pose in zip(eyes, gazes, rolls, strict=True)])
 
 
-def mapping_walk(count: int) -> npt.NDArray[np.float64]:
-    """Return the mapping walk: slowly around the centre, looking outwards."""
+def true_map_walk(count: int) -> npt.NDArray[np.float64]:
+    """Return the walk behind the demo's map of true boxes: around the centre, looking outwards.
+
+    It shows most objects from one side only. That suffices there: the fit starts at the truth.
+    """
     turn = np.linspace(0, 2 * np.pi, 13)
     eyes = np.c_[3.0 + 0.9 * np.cos(turn), 2.5 + 0.6 * np.sin(turn), np.full(13, 1.45)]
     gazes = np.c_[3.0 + 3.2 * np.cos(turn), 2.5 + 2.6 * np.sin(turn),
                   0.95 + 0.25 * np.sin(3 * turn)]
+    return walk(count, eyes, gazes)
+
+
+def mapping_walk(count: int) -> npt.NDArray[np.float64]:
+    """Return the mapping walk: sideways past each shelf and table, two metres away.
+
+    So each object is seen from directions 20 degrees apart and more.
+    """
+    eyes = [(0.9, 2.1, 1.4), (1.5, 2.3, 1.5), (2.2, 2.2, 1.4), (2.8, 1.9, 1.5),  # shelf
+            (3.6, 2.0, 1.5), (4.3, 2.3, 1.4), (5.1, 2.1, 1.4),  # table
+            (4.2, 2.2, 1.5), (3.8, 3.1, 1.4), (4.1, 4.0, 1.4), (4.2, 3.4, 1.5),  # table, turn
+            (3.7, 2.9, 1.5), (2.8, 2.7, 1.4), (2.0, 3.0, 1.4), (2.0, 3.6, 1.4),  # table, turn
+            (2.1, 4.1, 1.5), (2.3, 3.4, 1.4), (2.3, 2.6, 1.5), (1.9, 1.9, 1.4)]  # shelf
+    gazes = [(1.3, 0.2, 1.1), (1.4, 0.2, 1.0), (1.5, 0.2, 1.1), (1.7, 0.2, 1.0),
+             (4.5, 0.5, 0.75), (4.7, 0.5, 0.75), (4.8, 0.5, 0.75),
+             (5.5, 2.8, 0.75), (5.5, 3.1, 0.75), (5.5, 3.3, 0.75), (4.3, 4.7, 0.75),
+             (2.9, 4.6, 0.75), (2.8, 4.6, 0.75), (2.6, 4.6, 0.75), (1.0, 4.8, 0.9),
+             (0.2, 3.4, 1.0), (0.2, 3.1, 1.1), (0.2, 2.9, 1.0), (0.2, 2.7, 1.1)]
     return walk(count, eyes, gazes)
 
 

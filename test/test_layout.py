@@ -20,7 +20,8 @@ SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
     ('errors', 'replace_file', 'units'),
-    ('core.compiled', 'core.landmark_details', 'core.parameter_file', 'core.time_budget'),
+    ('core.compiled', 'core.landmark_details', 'core.landmark_embeddings', 'core.parameter_file',
+     'core.time_budget'),
     ('core.geometry',),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
@@ -31,7 +32,7 @@ LAYERS = (
     ('core',),
     ('mapping',),
     ('messages', 'command', 'parallel'),
-    ('models', 'datasets'),
+    ('models', 'datasets', 'vocabulary'),
     ('recording',),
     ('evaluation',),
     ('benchmark',),

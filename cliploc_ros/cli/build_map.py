@@ -10,11 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.map_labels import add_label_options, prepare_labels
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from cliploc_ros.mapping.building import BuiltMap
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 
@@ -25,6 +29,7 @@ examples:
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
+  build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
 """
 
@@ -52,15 +57,18 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    add_label_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise is given)')
+                       '--pose-noise is given, or estimated from the boxes)')
     poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
     poses.add_argument('--pose-correlation', type=_seconds, default=3.0, metavar='SECONDS',
                        help='time after which a pose error is another one (%(default)s)')
+    poses.add_argument('--refine-mount', action='store_true',
+                       help='correct a mount of the camera that is off by centimetres or degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
     limits.add_argument('--min-viewpoints', type=_positive_int, default=3, metavar='N',
                         help='10 cm or 5 degrees apart (%(default)s)')
@@ -83,13 +91,19 @@ def build(options: argparse.Namespace) -> int:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
+    labeller = prepare_labels(options, detections)
     with _ProgressBar() as bar:
         built = build_map(detections, _mapping_options(options), bar.show)
     head = [f'built by build_map from {source_of(options).name}', *built.report.lines()[:2]]
-    write_map(options.out, built.landmark_map, head)
+    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+    write_map(options.out, landmark_map, head, embeddings)
     if options.report is not None:
         _write_report(options.report, built)
     print('\n'.join(built.report.lines()))
+    if labeller.note:
+        print(f'note: {labeller.note}')
+    if built.mount is not None:
+        print(_mount_option(options, built.mount.given_from_corrected))
     print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')
     return 0
 
@@ -98,13 +112,14 @@ def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
     from cliploc_ros.mapping.options import MappingOptions
 
     return MappingOptions(
-        pose_errors=_pose_errors(options), min_viewpoints=options.min_viewpoints,
+        pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
+        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {source_of(options).name}', random_seed=options.seed)
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return how the poses may be off; None where they are not to be refined."""
+    """Return how the poses may be off; None where that is unknown, or not to be refined."""
     from cliploc_ros.mapping.options import PoseErrors
 
     if options.joint is False:
@@ -115,6 +130,16 @@ def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
         return None
     sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
     return PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
+
+
+def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
+    """Return the corrected mount as the option --mount takes it."""
+    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.datasets.poses import mount_from_numbers
+
+    given = correction if options.mount is None else mount_from_numbers(options.mount) @ correction
+    numbers = [*given[:3, 3], *quaternion_from_transform(given)]
+    return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 
 
 def _check_folder(path: Path) -> None:

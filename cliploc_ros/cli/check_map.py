@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.progress import StageBar
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, split_ros_args
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def check(options: argparse.Namespace) -> int:
         write_report(options.out, options.map.name, landmark_map, report)
     print('\n'.join(summary_lines(report)))
     print('what to do:')
-    print('\n'.join(f'  {_printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
+    print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
     print(f'wrote {options.out / PAGE} in {time.monotonic() - begin:.1f} s: '
@@ -154,11 +154,6 @@ def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObserva
     found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
     return [PosedObservation(one.observation, one.map_from_camera,
                              one.observation.stamp_ns / NS_PER_S) for one in found]
-
-
-def _printable(text: str) -> str:
-    """Return text for a terminal: ids in a map may hold any characters."""
-    return ''.join(char if char.isprintable() else ' ' for char in text)
 
 
 def _positive_int(text: str) -> int:

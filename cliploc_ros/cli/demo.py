@@ -14,7 +14,8 @@ from cliploc_ros.errors import OptionsError
 EPILOG = """\
 The demo plays a recording to the real detector and relocalizer, each in its own process. At each
 wake-up the robot stops, calls ~/relocalize, and goes on after the answer. At the end the demo
-writes a page of pictures to the folder of --out.
+writes a page of pictures to the folder of --out. With --map it first builds a map from a mapping
+walk and compares it with the room; the robot then wakes up in that map.
 """
 
 
@@ -45,8 +46,11 @@ def make_parser() -> argparse.ArgumentParser:
         help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
     parser.add_argument(
         '--assets', type=Path, default=ASSETS, metavar='DIR',
-        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt '
-        'and, except for class_*, clip.json and clip.safetensors')
+        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt, '
+        'for --map mapping/, and except for class_* clip.json and clip.safetensors')
+    parser.add_argument(
+        '--map', action='store_true',
+        help="build the map from the assets' mapping walk (mapping/), and wake up in it")
     parser.add_argument(
         '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
     return parser
@@ -62,8 +66,14 @@ def demonstrate(options: argparse.Namespace) -> int:
         ) from error
     from cliploc_ros.demo.run import DemoOptions, run_demo
 
-    run_demo(DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
-                         rate=options.rate, method=options.method, rviz=options.rviz))
+    chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
+                         rate=options.rate, method=options.method, rviz=options.rviz)
+    if options.map:
+        from cliploc_ros.demo.map_demo import run_map_demo
+
+        run_map_demo(chosen)
+    else:
+        run_demo(chosen)
     return 0
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.core.options import COMPARED
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
@@ -63,7 +64,9 @@ def make_parser() -> argparse.ArgumentParser:
                         help="of a query file; 'all' includes the neighbours of the queries")
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
     parser.add_argument('--workers', type=_positive_int, metavar='N',
-                        default=len(os.sched_getaffinity(0)), help='processes (%(default)s)')
+                        help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, instead of local processes')
     parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
     _add_paper_options(parser)
@@ -109,6 +112,9 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
     group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
     group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
+    group.add_argument('--landmark-embeddings', choices=COMPARED, default='both',
+                       help="compare crops with the map's labels (text), with the images next to "
+                       'it, or with both (%(default)s)')
     group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--every', type=_positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
@@ -152,7 +158,8 @@ def evaluate(options: argparse.Namespace) -> int:
                                   noise_deg, options.seed)
     if options.frames == 'main':
         queries = tuple(query for query in queries if recorded[query.number].is_main)
-    evaluation = Evaluation(landmark_map, queries, options.out, options.trials, options.workers)
+    evaluation = Evaluation(landmark_map, queries, options.out, options.trials,
+                            options.workers or _cores(), options.scheduler)
     evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
                        figures=options.figures, frames=recorded.frames)
     return 0
@@ -186,8 +193,10 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
                        device=options.device)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified])
-    queries = recorded_queries(frames, landmark_map,
-                               RecordingOptions(yolo, clip, EVERY_FRAME, reading))
+    recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,
+                                 options.scheduler)
+    queries = recorded_queries(frames, landmark_map, recording, str(options.map),
+                               options.landmark_embeddings)
     without = frames.count - len(queries)
     if without:
         print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
@@ -210,6 +219,11 @@ def _frames(options: argparse.Namespace) -> 'Frames':
         options.bag, BagTopics(options.image, options.camera_info, options.rectified),
         poses_of_topic(options.ground_truth, body_from_camera=None if mount is None
                        else mount_from_numbers(mount)))
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def _deviation(text: str) -> float:

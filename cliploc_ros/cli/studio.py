@@ -71,14 +71,14 @@ def serve(options: argparse.Namespace) -> int:
 
     studio = open_studio(options)
     try:
-        with serve_studio(studio, options.host, options.port) as url:
+        with serve_studio(studio, options.host, options.port) as served:
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
             for note in studio.document.notes:
                 print(f'note: {note}')
-            print(f'studio: {url}', flush=True)
+            print(f'studio: {served.url}', flush=True)
             if not options.no_browser:
-                webbrowser.open(url)
+                webbrowser.open(served.url)
             threading.Event().wait()
     finally:
         studio.document.close()

@@ -9,6 +9,11 @@ from typing import Any
 
 from cliploc_ros.errors import MapError
 
+#: A class with a smaller share of its boxes makes no candidate of a landmark. A guess.
+LEAST_CLASS_SHARE = 0.1
+#: Labels that describe one landmark, with their weights.
+WeightedLabels = tuple[tuple[str, float], ...]
+
 
 @dataclass(frozen=True)
 class LandmarkDetails:
@@ -34,7 +39,7 @@ class LandmarkDetails:
         Where it comes from.
     """
 
-    labels: tuple[tuple[str, float], ...] | None = None
+    labels: WeightedLabels | None = None
     class_weights: tuple[tuple[str, float], ...] | None = None
     position_sigma: float | None = None
     support: int | None = None
@@ -42,6 +47,20 @@ class LandmarkDetails:
     baseline_deg: float | None = None
     last_seen: float | None = None
     source: str | None = None
+
+    def labels_with(self, label: str) -> WeightedLabels:
+        """Return the labels; one that they lack, such as an edited one, counts like the best."""
+        if self.labels is None:
+            return ((label, 1.0),)
+        if any(text == label for text, _ in self.labels):
+            return self.labels
+        return ((label, max(weight for _, weight in self.labels)), *self.labels)
+
+    def likely_classes(self) -> tuple[str, ...]:
+        """Return the classes whose share is great enough for a correspondence candidate."""
+        weights = dict(self.class_weights or ())
+        least = LEAST_CLASS_SHARE * sum(weights.values())
+        return tuple(name for name, weight in weights.items() if weight >= least)
 
 
 OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))

@@ -4,7 +4,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
-from cliploc_ros.core.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
+from cliploc_ros.core.landmark_details import (
+    OPTIONAL_FIELDS,
+    LandmarkDetails,
+    WeightedLabels,
+    read_details,
+)
 from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
@@ -60,6 +65,16 @@ class LandmarkMap:
         """Return the number of landmarks."""
         return len(self.landmark_ids)
 
+    def select(self, rows: Sequence[int]) -> 'LandmarkMap':
+        """Return the map of some of the landmarks, at least one, in the order given."""
+        def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(values[row] for row in rows)
+
+        return LandmarkMap(
+            self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
+            self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
+            pick(self.details) if self.details else ())
+
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
         _ = self.shapes, self.classes, self.sorted_landmarks
@@ -69,15 +84,25 @@ class LandmarkMap:
         """Return the shape matrices (L, 6), see cliploc_ros.core.geometry.ellipsoid."""
         return shape_matrices(self.semi_axes, self.quats_xyzw)
 
+    @property
+    def weighted_labels(self) -> tuple[WeightedLabels, ...]:
+        """Return all labels that describe each landmark, with their weights."""
+        if not self.details:
+            return tuple(((label, 1.0),) for label in self.labels)
+        return tuple(one.labels_with(label)
+                     for one, label in zip(self.details, self.labels, strict=True))
+
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return the landmarks by class."""
-        return ClassIndex.of(self.class_ids)
+        """Return the landmarks by class: by their own, and by others that they are taken for."""
+        others = [(row, name) for row, one in enumerate(self.details)
+                  for name in one.likely_classes() if name != self.class_ids[row]]
+        return ClassIndex.of(self.class_ids, others)
 
     @cached_property
     def sorted_landmarks(self) -> SortedLandmarks:
         """Return the landmarks sorted by place."""
-        return sort_landmarks(self.centers, self.shapes, self.classes.of_landmarks)
+        return sort_landmarks(self.centers, self.shapes, self.classes.members)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':

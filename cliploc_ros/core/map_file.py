@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file."""
+"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and what lies next to it."""
 
 import json
 import os
@@ -11,6 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    save_landmark_embeddings,
+)
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 from cliploc_ros.replace_file import replace_file
@@ -19,8 +24,11 @@ _INDENT = ' ' * 10
 
 
 def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
-              comments: Iterable[str] = ()) -> None:
+              comments: Iterable[str] = (), embeddings: LandmarkEmbeddings | None = None
+              ) -> None:
     """Write a map file in one step: an existing file is replaced complete, or stays.
+
+    The image embeddings of a map that is replaced are removed: they are not of the new one.
 
     Parameters
     ----------
@@ -29,20 +37,25 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     landmark_map : LandmarkMap
     comments : iterable of str
         Lines for the head of the file.
+    embeddings : LandmarkEmbeddings, optional
+        Image embeddings of these landmarks, written next to the map.
 
     Raises
     ------
     MapError
-        The file cannot be written.
+        A file cannot be written.
     """
     path = Path(path)
     try:
         with replace_file(path) as partial, partial.open('w', encoding='utf-8') as file:
             file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
             file.writelines(f'{line}\n' for line in _lines(landmark_map))
+        embeddings_path(path).unlink(missing_ok=True)
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
+    if embeddings is not None:
+        save_landmark_embeddings(embeddings_path(path), embeddings)
 
 
 def _lines(landmark_map: LandmarkMap) -> Iterator[str]:

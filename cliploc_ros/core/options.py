@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from cliploc_ros.errors import OptionsError
 
 MATCHINGS = ('class', 'clip', 'hybrid')
+#: What crops are compared with: the map's labels, its images, or both.
+COMPARED = ('text', 'image', 'both')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
 
 

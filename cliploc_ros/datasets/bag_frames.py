@@ -18,6 +18,7 @@ from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
+from cliploc_ros.datasets.depth_messages import depth_counts_from_msg
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.datasets.poses import (
     POSE_TYPES,
@@ -27,7 +28,7 @@ from cliploc_ros.datasets.poses import (
     read_pose_topic,
 )
 from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg, image_from_msg
+from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.units import NS_PER_S
 
 _IMAGE = 'sensor_msgs/msg/Image'
@@ -50,7 +51,8 @@ class BagTopics:
     rectified : bool
         Whether images are rectified, so that P holds, without distortion.
     depth : str
-        sensor_msgs/Image of depth, 16UC1 or 32FC1; '' for none.
+        sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
+        none.
     """
 
     image: str = '/image'
@@ -101,7 +103,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
         raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')
     with BagReader(bag) as reader:
         for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
-                            *([(topics.depth, (_IMAGE,))] if topics.depth else [])):
+                            *([(topics.depth, _IMAGES)] if topics.depth else [])):
             topic = reader.topic(name)
             if topic.msgtype not in types:
                 raise DatasetError(f'{bag}: {name} is of type {topic.msgtype}, not '
@@ -109,13 +111,15 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
             if topic.message_count == 0:
                 raise DatasetError(f'{bag}: {name} has no messages')
         image = _first(reader, topics.image)
+        depth_type = reader.topic(topics.depth).msgtype if topics.depth else ''
         poses = read_poses(reader, str(image.header.frame_id))
         first_ns = stamp_ns(image)
         check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, str(bag))
         info = next(reader.messages([topics.camera_info])).data
         count = reader.topic(topics.image).message_count
     decode = partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified)
-    decode_depth = partial(_decode_depth, f'{bag}: {topics.depth}', depth or DepthFormat())
+    decode_depth = partial(_decode_depth, f'{bag}: {topics.depth}', depth_type,
+                           depth or DepthFormat())
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
@@ -186,8 +190,8 @@ def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: 
         raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
 
 
-def _decode_depth(where: str, form: DepthFormat, data: bytes) -> DepthImage:
-    message = _deserialize(data, _IMAGE, where)
+def _decode_depth(where: str, msgtype: str, form: DepthFormat, data: bytes) -> DepthImage:
+    message = _deserialize(data, msgtype, where)
     where = f'{where} at {stamp_ns(message) / NS_PER_S:.6f}'
     try:
         counts = depth_counts_from_msg(message)

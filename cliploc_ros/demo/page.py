@@ -27,7 +27,8 @@ table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabul
 th, td {{ text-align: left; padding: .25rem .8rem; border-bottom: 1px solid #ddd }}
 .accepted {{ color: {ACCEPTED} }} .refused {{ color: {REFUSED} }}
 .note {{ background: #fff6e5; border-left: 4px solid #E69F00; padding: .6rem 1rem }}
-figure {{ margin: 2rem 0 }} figcaption {{ font-size: 14px; color: #555 }}
+figure {{ margin: 2rem 0 }} details {{ margin: 1rem 0 }}
+figcaption {{ font-size: 14px; color: #555 }}
 """
 
 _SYNTHETIC = """\
@@ -78,8 +79,17 @@ def summary(judged: Sequence[Judged]) -> str:
         '(median)'
 
 
-def write_page(folder: Path, reviews: Sequence[Review], method: str) -> Path:
-    """Write the page that shows all pictures; return its file."""
+def write_page(folder: Path, reviews: Sequence[Review], method: str, section: str = '') -> Path:
+    """Write the page that shows all pictures; return its file.
+
+    Parameters
+    ----------
+    folder : Path
+    reviews : sequence of Review
+    method : str
+    section : str
+        What to say before the wake-ups, as HTML.
+    """
     judged = [review.judged for review in reviews]
     repeated = sum(review.repeated for review in reviews)
     how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
@@ -88,7 +98,7 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str) -> Path:
         '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
         '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
         '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
-        f'{escape(method)}.</p>', _SYNTHETIC, _table(judged),
+        f'{escape(method)}.</p>', _SYNTHETIC, section, _table(judged),
         f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
         '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
         'poses were not published.</figcaption></figure>', how,

@@ -152,8 +152,8 @@ def _match_cells(review: Review, landmark_map: LandmarkMap, detection: int, land
     if review.similarities is not None:
         row = review.similarities[detection]
         similarity, rank = f'{row[landmark]:.2f}', str(1 + int((row > row[landmark]).sum()))
-    is_true = None if review.true_ids is None else (
-        review.true_ids[detection] == landmark_map.landmark_ids[landmark])
+    is_true = None if review.true_landmarks is None else (
+        review.true_landmarks[detection] == landmark_map.landmark_ids[landmark])
     return landmark_map.labels[landmark], similarity, rank, is_true
 
 

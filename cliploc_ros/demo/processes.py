@@ -110,7 +110,7 @@ def node_command(name: str, parameters: Mapping[str, object]) -> list[object]:
     DemoError
         If the package is not installed.
     """
-    arguments: list[object] = [_find_executable(name), '--ros-args']
+    arguments: list[object] = [find_executable(name), '--ros-args']
     for parameter, value in parameters.items():
         arguments += ['-p', f'{parameter}:={value}']
     return arguments
@@ -118,11 +118,17 @@ def node_command(name: str, parameters: Mapping[str, object]) -> list[object]:
 
 def installed_share() -> Path:
     """Return the package's share folder."""
-    return _find_executable('detector').parents[2] / 'share' / 'cliploc_ros'
+    return find_executable('detector').parents[2] / 'share' / 'cliploc_ros'
 
 
-def _find_executable(name: str) -> Path:
-    """Find an executable beside the running one, or in the sourced workspace."""
+def find_executable(name: str) -> Path:
+    """Find an executable of the package beside the running one, or in the sourced workspace.
+
+    Raises
+    ------
+    DemoError
+        If the package is not installed.
+    """
     folders = [Path(sys.argv[0]).resolve().parent]
     try:
         from ament_index_python import get_package_prefix

@@ -17,14 +17,13 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.tum import TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
-from cliploc_ros.demo.truth import TrueBox, read_frames
+from cliploc_ros.demo.truth import TrueBox, read_frames, true_ids
 from cliploc_ros.units import NS_PER_S
 
 #: A pose with a greater error is wrong [m].
 WRONG_M = 1.0
 # A repeated search that differs by more than this has found another pose [m, deg].
 _SAME_POSE = (1e-6, 1e-4)
-_SAME_OBJECT_IOU = 0.5
 
 #: Makes an observation of image, camera, detections and stamp [ns].
 Observe = Callable[[NDArray[np.uint8], Camera, Detections, int], Observation]
@@ -83,8 +82,9 @@ class Review:
         Inliers of the best hypothesis.
     similarities : ndarray (n, L) or None
         Similarity of each crop and each label; None if the method matches classes only.
-    true_ids : tuple of str, or None
-        The object that each detection shows, '' if none; None if the recording lacks it.
+    true_landmarks : tuple of str, or None
+        The landmark of the object that each detection shows, '' if none; None if the recording
+        does not say it.
     repeated : bool
         Whether the repeated search found the pose that the node sent. If not, there are no
         matches.
@@ -96,7 +96,7 @@ class Review:
     detections: Detections
     matches: tuple[Match, ...]
     similarities: NDArray[np.float32] | None
-    true_ids: tuple[str, ...] | None
+    true_landmarks: tuple[str, ...] | None
     repeated: bool
 
 
@@ -124,14 +124,17 @@ class Reviewer:
         Searches the pose of observations, as `Relocalizer.relocalize`.
     max_detections : int
         The relocalizer's parameter of this name.
+    landmark_of : callable, optional
+        Returns the id of an object's landmark, '' if the map lacks it. By default the two ids are
+        equal.
     """
 
     def __init__(self, sequence: TumSequence, camera: Camera, observe: Observe,
                  relocalize: Callable[[Sequence[Observation]], Relocalization],
-                 max_detections: int) -> None:
+                 max_detections: int, landmark_of: Callable[[str], str] = str) -> None:
         self._sequence, self._camera = sequence, camera
         self._observe, self._relocalize = observe, relocalize
-        self._max_detections = max_detections
+        self._max_detections, self._landmark_of = max_detections, landmark_of
         self._true_boxes = _read_true_boxes(sequence.folder)
 
     def review(self, judged: Judged) -> Review:
@@ -148,7 +151,9 @@ class Reviewer:
                       found.matches if repeated else (),
                       None if observation.similarities is None
                       else np.asarray(observation.similarities),
-                      None if true_boxes is None else _true_ids(detections, true_boxes), repeated)
+                      None if true_boxes is None else tuple(map(
+                          self._landmark_of, true_ids(detections.bboxes_xyxy, true_boxes))),
+                      repeated)
 
 
 def _same_pose(first: NDArray[np.float64] | None, second: NDArray[np.float64] | None) -> bool:
@@ -170,20 +175,3 @@ def _read_true_boxes(folder: Path) -> dict[int, tuple[TrueBox, ...]]:
         return {}
     return {parse_stamp_ns(frame.timestamp, 'truth.json'): frame.boxes
             for frame in read_frames(folder, least_visibility=0.0)}
-
-
-def _true_ids(detections: Detections, true_boxes: tuple[TrueBox, ...]) -> tuple[str, ...]:
-    """Return the object whose visible part fills each box, or ''."""
-    ids = []
-    for bbox in detections.bboxes_xyxy:
-        ious = [_box_iou(bbox, true.bbox_xyxy) for true in true_boxes]
-        best = int(np.argmax(ious)) if ious else -1
-        ids.append(true_boxes[best].object_id if ious and ious[best] > _SAME_OBJECT_IOU else '')
-    return tuple(ids)
-
-
-def _box_iou(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
-    shared = float(np.prod(np.maximum(sides, 0.0)))
-    return shared / float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2])
-                          - shared)

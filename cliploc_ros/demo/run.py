@@ -44,6 +44,24 @@ _PATIENCE_S = 180.0
 
 
 @dataclass(frozen=True)
+class WakeUpMap:
+    """Another map than the assets' to wake up in.
+
+    Parameters
+    ----------
+    file : Path
+    landmark_of : callable
+        Returns the id of an object's landmark, '' if the map lacks it.
+    section : str
+        What the page says of the map, as HTML.
+    """
+
+    file: Path
+    landmark_of: Callable[[str], str]
+    section: str
+
+
+@dataclass(frozen=True)
 class DemoOptions:
     """Options of the demo.
 
@@ -62,6 +80,8 @@ class DemoOptions:
         Matching and algorithm, joined as in the paper: ``hybrid_auto``.
     rviz : bool
         Whether to open RViz if it is installed.
+    wake_up_map : WakeUpMap, optional
+        The map to wake up in; None: the assets' map.yaml.
     """
 
     assets: Path
@@ -70,12 +90,18 @@ class DemoOptions:
     rate: float = 4.0
     method: str = 'hybrid_auto'
     rviz: bool = False
+    wake_up_map: WakeUpMap | None = None
+
+    @property
+    def map_file(self) -> Path:
+        """Return the file of the map to wake up in."""
+        return self.assets / 'map.yaml' if self.wake_up_map is None else self.wake_up_map.file
 
     @property
     def parameters(self) -> dict[str, object]:
         """Return the relocalizer's parameters that differ from its defaults."""
         matching, _, algorithm = self.method.partition('_')
-        parameters: dict[str, object] = {'map_file': self.assets / 'map.yaml',
+        parameters: dict[str, object] = {'map_file': self.map_file,
                                          'matching': matching, 'algorithm': algorithm,
                                          'require_localizer': False,  # the demo has no AMCL
                                          # a search that the clock ends cannot be repeated
@@ -105,10 +131,8 @@ def run_demo(options: DemoOptions) -> list[Judged]:
         For missing or invalid assets, and if the nodes do not run.
     """
     start = time.monotonic()
-    relocalizer_options(options.values)  # refuses an unknown method before anything starts
-    _make_folder(options.out)
-    _check_assets(options)
-    landmark_map = LandmarkMap.from_file(options.assets / 'map.yaml')
+    prepare(options)
+    landmark_map = LandmarkMap.from_file(options.map_file)
     sequence = read_tum(options.assets / 'sequence')
     with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
         bag = _convert(sequence, Path(folder) / 'walk', landmark_map.frame_id)
@@ -124,7 +148,16 @@ def run_demo(options: DemoOptions) -> list[Judged]:
     return judged
 
 
-def _check_assets(options: DemoOptions) -> None:
+def prepare(options: DemoOptions) -> None:
+    """Check options and assets, and make the folder for the pictures, before anything starts.
+
+    Raises
+    ------
+    CliplocError
+        For an unknown method, missing assets, and a folder that cannot be written.
+    """
+    relocalizer_options(options.values)
+    _make_folder(options.out)
     needed = [options.assets / 'sequence', options.assets / 'yolo.pt',
               *(value for value in options.parameters.values() if isinstance(value, Path))]
     for path in needed:
@@ -217,7 +250,8 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
         reviews.append(reviewer.review(one))
         draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(one))
     draw_top_view(judged, landmark_map, _walked(sequence), options.out / page.TOP_VIEW)
-    return page.write_page(options.out, reviews, options.method)
+    section = '' if options.wake_up_map is None else options.wake_up_map.section
+    return page.write_page(options.out, reviews, options.method, section)
 
 
 def _walked(sequence: TumSequence) -> NDArray[np.float64]:
@@ -234,11 +268,12 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
 
     observe: Observe = observe_classes
     if method.needs_similarities:
-        from cliploc_ros.models.clip_encoder import load_encoder
+        from cliploc_ros.models.map_rows import load_encoder_for_map
         from cliploc_ros.models.observer import Observer
-        observe = Observer(*load_encoder(
+        observe = Observer(*load_encoder_for_map(
             ClipOptions(model=str(values['clip_model']),
                         pretrained=str(values['clip_pretrained'])),
-            landmark_map.labels)).observe
+            landmark_map, str(values['map_file']), values['landmark_embeddings'])).observe
     return Reviewer(sequence, camera, observe, Relocalizer(landmark_map, method).relocalize,
-                    values['max_detections'])
+                    values['max_detections'],
+                    str if options.wake_up_map is None else options.wake_up_map.landmark_of)

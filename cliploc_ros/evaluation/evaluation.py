@@ -47,7 +47,7 @@ class Evaluation:
     queries : sequence of Query
     out : Path
         An existing folder.
-    trials, workers : int
+    trials, workers, scheduler : int, int, str
         See run_methods.
     """
 
@@ -56,6 +56,7 @@ class Evaluation:
     out: Path
     trials: int
     workers: int
+    scheduler: str = ''
 
     def compare(self, methods: Sequence[Method], *, sweep: Sequence[int] = (),
                 resume: bool = False, figures: bool = True, frames: Sequence[QueryFrame] = ()
@@ -108,7 +109,8 @@ class Evaluation:
                 bar.update(len(results))
 
             return run_methods(self.landmark_map, methods, self.queries, trials=self.trials,
-                               workers=self.workers, done=done, advance=advance)
+                               workers=self.workers, scheduler=self.scheduler, done=done,
+                               advance=advance)
 
     @contextmanager
     def _progress(self, methods: Sequence[Method], done: int) -> Iterator[Any]:
@@ -128,6 +130,7 @@ class Evaluation:
             digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
             digest.update(repr(query.number).encode())
         world = hashlib.sha256(repr((self.landmark_map.landmark_ids, self.landmark_map.class_ids,
+                                     self.landmark_map.classes.members.tolist(),
                                      self.landmark_map.centers.tolist(),
                                      self.landmark_map.shapes.tolist())).encode())
         return {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': self.trials,

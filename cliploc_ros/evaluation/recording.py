@@ -14,14 +14,14 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import Recorded
 from cliploc_ros.datasets.queries import Queries, QueryFrame
-from cliploc_ros.models.clip_encoder import embed_labels
+from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.recording.recorder import RecordingOptions, observation_file, record_once
 
 logger = logging.getLogger(__name__)
 
 
-def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: RecordingOptions
-                     ) -> Queries:
+def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: RecordingOptions,
+                     map_file: str, compare: str) -> Queries:
     """Return the images with ground truth as queries; detector and CLIP run once.
 
     Parameters
@@ -30,6 +30,8 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     landmark_map : LandmarkMap
     options : RecordingOptions
         With CLIP.
+    map_file, compare : str
+        See load_encoder_for_map.
 
     Raises
     ------
@@ -38,7 +40,7 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
         warning only.
     """
     assert options.clip is not None
-    labels = embed_labels(options.clip, landmark_map.labels)
+    labels = embed_map(options.clip, landmark_map, map_file, compare)
     file = observation_file(frames, options)
     if file.exists() or os.access(file.parent, os.W_OK):
         return make_queries_of(record_once(frames, options), landmark_map, labels)

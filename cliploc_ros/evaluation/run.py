@@ -1,13 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""All trials of all methods on all queries, on all cores."""
+"""All trials of all methods on all queries, on all cores or on a cluster."""
 
-import ctypes
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from dataclasses import dataclass
 from itertools import batched
 from typing import NamedTuple
 
@@ -17,6 +14,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
+from cliploc_ros.parallel import run_tasks
 
 # A stopped run loses at most this many queries of each core.
 _QUERIES_A_PART = 8
@@ -34,9 +32,15 @@ class _Part(NamedTuple):
     trial: int
     places: tuple[int, ...]
 
+    @property
+    def name(self) -> str:
+        """Return what it is, for a message."""
+        return f'{self.method.name}, trial {self.trial}, rows {self.places[0]}-{self.places[-1]}'
+
 
 def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
-                *, trials: int, workers: int = 1, done: Sequence[Result] = (),
+                *, trials: int, workers: int = 1, scheduler: str = '',
+                done: Sequence[Result] = (),
                 advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
     """Run methods on queries.
 
@@ -47,8 +51,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
         A method that draws no samples runs one trial.
     queries : sequence of Query
     trials : int
-    workers : int
-        Number of processes; 1 uses this process. Results do not depend on it.
+    workers, scheduler : int, str
+        See cliploc_ros.parallel.run_tasks. Results do not depend on them.
     done : sequence of Result
         Results of an earlier run, which are not run again.
     advance : callable, optional
@@ -62,16 +66,27 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     Raises
     ------
     RunError
-        A worker died.
+        Workers died again and again at some queries; all others are done.
+    WorkersError
+        From the workers.
     """
     known = {(result.method, result.trial, result.query) for result in done}
     parts = list(_parts(methods, queries, trials, known))
-    results = list(done)
-    finished = _in_processes(landmark_map, queries, parts, workers) \
-        if workers > 1 and len(parts) > 1 else _here(landmark_map, queries, parts)
-    for part_results in finished:
-        results += part_results
-        advance(part_results)
+    results, lost = list(done), []
+    # a few queries are done sooner than a process starts
+    workers = workers if len(parts) > 1 else 1
+    with closing(run_tasks(_MakeSearch(landmark_map, queries), parts, workers=workers,
+                           scheduler=scheduler)) as finished:
+        for part, found in finished:
+            if found is None:
+                lost.append(part)
+            else:
+                results += found
+                advance(found)
+    if lost:
+        raise RunError(f'workers died again and again at {len(lost)} of {len(parts)} parts, first '
+                       f'at {lost[0].name}; the others are done: continue with --resume and fewer '
+                       '--workers')
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda one: (order[one.method], one.trial, one.query))
 
@@ -92,54 +107,19 @@ def _parts(methods: Sequence[Method], queries: Sequence[Query], trials: int,
                 yield _Part(method, trial, some)
 
 
-def _here(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_Part]
-          ) -> Iterator[list[Result]]:
-    _prepare(landmark_map, queries)
-    for part in parts:
-        yield _run_part(part)
+@dataclass(frozen=True, eq=False)
+class _MakeSearch:
+    """Makes the function that runs a part; holds what all parts share."""
 
+    landmark_map: LandmarkMap
+    queries: Sequence[Query]
 
-def _in_processes(landmark_map: LandmarkMap, queries: Sequence[Query], parts: Sequence[_Part],
-                  workers: int) -> Iterator[list[Result]]:
-    # spawned, since forking a process that has run PyTorch's threads may hang
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'),
-                               initializer=_begin_worker, initargs=(landmark_map, queries))
-    # the pool forgets its processes when it shuts down
-    processes = pool._processes
-    futures: list[Future[list[Result]]] = []
-    try:
-        futures += [pool.submit(_run_part, part) for part in parts]
-        for future in as_completed(futures):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise RunError('a worker process died, perhaps out of memory; continue with --resume and '
-                       'fewer --workers') from error
-    except BaseException:
-        for process in [*processes.values()]:
-            process.terminate()  # an exhaustive search may take minutes
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+    def __call__(self) -> Callable[[_Part], list[Result]]:
+        """Return the function, after the kernels are compiled: searches are timed."""
+        Relocalizer(self.landmark_map,
+                    RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
+        return self._run
 
-
-_landmark_map: LandmarkMap
-_queries: Sequence[Query]
-
-
-def _begin_worker(landmark_map: LandmarkMap, queries: Sequence[Query]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    # a killed parent cannot end its workers, so the kernel does
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    _prepare(landmark_map, queries)
-
-
-def _prepare(landmark_map: LandmarkMap, queries: Sequence[Query]) -> None:
-    """Keep what all parts share, and compile the kernels before a search is timed."""
-    global _landmark_map, _queries  # a pool's workers have no other memory
-    _landmark_map, _queries = landmark_map, queries
-    Relocalizer(landmark_map, RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
-
-
-def _run_part(part: _Part) -> list[Result]:
-    queries = [_queries[place] for place in part.places]
-    return run_trial(_landmark_map, part.method, part.trial, queries)
+    def _run(self, part: _Part) -> list[Result]:
+        return run_trial(self.landmark_map, part.method, part.trial,
+                         [self.queries[place] for place in part.places])

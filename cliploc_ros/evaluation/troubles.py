@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.evaluation.trials import Query
@@ -27,7 +29,8 @@ def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share:
                     labels=tuple(landmark_map.labels[row] for row in kept),
                     class_ids=tuple(landmark_map.class_ids[row] for row in kept),
                     centers=landmark_map.centers[kept], semi_axes=landmark_map.semi_axes[kept],
-                    quats_xyzw=landmark_map.quats_xyzw[kept])
+                    quats_xyzw=landmark_map.quats_xyzw[kept],
+                    details=_of_rows(landmark_map.details, kept))
     return fewer, [_with_similarities(query, np.asarray(query.observation.similarities)[:, kept])
                    for query in queries]
 
@@ -59,7 +62,8 @@ def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     source = np.arange(count)
     source[chosen] = np.roll(chosen, 1)
     wrong = replace(landmark_map, labels=tuple(landmark_map.labels[row] for row in source),
-                    class_ids=tuple(landmark_map.class_ids[row] for row in source))
+                    class_ids=tuple(landmark_map.class_ids[row] for row in source),
+                    details=_of_rows(landmark_map.details, source))
     return wrong, [_with_similarities(query, np.asarray(query.observation.similarities)[:, source])
                    for query in queries]
 
@@ -74,6 +78,12 @@ def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share
                       rng: np.random.Generator) -> World:
     """Add random boxes, a number for each true one, that look like random landmarks."""
     return landmark_map, [_with_invented(query, share, rng) for query in queries]
+
+
+def _of_rows(details: tuple[LandmarkDetails, ...], rows: NDArray[np.int64]
+             ) -> tuple[LandmarkDetails, ...]:
+    """Return the details of some landmarks of a map; none where it has none."""
+    return tuple(details[row] for row in rows) if details else ()
 
 
 def _without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:

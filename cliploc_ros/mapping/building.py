@@ -3,7 +3,7 @@
 """The entry point of mapping: posed detections in, a map and a report out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,9 @@ from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.joint import pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks, no_landmarks
 from cliploc_ros.mapping.merging import merge_classes, merge_duplicates
-from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.mount import MountCorrection, refine_mount
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
@@ -52,12 +54,15 @@ class BuiltMap:
         Row of the landmark that each box shows, -1 for none.
     map_from_camera : ndarray (F, 4, 4)
         The poses, refined where that was asked for.
+    mount : MountCorrection, optional
+        Where a correction was asked for.
     """
 
     landmark_map: LandmarkMap
     report: MappingReport
     shown: NDArray[np.int64]
     map_from_camera: NDArray[np.float64]
+    mount: MountCorrection | None = None
 
 
 def build_map(detections: PosedDetections, options: MappingOptions | None = None,
@@ -84,18 +89,17 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     if detections.depths is not None:
         given, options, depth_notes = _with_depths(detections, given, options, rng, tell)
         notes += depth_notes
-    views = given
-    draft = _draft(views, options, rng, tell)
-    if options.pose_errors is not None:
-        for number in range(options.rebuilds):
-            tell('refining poses', number / options.rebuilds)
-            views, draft = _refine(given, views, draft, options)
-            draft = _draft(views, options, rng, tell)
-        views, draft = _refine(given, views, draft, options)
+    draft = _draft(given, options, rng, tell)
+    mount = None
+    if options.refine_mount:
+        mount, draft = _with_mount(given, draft, options, rng, tell)
+        given, notes = mount.views, notes + mount.lines()
+    views, draft, pose_notes = _with_poses(given, draft, options, rng, tell)
+    notes += pose_notes
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
         raise MappingError(_nothing_found(draft))
-    return _finish(detections, given, views, draft, options, notes)
+    return replace(_finish(detections, given, views, draft, options, notes), mount=mount)
 
 
 def _with_depths(detections: PosedDetections, views: Views, options: MappingOptions,
@@ -108,6 +112,46 @@ def _with_depths(detections: PosedDetections, views: Views, options: MappingOpti
     scale = depth_scale(with_depths, draft.landmarks, draft.shown, evidence.baseline_deg)
     with_depths, notes = correct_scale(with_depths, detections, scale)
     return with_depths, options_with_depth(options), notes
+
+
+def _with_mount(given: Views, draft: '_Draft', options: MappingOptions,
+                rng: np.random.Generator, tell: Progress) -> tuple[MountCorrection, '_Draft']:
+    """Return the correction of the mount, and a draft of the views with the correction."""
+    views = given
+    for number in range(options.rebuilds + 1):
+        tell('refining the mount', number / (options.rebuilds + 1))
+        found = refine_mount(given, draft.landmarks, draft.shown, views)
+        views = found.views
+        draft = _draft(views, options, rng, tell)
+    return found, draft
+
+
+def _with_poses(given: Views, draft: '_Draft', options: MappingOptions,
+                rng: np.random.Generator, tell: Progress) -> tuple[Views, '_Draft', list[str]]:
+    """Return the views with refined poses, the landmarks that fit them, and notes.
+
+    Poses are refined where their errors are given, or estimated and significant.
+    """
+    views, errors, notes = given, options.pose_errors, list[str]()
+    is_estimated = errors is None and options.estimate_pose_errors
+    if is_estimated:
+        tell('estimating pose errors', 0.0)
+        errors = significant_pose_errors(given, draft.landmarks, draft.shown)
+    if errors is None:
+        return views, draft, notes
+    for number in range(options.rebuilds):
+        tell('refining poses', number / options.rebuilds)
+        views, draft = _refine(given, views, draft, errors, options)
+        draft = _draft(views, options, rng, tell)
+        if is_estimated:
+            # objects that were split before tell more now
+            errors = estimate_pose_errors(given, draft.landmarks, draft.shown, views) or errors
+    if is_estimated:
+        notes.append(f'poses are off by about {100 * errors.sigma_m:.1f} cm and '
+                     f'{errors.sigma_deg:.1f} degrees on each axis for {errors.correlation_s:.1f} '
+                     's, estimated from the boxes; refined')
+    views, draft = _refine(given, views, draft, errors, options)
+    return views, draft, notes
 
 
 class _Draft(NamedTuple):
@@ -143,17 +187,16 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
                   evidence.select(~kept))
 
 
-def _refine(given: Views, views: Views, draft: _Draft, options: MappingOptions
-            ) -> tuple[Views, _Draft]:
+def _refine(given: Views, views: Views, draft: _Draft, errors: PoseErrors,
+            options: MappingOptions) -> tuple[Views, _Draft]:
     """Return the views with refined poses, and the landmarks that fit them.
 
     Errors of the poses split objects in two. Poses and parts move towards each other in turns,
     until the parts merge.
     """
-    assert options.pose_errors is not None
     landmarks, shown = draft.landmarks, draft.shown
     for _ in range(options.refinements):
-        views, landmarks = refine_jointly(given, views, landmarks, shown, options.pose_errors)
+        views, landmarks = refine_jointly(given, views, landmarks, shown, errors)
         landmarks = _settle(views, landmarks, options)
         shown = associate(views, landmarks, options.association_iou)
     return views, draft._replace(landmarks=landmarks, shown=shown)
@@ -246,9 +289,10 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
     semi_axes = np.linalg.norm(landmarks.bases, axis=1)
     rotations = landmarks.bases / semi_axes[:, None, :]
     rotations[np.linalg.det(rotations) < 0.0] *= -1.0
+    boxes_of = group_boxes(shown, len(names))
     details = tuple(
         LandmarkDetails(
-            class_weights=_class_weights(detections, shown == row),
+            class_weights=_class_weights(detections, boxes_of[row]),
             position_sigma=float(evidence.position_sigma[row]),
             support=int(evidence.support[row]), seen_ratio=float(evidence.seen_ratio[row]),
             baseline_deg=float(evidence.baseline_deg[row]),
@@ -258,7 +302,7 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
                        semi_axes, Rotation.from_matrix(rotations).as_quat(), details)
 
 
-def _class_weights(detections: PosedDetections, rows: NDArray[np.bool_]
+def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
                    ) -> tuple[tuple[str, float], ...] | None:
     """Return the classes of some boxes with their shares, the greatest first; None for one."""
     counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))

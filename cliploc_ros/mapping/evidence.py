@@ -68,7 +68,9 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         The landmark that each box shows, -1 for none.
     """
     rows_of = group_boxes(shown, len(landmarks.centers))
-    per_landmark = [_evidence_of(views, landmarks.centers[number], landmarks.bases[number], rows)
+    cameras = camera_centers(views, np.arange(len(views.rotations)))
+    per_landmark = [_evidence_of(views, cameras, landmarks.centers[number],
+                                 landmarks.bases[number], rows)
                     for number, rows in enumerate(rows_of)]
     columns = np.array(per_landmark, dtype=np.float64).reshape(-1, 7).T
     counts = columns[:3].astype(np.int64)
@@ -82,22 +84,34 @@ def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]
     return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
 
 
-def _evidence_of(views: Views, center: NDArray[np.float64], basis: NDArray[np.float64],
-                 rows: NDArray[np.int64]) -> tuple[float, ...]:
+def _evidence_of(views: Views, cameras: NDArray[np.float64], center: NDArray[np.float64],
+                 basis: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[float, ...]:
     if len(rows) == 0:
         return 0, 0, 0, 0.0, np.inf, 0.0, np.nan
     frames = views.frames[rows]
-    offsets = center - camera_centers(views, frames)
+    offsets = center - cameras[frames]
     distances = np.linalg.norm(offsets, axis=1)
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-    covariance = np.linalg.inv(information)[:3, :3]
     return (len(rows), len(np.unique(views.viewpoints[frames])),
-            count_expected(views, center, basis, _REACH * distances.max()),
+            count_expected(views, cameras, center, basis, _REACH * distances.max()),
             widest_angle_deg(offsets / distances[:, None]),
-            float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+            _position_sigma(information),
             float(np.median(ious_with(views, rows, center, basis))),
             float(views.stamps_s[frames].max()))
+
+
+def _position_sigma(information: NDArray[np.float64]) -> float:
+    """Return the deviation [m] of a centre on its worst axis; inf where its boxes leave it open.
+
+    A box that the image cuts on all sides tells nothing about the centre.
+    """
+    try:
+        variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
+    except np.linalg.LinAlgError:
+        return np.inf
+    # rounding makes what no box restrains negative
+    return float(np.sqrt(variance)) if variance > 0.0 else np.inf
 
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
@@ -127,16 +141,17 @@ def ious_with(views, rows, center, basis):
 
 
 @compiled
-def count_expected(views, center, basis, reach):
+def count_expected(views, cameras, center, basis, reach):
     """Return in how many frames an ellipsoid lies in the image, and no farther than reach [m]."""
     count, box = 0, np.empty(4)
     left, top, right, bottom = views.bounds
-    for frame in range(len(views.rotations)):
-        rotation, translation = views.rotations[frame], views.translations[frame]
-        if not project_box(rotation, translation, center, basis, box):
+    for frame in range(len(cameras)):
+        distance_2 = 0.0
+        for i in range(3):
+            distance_2 += (center[i] - cameras[frame, i]) ** 2
+        if distance_2 > reach * reach:
             continue
-        offset = rotation @ center + translation
-        if (offset * offset).sum() > reach * reach:
+        if not project_box(views.rotations[frame], views.translations[frame], center, basis, box):
             continue
         width = min(box[2], right) - max(box[0], left)
         height = min(box[3], bottom) - max(box[1], top)

@@ -50,7 +50,7 @@ _LEAST_IMPROVEMENT = 1e-3
 _MAX_DAMPING = 1e4
 
 
-class _Equations(NamedTuple):
+class Equations(NamedTuple):
     """Normal equations: F poses, L landmarks, m boxes."""
 
     of_landmarks: NDArray[np.float64]    # (L, 9, 9)
@@ -78,8 +78,8 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
         The most steps of Levenberg and Marquardt.
     """
     rows = np.nonzero(shown >= 0)[0]
-    problem = _Problem(views, rows, shown[rows], _Prior.of(views.stamps_s, errors))
-    state = _State(views, landmarks, pose_errors(given, views))
+    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors))
+    state = State(views, landmarks, pose_errors(given, views))
     cost, equations = problem.linearize(state)
     damping = 1e-4
     for _ in range(iterations):
@@ -106,7 +106,7 @@ def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
     return np.concatenate([offsets, Rotation.from_matrix(turns).as_rotvec()], axis=1)
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     """Views with their present poses, landmarks, and the errors (F, 6) of the given poses."""
 
     views: Views
@@ -114,7 +114,7 @@ class _State(NamedTuple):
     errors: NDArray[np.float64]
 
     def moved(self, landmark_steps: NDArray[np.float64], pose_steps: NDArray[np.float64]
-              ) -> '_State':
+              ) -> 'State':
         """Return the state after steps (L, 9) and (F, 6)."""
         centers = np.empty_like(self.landmarks.centers)
         bases = np.empty_like(self.landmarks.bases)
@@ -123,19 +123,19 @@ class _State(NamedTuple):
         origins = camera_centers(self.views, np.arange(len(self.errors)))
         rotations = np.ascontiguousarray(self.views.rotations @ turned)
         translations = -np.einsum('fij,fj->fi', rotations, origins + pose_steps[:, :3])
-        return _State(self.views._replace(rotations=rotations, translations=translations),
+        return State(self.views._replace(rotations=rotations, translations=translations),
                       Landmarks(centers, bases, self.landmarks.classes),
                       self.errors + pose_steps)
 
 
-class _Prior(NamedTuple):
+class Prior(NamedTuple):
     """The information of the process of errors: its diagonal and next-to-diagonal (F, 6)."""
 
     diagonal: NDArray[np.float64]
     beside: NDArray[np.float64]
 
     @staticmethod
-    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> '_Prior':
+    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'Prior':
         """Return the prior of frames at some times."""
         kept = np.zeros(len(stamps_s))
         if errors.correlation_s > 0.0:
@@ -148,7 +148,15 @@ class _Prior(NamedTuple):
         beside = np.zeros(len(stamps_s))
         beside[:-1] = -gain * kept[:-1]
         weights = 1.0 / errors.sigmas ** 2
-        return _Prior(diagonal[:, None] * weights, beside[:, None] * weights)
+        return Prior(diagonal[:, None] * weights, beside[:, None] * weights)
+
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of the information."""
+        # Q = L D L': each pivot is what the frames before leave of the diagonal
+        pivots = self.diagonal.copy()
+        for frame in range(1, len(pivots)):
+            pivots[frame] -= self.beside[frame - 1] ** 2 / pivots[frame - 1]
+        return float(np.log(pivots).sum())
 
     def gradient(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the information times errors (F, 6)."""
@@ -158,18 +166,18 @@ class _Prior(NamedTuple):
         return product
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """What stays the same over the iterations: m boxes and the landmark that each shows."""
 
     views: Views
     rows: NDArray[np.int64]
     landmarks: NDArray[np.int64]
-    prior: _Prior
+    prior: Prior
 
-    def linearize(self, state: _State) -> tuple[float, _Equations]:
+    def linearize(self, state: State) -> tuple[float, Equations]:
         """Return the cost of a state and its normal equations."""
         count, frames = len(state.landmarks.centers), len(state.errors)
-        equations = _Equations(
+        equations = Equations(
             np.zeros((count, LANDMARK_SIZE, LANDMARK_SIZE)),
             np.zeros((frames, POSE_SIZE, POSE_SIZE)),
             np.zeros((len(self.rows), POSE_SIZE, LANDMARK_SIZE)),
@@ -180,16 +188,16 @@ class _Problem(NamedTuple):
         equations.pose_gradient[:] += pull
         return cost + 0.5 * float((pull * state.errors).sum()), equations
 
-    def solve(self, equations: _Equations, damping: float
+    def solve(self, equations: Equations, damping: float
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the steps of the landmarks (L, 9) and of the poses (F, 6)."""
         count, frames = len(equations.of_landmarks), len(equations.of_poses)
-        factor = cholesky_banded(self._banded(equations.of_poses, damping), lower=True)
+        factor = cholesky_banded(self.banded(equations.of_poses, damping), lower=True)
         of_landmarks = equations.of_landmarks.copy()
         diagonal = np.arange(LANDMARK_SIZE)
         of_landmarks[:, diagonal, diagonal] *= 1.0 + damping
         of_landmarks[:, diagonal, diagonal] += 1e-9
-        coupling = self._coupling(equations.of_boxes, frames, count)
+        coupling = self.coupling(equations.of_boxes, frames, count)
         inverses = np.linalg.inv(of_landmarks)
 
         def reduced(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -210,23 +218,28 @@ class _Problem(NamedTuple):
                                  -equations.pose_gradient.ravel() - coupling @ steps)
         return steps.reshape(count, -1), poses.reshape(frames, -1)
 
-    def _coupling(self, of_boxes: NDArray[np.float64], frames: int, count: int) -> bsr_matrix:
+    def coupling(self, of_boxes: NDArray[np.float64], frames: int, count: int) -> bsr_matrix:
         """Return the part (6 F, 9 L) of the equations that joins poses and landmarks."""
         order = np.lexsort((self.landmarks, self.views.frames[self.rows]))
         starts = np.searchsorted(self.views.frames[self.rows][order], np.arange(frames + 1))
         return bsr_matrix((of_boxes[order], self.landmarks[order], starts),
                           shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
 
-    def _banded(self, of_poses: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
+    def banded(self, of_poses: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
         """Return the poses' part of the equations with the prior, as lower bands (7, 6 F)."""
-        frames = len(of_poses)
-        bands = np.zeros((POSE_SIZE + 1, frames, POSE_SIZE))
+        bands = self.bands_of(of_poses, self.prior)
+        bands[0] *= 1.0 + damping
+        return bands
+
+    @staticmethod
+    def bands_of(of_poses: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+        """Return blocks (F, 6, 6) with the information of a prior, as lower bands (7, 6 F)."""
+        bands = np.zeros((POSE_SIZE + 1, len(of_poses), POSE_SIZE))
         for below in range(POSE_SIZE):
             for column in range(POSE_SIZE - below):
                 bands[below, :, column] = of_poses[:, column + below, column]
-        bands[0] += self.prior.diagonal
-        bands[0] *= 1.0 + damping
-        bands[POSE_SIZE] = self.prior.beside
+        bands[0] += prior.diagonal
+        bands[POSE_SIZE] = prior.beside
         return bands.reshape(POSE_SIZE + 1, -1)
 
 

@@ -6,6 +6,8 @@ Two landmarks that lie in one another are one object, unless frames show both of
 detector may call one object by two names, in different frames or in one.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -21,6 +23,24 @@ from cliploc_ros.mapping.views import Views
 _ONE_BOX_IOU = 0.6
 
 
+class Merged(NamedTuple):
+    """Landmarks after merging: K of L are left.
+
+    Parameters
+    ----------
+    landmarks : Landmarks
+        The K that are left, in their order.
+    shown : ndarray (n,) of int
+        The landmark, of those that are left, that each box shows, -1 for none.
+    into : ndarray (L,) of int
+        The landmark, of those before merging, that each one is part of now.
+    """
+
+    landmarks: Landmarks
+    shown: NDArray[np.int64]
+    into: NDArray[np.int64]
+
+
 def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                      options: MappingOptions) -> tuple[Landmarks, NDArray[np.int64]]:
     """Return the landmarks with duplicates merged, and which of them each box shows.
@@ -33,8 +53,9 @@ def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64
         The landmark that each box shows, -1 for none.
     options : MappingOptions
     """
-    return _merge(views, landmarks, shown, pairs_of_one_class(landmarks, options.merge_distance),
-                  options)
+    merged = merge_pairs(views, landmarks, shown,
+                         pairs_of_one_class(landmarks, options.merge_distance), options)
+    return merged.landmarks, merged.shown
 
 
 def merge_classes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
@@ -45,7 +66,8 @@ def merge_classes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
     """
     pairs = [pair for pair in _close_pairs(landmarks, options.class_merge_distance)
              if landmarks.classes[pair[0]] != landmarks.classes[pair[1]]]
-    return _merge(views, landmarks, shown, pairs, options)
+    merged = merge_pairs(views, landmarks, shown, pairs, options)
+    return merged.landmarks, merged.shown
 
 
 def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
@@ -54,15 +76,14 @@ def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[
             if landmarks.classes[pair[0]] == landmarks.classes[pair[1]]]
 
 
-def _merge(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-           pairs: list[tuple[int, int]], options: MappingOptions
-           ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Merge those of the pairs that are one object."""
+def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                pairs: list[tuple[int, int]], options: MappingOptions) -> Merged:
+    """Merge those of the pairs that are one object, in the order given."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     rows_of = group_boxes(shown, len(centers))
-    is_kept = np.ones(len(centers), dtype=np.bool_)
+    into = np.arange(len(centers))
     for first, second in pairs:
-        if not (is_kept[first] and is_kept[second]):
+        if into[first] != first or into[second] != second:
             continue
         keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
                       else (second, first))
@@ -76,12 +97,13 @@ def _merge(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
         if len(rows) and after.mean() < before.mean() - options.merge_loss:
             continue
         centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, rows
-        is_kept[drop] = False
+        into[into == drop] = keep
+    is_kept = into == np.arange(len(into))
     numbers = np.cumsum(is_kept) - 1
     merged = np.full(len(shown), -1, dtype=np.int64)
     for number in np.nonzero(is_kept)[0]:
         merged[rows_of[number]] = numbers[number]
-    return Landmarks(centers, bases, landmarks.classes).select(is_kept), merged
+    return Merged(Landmarks(centers, bases, landmarks.classes).select(is_kept), merged, into)
 
 
 def _close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:

@@ -62,7 +62,8 @@ class MappingOptions:
     merge_loss : float
         Or the mean IoU of their boxes falls by more than this.
     min_seen_ratio : float
-        Share of the frames showing a landmark's place in which it must be detected.
+        Share of the frames showing a landmark's place in which it must be detected. Chance
+        arrangements of boxes are seen rarely, but so are objects that others hide.
     min_baseline_deg : float
         Least angle between two of its directions [deg].
     max_position_sigma_m, max_position_sigma_share : float
@@ -71,6 +72,10 @@ class MappingOptions:
         Of a landmark's boxes.
     pose_errors : PoseErrors, optional
         Refine the poses with the landmarks, as far as they may be off; None: poses are exact.
+    estimate_pose_errors : bool
+        Without pose_errors, estimate them, and refine the poses where they are significant.
+    refine_mount : bool
+        Correct the mount of the camera, which all poses share.
     rebuilds : int
         How often the map is built anew with refined poses.
     refinements : int
@@ -100,6 +105,8 @@ class MappingOptions:
     max_position_sigma_share: float = 0.1
     min_median_iou: float = 0.5
     pose_errors: PoseErrors | None = None
+    estimate_pose_errors: bool = False
+    refine_mount: bool = False
     rebuilds: int = 1
     refinements: int = 3
     frame_id: str = 'map'

@@ -6,22 +6,32 @@ import logging
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.index.similarities import LabelEmbeddings
+from cliploc_ros.core.landmark_details import WeightedLabels
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_towers import load_image_tower, load_text_tower, quiet_root_logger
+from cliploc_ros.models.clip_towers import (
+    cut_padding,
+    load_image_tower,
+    load_text_tower,
+    quiet_root_logger,
+)
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory, resolve_device, resolve_precision
 from cliploc_ros.models.files import resolve_cache_dir
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.models.weighted_labels import mixed_rows
 
 if TYPE_CHECKING:
     import torch
+
+Label = str | WeightedLabels
 
 _LABEL_BATCH = 64
 # CLIP sees only the middle square of a long crop; beyond this ratio the rest has no influence.
@@ -37,7 +47,7 @@ class LoadedEncoder(NamedTuple):
     label_embeddings: LabelEmbeddings
 
 
-def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
+def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder:
     """Load CLIP for a map: encode its labels and keep only the image tower.
 
     The labels' embeddings come from the cache if it knows model, weights and labels; then the text
@@ -48,8 +58,8 @@ def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
     ----------
     options : ClipOptions
         Which CLIP, and how to run it.
-    labels : sequence of str
-        The map's labels; they may repeat.
+    labels : sequence of str or WeightedLabels
+        What describes each landmark of the map; they may repeat.
 
     Raises
     ------
@@ -66,26 +76,33 @@ def load_encoder(options: ClipOptions, labels: Sequence[str]) -> LoadedEncoder:
     return LoadedEncoder(encoder, embeddings)
 
 
-def embed_labels(options: ClipOptions, labels: Sequence[str]) -> LabelEmbeddings:
+def embed_labels(options: ClipOptions, labels: Sequence[Label]) -> LabelEmbeddings:
     """Return the embeddings of other labels for an encoder that stays, see `load_encoder`."""
     return _embed_labels(resolve_clip_weights(options), options, labels)
 
 
-def _embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
+def _embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
                   ) -> LabelEmbeddings:
+    described = [((one, 1.0),) if isinstance(one, str) else one for one in labels]
     # Once each and sorted: moving or reordering landmarks needs no new embeddings.
-    unique = sorted(set(labels))
+    unique = sorted(set(described))
+    embeddings = mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim)
+    rows = {one: row for row, one in enumerate(unique)}
+    return LabelEmbeddings(embeddings, np.array([rows[one] for one in described], dtype=np.int64))
+
+
+def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
+                  ) -> NDArray[np.float32]:
+    """Return the embeddings of labels: those in the cache, or new ones, which it then holds."""
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
-    embeddings = cache.load(weights.key, unique, weights.embed_dim)
+    embeddings = cache.load(weights.key, labels, weights.embed_dim)
     source = 'cached'
     if embeddings is None:
         source = 'encoded'
-        embeddings = encode_labels(weights, unique, resolve_device(options.device))
-        cache.store(weights.key, unique, embeddings)
-    logger.info('CLIP %s: %d labels %s', weights.model, len(unique), source)
-    rows = {label: row for row, label in enumerate(unique)}
-    of_landmarks = np.array([rows[label] for label in labels], dtype=np.int64)
-    return LabelEmbeddings(embeddings, of_landmarks)
+        embeddings = encode_labels(weights, labels, resolve_device(options.device))
+        cache.store(weights.key, labels, embeddings)
+    logger.info('CLIP %s: %d labels %s', weights.model, len(labels), source)
+    return embeddings
 
 
 class ClipEncoder:
@@ -217,11 +234,10 @@ def _run_text_tower(
     with quiet_root_logger():
         tokenizer = open_clip.get_tokenizer(weights.model)
     _warn_of_long_labels(tokenizer, labels)
-    model = load_text_tower(weights, device)
+    model, tokens = cut_padding(load_text_tower(weights, device), tokenizer(list(labels)))
     with torch.inference_mode():
-        batches = [tokenizer(list(labels[start:start + _LABEL_BATCH])).to(device)
-                   for start in range(0, len(labels), _LABEL_BATCH)]
-        return [_normalize(model.encode_text(batch, normalize=False)) for batch in batches]
+        return [_normalize(model.encode_text(batch.to(device), normalize=False))
+                for batch in tokens.split(_LABEL_BATCH)]
 
 
 def _warn_of_long_labels(tokenizer: Any, labels: Sequence[str]) -> None:

@@ -49,6 +49,28 @@ def load_text_tower(weights: ClipWeights, device: 'torch.device') -> Any:
     return model
 
 
+def cut_padding(model: Any, tokens: 'torch.Tensor') -> 'tuple[Any, torch.Tensor]':
+    """Return a text tower for the longest of its texts, and their tokens without padding.
+
+    In a causal tower that is read at a text's end, nothing depends on the padding after it. Twelve
+    tokens instead of 77 take a quarter of the time. Any other tower stays as it is.
+
+    Parameters
+    ----------
+    model : CLIP
+        With a text tower, which is for these texts only afterwards.
+    tokens : Tensor (L, context) of int
+        The padding is 0.
+    """
+    text = model.text
+    if (getattr(text, 'pool_type', '') != 'argmax' or getattr(text, 'attn_mask', None) is None
+            or getattr(text, 'cls_emb', None) is not None):
+        return model, tokens
+    longest = int(tokens.any(dim=0).nonzero().max()) + 1
+    text.attn_mask = text.attn_mask[:longest, :longest]
+    return model, tokens[:, :longest]
+
+
 def _load(
     weights: ClipWeights, tower: str, device: 'torch.device', precision: str
 ) -> tuple[Any, Any]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 _FORMAT = 1
 # A map of 1,000 labels takes 3 MB with ViT-L-14.
-_MAX_FILES = 32
+_MOST_FILES = 32
 _STALE_S = 24 * 3600.0
 
 logger = logging.getLogger(__name__)
@@ -31,17 +31,19 @@ class LabelCache:
     weights) and of the labels. The file holds both, which reveals a foreign or damaged one. One
     file holds the whole set, not one label: embeddings then never depend on earlier batches, and
     an edit of the map costs one cold start. Files are written under another name and renamed, so
-    that any number of processes may share the folder. A hit marks its file as used; beyond 32
-    files the least recently used are removed.
+    that any number of processes may share the folder. A hit marks its file as used.
 
     Parameters
     ----------
     folder : Path
         The folder; made at the first write.
+    most_files : int
+        Beyond these, the least recently used files are removed.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, most_files: int = _MOST_FILES) -> None:
         self._folder = folder
+        self._most_files = most_files
 
     def load(self, key: str, labels: Sequence[str], embed_dim: int) -> NDArray[np.float32] | None:
         """Return the embeddings (L, embed_dim) of L labels, or None if the cache lacks them."""
@@ -95,7 +97,7 @@ class LabelCache:
         files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
         stale = [file for file in self._folder.glob('.*.tmp')
                  if _modified(file) < time.time() - _STALE_S]
-        for file in files[_MAX_FILES - 1:] + stale:
+        for file in files[self._most_files - 1:] + stale:
             file.unlink(missing_ok=True)
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:

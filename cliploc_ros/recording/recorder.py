@@ -9,7 +9,6 @@ that is stopped leaves its partial results beside it, and the next run goes on.
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -69,8 +68,12 @@ class RecordingOptions:
 
     @property
     def networks(self) -> LoadNetworks:
-        """Return what loads the networks; local workers share the cores."""
-        threads = 0 if self.workers == 1 else max(1, (os.cpu_count() or 1) // self.workers)
+        """Return what loads the networks.
+
+        PyTorch rounds in another way on another number of threads. With one for each worker, the
+        result is the same on any number of workers and on a cluster.
+        """
+        threads = 0 if self.workers == 1 and not self.scheduler else 1
         return LoadNetworks(self.yolo, self.clip, threads)
 
 

@@ -38,7 +38,7 @@ class Localized(NamedTuple):
 
 
 class Localizer:
-    """A map and, unless only classes are matched, an observer for its labels.
+    """A map and, unless only classes are matched, an observer for its labels and images.
 
     Parameters
     ----------
@@ -89,9 +89,10 @@ class Localizer:
         relocalizer = Relocalizer(landmark_map, options)
         observer = self._observer
         if observer is not None:
-            from cliploc_ros.models.clip_encoder import embed_labels
-            observer = observer.with_labels(embed_labels(_clip_options(values),
-                                                         landmark_map.labels))
+            from cliploc_ros.models.map_rows import embed_map
+            observer = observer.with_labels(embed_map(
+                _clip_options(values), landmark_map, values['map_file'],
+                values['landmark_embeddings']))
         return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState) -> Localized:
@@ -157,8 +158,10 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
-        from cliploc_ros.models.clip_encoder import load_encoder
-        encoder, embeddings = load_encoder(_clip_options(values), landmark_map.labels)
+        from cliploc_ros.models.map_rows import load_encoder_for_map
+        encoder, embeddings = load_encoder_for_map(
+            _clip_options(values), landmark_map, values['map_file'],
+            values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
     return Localizer(landmark_map, observer, relocalizer, options, device)
 

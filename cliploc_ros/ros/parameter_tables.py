@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cliploc_ros.core.options import ALGORITHMS, MATCHINGS, RelocalizerOptions
+from cliploc_ros.core.options import ALGORITHMS, COMPARED, MATCHINGS, RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.inputs.vertical import SOURCES
@@ -103,6 +103,9 @@ RELOCALIZER = (
                  read_only=True),
     ParameterRow('clip_checkpoint_path', '', 'Local file with the weights of that tag; empty: '
                  'download them once.', read_only=True),
+    ParameterRow('landmark_embeddings', 'both', "What crops are compared with: the map's labels "
+                 "('text'), the images next to map_file ('image'), or both. Without images of "
+                 'this CLIP: labels.', choices=COMPARED, read_only=True),
     _DEVICE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,

@@ -3,19 +3,20 @@
 """What a person can do to a map: each function returns a change and alters nothing."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.mapping.fitting import Fit
+from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.studio.changes import Change, EditError, Landmarks, change_of
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M, Landmark, rounded, shape_fields
 
 _SOURCE = 'studio'
 # What a recording said of a landmark is not known of an ellipsoid that a person placed.
 _NOT_MEASURED = {'position_sigma': None}
+_MEASURED = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')
 _NO_EVIDENCE = {**_NOT_MEASURED, 'support': None, 'seen_ratio': None, 'baseline_deg': None}
 
 
@@ -176,10 +177,27 @@ def split(landmarks: Landmarks, landmark_id: str) -> Change:
                      {landmark_id: first, new_id(landmarks, old.class_id): second})
 
 
-def take_fits(landmarks: Landmarks, fits: Mapping[str, Fit]) -> Change:
-    """Give landmarks the ellipsoids that were fitted to their boxes."""
-    after = {key: _get(landmarks, key).changed(**shape_fields(fit.center, fit.basis),
-                                               **_NOT_MEASURED) for key, fit in fits.items()}
+def take_fits(landmarks: Landmarks, landmark_ids: Iterable[str], fitted: LandmarkMap) -> Change:
+    """Give landmarks the ellipsoids, and what is known of them, of a fitted map.
+
+    Parameters
+    ----------
+    landmarks : mapping
+    landmark_ids : iterable of str
+        Those to change.
+    fitted : LandmarkMap
+    """
+    rows = {key: row for row, key in enumerate(fitted.landmark_ids)}
+    after = {}
+    for key in landmark_ids:
+        row = rows[key]
+        known = {name: rounded([value])[0] for name in _MEASURED
+                 if (value := getattr(fitted.details[row], name)) is not None}
+        if 'support' in known:
+            known['support'] = int(known['support'])
+        after[key] = _get(landmarks, key).changed(
+            center=rounded(fitted.centers[row]), semi_axes=rounded(fitted.semi_axes[row]),
+            orientation=rounded(fitted.quats_xyzw[row]), **known)
     return change_of(f'refit {len(after)} landmarks', landmarks, after)
 
 

@@ -3,6 +3,7 @@
 """The panels of the page: fields and buttons. Each reads the studio in ``show``."""
 
 import html
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.changes import Change
-from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M, Landmark
+from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M
 from cliploc_ros.studio.map_source import ChangedOnDiskError
 
 if TYPE_CHECKING:
@@ -41,6 +42,33 @@ def _button(page: 'Page', label: str, action: Callable[[], str | None], hotkey: 
         command = page.server.gui.add_command(label, hotkey=hotkey, modifier=modifier)
         command.on_trigger(lambda event: page.act(event, action))
     return handle
+
+
+class Field:
+    """A field that a person edits and the studio shows.
+
+    A stroke reaches the studio later than the field. So the field is only set where the studio's
+    value differs from the last one that was shown or typed: redrawing takes no stroke back.
+
+    Parameters
+    ----------
+    handle : viser's handle
+    """
+
+    def __init__(self, handle: Any):
+        self.handle = handle
+        self._known = handle.value
+
+    def typed(self) -> Any:
+        """Return what a person typed."""
+        self._known = self.handle.value
+        return self._known
+
+    def show(self, value: Any, is_same: Callable[[Any, Any], bool] = operator.eq) -> None:
+        """Show a value, unless what is there means the same."""
+        if not is_same(self._known, value):
+            self.handle.value = value
+            self._known = value
 
 
 class MapPanel:
@@ -104,13 +132,14 @@ class LandmarkPanel:
         gui = page.server.gui
         with gui.add_folder('Selected landmark') as self._folder:
             self._name = gui.add_html('')
-            self._label: Any = gui.add_text('Label', '')
-            self._phrases: Any = gui.add_dropdown('Phrases', (_NO_PHRASE,))
-            self._class: Any = gui.add_text('Class', '')
-            self._center = gui.add_vector3('Position [m]', (0.0, 0.0, 0.0), step=0.001)
-            self._angles = gui.add_vector3('Roll pitch yaw [deg]', (0.0, 0.0, 0.0), step=0.1)
-            self._sliders: list[Any] = [gui.add_slider(f'Semi-axis {name} [m]', LEAST_SEMI_AXIS_M,
-                                            _SLIDER_MAX_M, 0.001, 0.1) for name in 'xyz']
+            self._label = Field(gui.add_text('Label', ''))
+            self._phrases = Field(gui.add_dropdown('Phrases', (_NO_PHRASE,)))
+            self._class = Field(gui.add_text('Class', ''))
+            self._center = Field(gui.add_vector3('Position [m]', (0.0, 0.0, 0.0), step=0.001))
+            self._angles = Field(gui.add_vector3('Roll pitch yaw [deg]', (0.0, 0.0, 0.0),
+                                                 step=0.1))
+            self._sliders = [Field(gui.add_slider(f'Semi-axis {name} [m]', LEAST_SEMI_AXIS_M,
+                                                  _SLIDER_MAX_M, 0.001, 0.1)) for name in 'xyz']
             self._buttons = [_button(page, label, action, hotkey) for label, action, hotkey in (
                 ('Lock or unlock', self._studio.toggle_lock, 'L'),
                 ('Split', self._studio.split, None), ('Merge', self._studio.merge, 'M'),
@@ -121,45 +150,45 @@ class LandmarkPanel:
         self._connect()
 
     def _connect(self) -> None:
-        self._edit(self._label, lambda all, key: edits.relabel(all, [key], self._label.value),
-                   lambda: bool(self._label.value.strip()))
-        self._edit(self._class, lambda all, key: edits.reclass(all, [key], self._class.value),
-                   lambda: bool(self._class.value.strip()))
-        self._edit(self._phrases, lambda all, key: edits.relabel(all, [key], self._phrases.value),
-                   lambda: self._phrases.value != _NO_PHRASE)
-        self._edit(self._center, lambda all, key: edits.move(all, key, self._center.value))
-        self._edit(self._angles, lambda all, key: edits.rotate(
-            all, key, Rotation.from_euler('xyz', self._angles.value, degrees=True).as_quat()))
+        self._edit(self._label, lambda all, key, text: edits.relabel(all, [key], text),
+                   lambda text: bool(text.strip()))
+        self._edit(self._class, lambda all, key, text: edits.reclass(all, [key], text),
+                   lambda text: bool(text.strip()))
+        self._edit(self._phrases, lambda all, key, text: edits.relabel(all, [key], text),
+                   lambda text: text != _NO_PHRASE)
+        self._edit(self._center, edits.move)
+        self._edit(self._angles, lambda all, key, angles: edits.rotate(
+            all, key, Rotation.from_euler('xyz', angles, degrees=True).as_quat()))
         for axis, slider in enumerate(self._sliders):
             self._edit(slider, partial(self._resize, axis))
 
-    def _resize(self, axis: int, landmarks: Any, key: str) -> Change:
+    def _resize(self, axis: int, landmarks: Any, key: str, length: float) -> Change:
         semi_axes = landmarks[key].semi_axes
-        semi_axes[axis] = self._sliders[axis].value
+        semi_axes[axis] = length
         return edits.set_axes(landmarks, key, semi_axes)
 
-    def _edit(self, handle: Any, make: Callable[[Any, str], Change],
-              is_complete: Callable[[], bool] = lambda: True) -> None:
+    def _edit(self, field: Field, make: Callable[[Any, str, Any], Change],
+              is_complete: Callable[[Any], bool] = lambda value: True) -> None:
         """Let a field edit the selected landmark; its strokes in a row are undone together."""
         def changed(event: Any) -> None:
             # the studio's own updates come without a client
-            if event.client is not None and is_complete():
+            if event.client is not None:
                 self._page.act(event, apply)
 
         def apply() -> None:
-            document = self._studio.document
-            if document.selected is not None:
+            document, value = self._studio.document, field.typed()
+            if document.selected is not None and is_complete(value):
                 key, _ = document.selected
-                document.apply(make(document.landmarks, key), gesture=(id(handle), key))
+                document.apply(make(document.landmarks, key, value), gesture=(id(field), key))
 
-        handle.on_update(changed)
+        field.handle.on_update(changed)
 
     def show(self) -> None:
         """Show the selected landmark."""
         selected = self._studio.document.selected
-        for handle in (self._label, self._phrases, self._class, self._center, self._angles,
-                       *self._sliders):
-            _set(handle, disabled=selected is None or selected[1].is_locked)
+        for field in (self._label, self._phrases, self._class, self._center, self._angles,
+                      *self._sliders):
+            _set(field.handle, disabled=selected is None or selected[1].is_locked)
         for button in self._buttons:
             _set(button, disabled=not self._studio.document.selection)
         if selected is None:
@@ -170,42 +199,39 @@ class LandmarkPanel:
         _set(self._name, content=_paragraph([
             f'{key}{" (locked)" if one.is_locked else ""}', *self._studio.faults(key)]))
         phrases = (_NO_PHRASE, *self._studio.phrases())
-        if tuple(self._phrases.options) != phrases:
-            self._phrases.options = phrases
-        _set(self._phrases, value=_NO_PHRASE)
-        self._show_texts(one)
-        _show_vector(self._center, one.center)
-        _show_rotation(self._angles, one)
+        if tuple(self._phrases.handle.options) != phrases:
+            self._phrases.handle.options = phrases
+        self._phrases.show(_NO_PHRASE)
+        # while a person types, a field may end in a space that the label does not have
+        self._label.show(one.label, _same_text)
+        self._class.show(one.class_id, _same_text)
+        self._center.show(tuple(float(value) for value in one.center), _same_numbers)
+        angles = Rotation.from_quat(one.quat_xyzw).as_euler('xyz', degrees=True)
+        self._angles.show(tuple(round(float(angle), 3) + 0.0 for angle in angles),
+                          _same_rotation)
         for slider, length in zip(self._sliders, one.semi_axes, strict=True):
-            if length > slider.max:
-                slider.max = float(2.0 * length)
-            if abs(slider.value - length) > 5e-4:
-                slider.value = round(float(length), 3)
+            if length > slider.handle.max:
+                slider.handle.max = float(2.0 * length)
+            slider.show(round(float(length), 3))
 
-    def _show_texts(self, one: Landmark) -> None:
-        # while a person types, the field may end in a space that the label does not have
-        for handle, text in ((self._label, one.label), (self._class, one.class_id)):
-            if ' '.join(handle.value.split()) != text:
-                handle.value = text
+
+def _same_text(shown: str, text: str) -> bool:
+    return ' '.join(shown.split()) == text
+
+
+def _same_numbers(shown: Any, values: Any) -> bool:
+    return bool(np.abs(np.subtract(shown, values)).max() <= 5e-7)
+
+
+def _same_rotation(shown: Any, angles: Any) -> bool:
+    """Return whether angles turn alike: they are not unique."""
+    first, second = (Rotation.from_euler('xyz', one, degrees=True) for one in (shown, angles))
+    return bool((first.inv() * second).magnitude() < 1e-4)
 
 
 def _paragraph(lines: list[str]) -> str:
     inner = '<br>'.join(html.escape(line) for line in lines)
     return f'<div style="padding:0 1em;font-size:0.85em">{inner}</div>'
-
-
-def _show_vector(handle: Any, values: NDArray[np.float64]) -> None:
-    if np.abs(np.array(handle.value) - values).max() > 5e-7:
-        handle.value = tuple(float(value) for value in values)
-
-
-def _show_rotation(handle: Any, one: Landmark) -> None:
-    """Show a rotation, unless the angles say the same already: they are not unique."""
-    rotation = Rotation.from_quat(one.quat_xyzw)
-    shown = Rotation.from_euler('xyz', handle.value, degrees=True)
-    if (shown.inv() * rotation).magnitude() > 1e-4:
-        angles = rotation.as_euler('xyz', degrees=True)
-        handle.value = tuple(round(float(angle), 3) + 0.0 for angle in angles)
 
 
 class TablePanel:
@@ -272,7 +298,7 @@ class ViewPanel:
         gui = page.server.gui
         panel = gui.add_panel()
         with panel.add_tab('View'):
-            self._view = gui.add_slider('View', 0, max(1, self._studio.views - 1), 1, 0)
+            self._view = Field(gui.add_slider('View', 0, max(1, self._studio.views - 1), 1, 0))
             self._picture = gui.add_image(np.zeros((3, 4, 3), dtype=np.uint8), format='jpeg')
             look = gui.add_button('Look through this view')
             here = gui.add_button('Relocalize here')
@@ -294,12 +320,12 @@ class ViewPanel:
         look.on_click(page.look_through)
         here.on_click(lambda event: page.ask(event, self._studio.relocalize_here))
         everywhere.on_click(lambda event: page.ask(event, self._studio.relocalize_all))
-        self._view.on_update(self._chosen)
+        self._view.handle.on_update(self._chosen)
         self._drawing.on_update(self._toggled)
 
     def _chosen(self, event: Any) -> None:
         if event.client is not None:
-            self._page.act(event, lambda: self._studio.show_view(self._view.value))
+            self._page.act(event, lambda: self._studio.show_view(self._view.typed()))
 
     def _toggled(self, event: Any) -> None:
         self._page.is_drawing = self._drawing.value
@@ -307,6 +333,6 @@ class ViewPanel:
     def show(self, picture: NDArray[np.uint8]) -> None:
         """Show the picture of the selected view."""
         self._picture.image = picture
-        _set(self._view, value=self._studio.view)
+        self._view.show(self._studio.view)
         count = len(self._studio.drawn)
         _set(self._create, label=f'Create landmark from {count} boxes', disabled=count < 2)

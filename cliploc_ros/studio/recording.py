@@ -20,6 +20,7 @@ from cliploc_ros.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.refit import RefitMap, refit_map
 from cliploc_ros.mapping.views import Views, make_views
 from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.landmark import Landmark, map_of
@@ -57,16 +58,19 @@ class Recording:
         shown = associate(self.views, ellipsoids, self.options.association_iou)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
-    def refit(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str]
-              ) -> dict[str, Fit]:
-        """Return landmarks fitted to their boxes; those with too few boxes are left out.
+    def refit(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str]) -> RefitMap:
+        """Fit some of the landmarks to their boxes.
 
-        The other landmarks keep their boxes, so that none takes those of its neighbour.
+        The others keep their boxes, so that none takes those of its neighbour.
+
+        Raises
+        ------
+        MappingError
+            None can be fitted.
         """
-        boxes = self.boxes_of(landmarks)
-        return {key: fit_ellipsoid(self.views, boxes[key], landmarks[key].center,
-                                   landmarks[key].basis)
-                for key in landmark_ids if len(boxes[key]) >= _MIN_BOXES}
+        chosen = set(landmark_ids)
+        return refit_map(self.detections, map_of(landmarks, 'map', 'studio'),
+                         np.array([key in chosen for key in landmarks]), self.options)
 
     def fit_together(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str],
                      center: NDArray[np.float64], basis: NDArray[np.float64]) -> Fit:

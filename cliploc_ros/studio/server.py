@@ -5,7 +5,7 @@
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import Any
+from typing import Any, NamedTuple
 
 import viser
 
@@ -14,9 +14,16 @@ from cliploc_ros.studio.page import Page
 from cliploc_ros.studio.studio import Studio
 
 
+class Served(NamedTuple):
+    """A server that runs, and the URL to open."""
+
+    url: str
+    server: viser.ViserServer
+
+
 @contextmanager
-def serve_studio(studio: Studio, host: str, port: int) -> Iterator[str]:
-    """Serve the page of a studio for as long as the block lasts; yield its URL.
+def serve_studio(studio: Studio, host: str, port: int) -> Iterator[Served]:
+    """Serve the page of a studio for as long as the block lasts; yield where.
 
     Parameters
     ----------
@@ -34,7 +41,7 @@ def serve_studio(studio: Studio, host: str, port: int) -> Iterator[str]:
     page = Page(studio, server)
     try:
         shown_host = f'[{host}]' if ':' in host else host
-        yield f'http://{shown_host}:{server.get_port()}{gate.path}'
+        yield Served(f'http://{shown_host}:{server.get_port()}{gate.path}', server)
     finally:
         page.stop()
         server.stop()

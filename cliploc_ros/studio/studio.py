@@ -212,10 +212,15 @@ class Studio:
 
     def _refit(self, landmark_ids: Sequence[str]) -> str:
         landmarks = self.document.landmarks
-        fits = self._recording().refit(landmarks, landmark_ids)
-        left_out = len(landmark_ids) - len(fits)
-        self.document.apply(edits.take_fits(landmarks, fits))
-        return f'refitted {len(fits)} landmarks; {left_out} have too few boxes'
+        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
+            raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
+        refit = self._recording().refit(landmarks, landmark_ids)
+        reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
+                   if reason is not None}
+        fitted = [key for key in landmark_ids if key not in reasons]
+        self.document.apply(edits.take_fits(landmarks, fitted, refit.landmark_map))
+        left_out = ''.join(f'; {key} {reason}' for key, reason in list(reasons.items())[:3])
+        return f'refitted {len(fitted)} of {len(landmark_ids)} landmarks{left_out}'
 
     # ---- a landmark from boxes ------------------------------------------------------------------
 

@@ -88,3 +88,24 @@ def test_the_index_of_classes_agrees_with_their_mask(landmarks, detections, limi
     rarest = rarest_class_candidates(index, classes, 100).pairs
     assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
     assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
+
+
+@given(st.lists(st.sampled_from('abc'), min_size=1, max_size=9),
+       st.sets(st.tuples(st.integers(0, 8), st.sampled_from('abcd')), max_size=12),
+       st.lists(st.sampled_from('abcde'), max_size=6), st.integers(0, 20))
+def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, detections, limit):
+    others = sorted((row, name) for row, name in others
+                    if row < len(landmarks) and landmarks[row] != name)
+    index = ClassIndex.of(landmarks, others)
+    mask = same_class(tuple(detections), tuple(landmarks))
+    for row, name in others:
+        mask[[one == name for one in detections], row] = True
+    classes = index.classes_of(detections)
+    assert (class_candidates(index, classes).pairs == np.argwhere(mask)).all()
+    rarest = rarest_class_candidates(index, classes, 100).pairs
+    assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
+    assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
+    rows, columns = np.indices(mask.shape).reshape(2, -1)
+    assert (index.have(columns, classes[rows]) == mask.ravel()).all()
+    assert (np.diff(index.members[:, 0]) >= 0).all()  # in the map's order
+    assert (index.of_landmarks == index.classes_of(landmarks)).all()

@@ -26,6 +26,11 @@ from cliploc_ros.core.search.strategies import search_samples
 HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))
 
 
+def own_classes(class_ids):
+    """Landmarks of one class each, as ClassIndex.members has them."""
+    return np.column_stack([np.arange(len(class_ids)), class_ids])
+
+
 def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
     """A landmark a four square metres; up to twelve boxes, each with all of its class."""
     rng, side = np.random.default_rng(seed), np.sqrt(4.0 * count)
@@ -47,7 +52,7 @@ def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
         return make_scene(noisy, centers, shapes, potential, pairs, 0.2)
     single = pairs[~potential[tuple(pairs.T)]]  # none
     return make_scene(noisy, centers, shapes, single, pairs, 0.2,
-                      sort_landmarks(centers, shapes, class_ids), class_ids[seen])
+                      sort_landmarks(centers, shapes, own_classes(class_ids)), class_ids[seen])
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -79,7 +84,7 @@ def test_a_frame_sees_what_its_boxes_can_show_and_little_more(rng, classes):
     shapes = np.zeros((1_000, 6))
     shapes[:, [0, 3, 5]] = 4.0
     class_ids = rng.permutation(np.arange(1_000) % classes)
-    landmarks = sort_landmarks(centers, shapes, class_ids)
+    landmarks = sort_landmarks(centers, shapes, own_classes(class_ids))
     assert (np.sort(landmarks.numbers) == np.arange(1_000)).all()
     assert (landmarks.landmarks[:, :3] == centers[landmarks.numbers]).all()
     assert landmarks.radii == pytest.approx(2.0)
@@ -106,7 +111,7 @@ def test_every_sphere_holds_what_is_below_it(rng, count):
     centers, class_ids = rng.uniform(-5, 5, (count, 3)), np.arange(count) % 2
     shapes = shape_matrices(rng.uniform(0.1, 0.4, (count, 3)), np.tile([0.0, 0, 0, 1], (count, 1)))
     _, _, _, members, levels, spheres = make_groups(
-        sort_landmarks(centers, shapes, class_ids), np.array([0, 1]),
+        sort_landmarks(centers, shapes, own_classes(class_ids)), np.array([0, 1]),
         np.array([[0.1, 0.1, 0.2, 0.1], [0, 0, 0.3, 0.2]]), 0.2)
     assert len(members) == levels[1] == count
     assert len(spheres) == levels[-1] == levels[-2] + 1  # the last one holds all
@@ -123,7 +128,7 @@ def test_every_sphere_holds_what_is_below_it(rng, count):
 
 def test_frames_that_show_nothing_of_the_map():
     for landmarks in (no_landmarks(), sort_landmarks(np.zeros((1, 3)), np.ones((1, 6)),
-                                                     np.zeros(1, dtype=np.int64))):
+                                                     own_classes([0]))):
         for classes in (np.empty(0, dtype=np.int64), np.array([-1])):
             groups = make_groups(landmarks, classes, np.ones((len(classes), 4)), 0.2)
             assert len(groups.starts) - 1 == len(groups.members) == len(groups.spheres) == 0
@@ -134,7 +139,7 @@ def test_far_landmarks_appear_too_small():
     """The greatest depth of a member against the outlines of spheres."""
     radius, box, iou_threshold = 0.3, np.array([[0.0, 0, 0.4, 0.3]]), 0.2
     shape = np.array([[radius**2, 0, 0, radius**2, 0, radius**2]])
-    farthest = make_groups(sort_landmarks(np.zeros((1, 3)), shape, np.zeros(1, dtype=np.int64)),
+    farthest = make_groups(sort_landmarks(np.zeros((1, 3)), shape, own_classes([0])),
                            np.zeros(1, dtype=np.int64), box, iou_threshold).spheres[0, 4]
     for x in (-0.5, 0.0, 0.5):
         direction = np.array([x, 0.2, 1.0])

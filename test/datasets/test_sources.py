@@ -3,7 +3,9 @@
 """Frames with poses and depth, out of recordings made here."""
 
 import pickle
+import struct
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,6 +28,7 @@ from cliploc_ros.errors import DatasetError
 MS = 1_000_000
 START = 1_700_000_000_000 * MS
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, 'plumb_bob', (0.0,) * 5)
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 TF = 'tf2_msgs/msg/TFMessage'
 
 
@@ -62,6 +65,14 @@ def depth_message(stamp, values):
                 width=values.shape[1], encoding='16UC1' if values.dtype == np.uint16 else '32FC1',
                 is_bigendian=0, step=values.shape[1] * values.itemsize,
                 data=np.frombuffer(values.tobytes(), dtype=np.uint8))
+
+
+def compressed_depth(stamp, encoding, values, a=0.0, b=0.0):
+    """A message of compressed_depth_image_transport: uint16 values (h, w), a and b."""
+    png = cv2.imencode('.png', values)[1].tobytes()
+    data = np.frombuffer(struct.pack('<iff', 0, a, b) + png, dtype=np.uint8)
+    return make(COMPRESSED, header=header(stamp, 'camera'), data=data,
+                format=f'{encoding}; compressedDepth png')
 
 
 def write_bag(path, images_ms, messages):
@@ -221,3 +232,37 @@ def test_depth_as_floats_and_of_another_type(tmp_path):
         list(bag_frames(bag, BagTopics(depth='/color'), poses_of_topic('/pose')).read())
     with pytest.raises(DatasetError, match='cannot be both the image and its depth'):
         bag_frames(bag, BagTopics(depth='/image'), poses_of_topic('/pose'))
+
+
+def test_compressed_depth(tmp_path):
+    """Counts as they are; floats as inverse depth, quantized as the transport does it."""
+    counts = np.array([[0, 700], [1500, 65535]], dtype=np.uint16)
+    depths = np.array([[0.7, 1.5], [4.0, 9.0]])
+    quantization, farthest_m = 100.0, 10.0
+    a = quantization * (quantization + 1.0)
+    b = 1.0 - a / farthest_m
+    inverse = (a / depths + b).astype(np.uint16)
+    inverse[0, 0] = 0  # no depth
+    cut = compressed_depth(START + 200 * MS, '16UC1', counts)
+    cut.data = cut.data[:30]
+    bag = write_bag(tmp_path / 'bag', [0, 100, 200], [
+        *drive(), (1, '/depth', COMPRESSED, compressed_depth(START, '16UC1', counts)),
+        (101, '/depth', COMPRESSED, compressed_depth(START + 100 * MS, '32FC1', inverse, a, b)),
+        (201, '/depth', COMPRESSED, cut)])
+    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose')).read()
+    np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 0.7], [1.5, np.nan]],
+                               rtol=1e-6)
+    np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]],
+                               rtol=0.02)
+    with pytest.raises(DatasetError, match=r'/depth at 1700000000.2000.*does not decode'):
+        next(frames)
+
+
+@pytest.mark.parametrize('stated', ['16UC1; compressedDepth rvl', '16UC1; png compressed', 'jpeg',
+                                    'rgb8; compressedDepth png'])
+def test_other_compressions_of_depth_are_named(tmp_path, stated):
+    message = compressed_depth(START, '16UC1', np.ones((2, 2), dtype=np.uint16))
+    message.format = stated
+    bag = write_bag(tmp_path / 'bag', [0], [*drive(), (0, '/depth', COMPRESSED, message)])
+    with pytest.raises(DatasetError, match=f'/depth at .*depth (format|encoding).*{stated[:4]}'):
+        list(bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose')).read())

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros' / 'demo' / 'assets'
@@ -80,6 +81,45 @@ def test_without_rviz_it_says_so_and_goes_on(finished):
     assert 'RViz (rviz2) is not installed' in finished[1]
 
 
+@pytest.fixture(scope='module')
+def mapped(executables, tmp_path_factory):
+    """Run the demo with a map of its own; return the folder of its pictures and its output."""
+    out = tmp_path_factory.mktemp('demo') / 'mapped'
+    code, output, errors = run(executables, '--out', out, '--map', '--wake-ups', 1)
+    assert code == 0, errors
+    print('\n' + output)
+    return out, output
+
+
+def test_the_built_map_holds_the_room(mapped):
+    limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['built_map']
+    found, objects, false, offset_cm = map(float, re.search(
+        r'^(\d+) of (\d+) objects found, \d+ missed, (\d+) false; centres ([.0-9]+) cm off',
+        mapped[1], re.MULTILINE).groups())
+    assert found / objects >= limits['found']
+    assert false <= limits['false']
+    assert offset_cm / 100 <= limits['center_offset_m']
+
+
+def test_it_localizes_in_the_built_map_and_in_the_true_one(mapped):
+    limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['built_map']
+    success = {name: (float(quarter), int(wrong)) for name, quarter, wrong in re.findall(
+        r'^(built|true) map +([.0-9]+) .* (\d+)$', mapped[1], re.MULTILINE)}
+    assert success['built'][0] >= limits['success_at_a_quarter_metre']
+    assert success['true'][0] > 0.9
+    assert success['built'][1] == success['true'][1] == 0
+    assert '1 wake-ups: ' in mapped[1]
+
+
+def test_the_page_shows_the_built_map(mapped):
+    out, output = mapped
+    page = (out / 'index.html').read_text()
+    assert 'src="built_map.png"' in page
+    assert cv2.imread(str(out / 'built_map.png')).std() > 20
+    assert re.search(r'^\d+ of 64 objects found.*$', output, re.MULTILINE)[0] in page
+    assert 'equal in 1 of 1 cases' in page
+
+
 def children(pid):
     """Return the children of a process."""
     return [int(child) for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
@@ -108,6 +148,8 @@ def test_no_process_outlives_it(executables, tmp_path, number, expected):
     (['--method', 'class_prosac'], "algorithm 'prosac'"),
     (['--method', 'telepathy'], "'telepathy' is none of"),
     (['--out', '/proc/demo'], '--out /proc/demo'),
+    (['--map', '--assets', '/nowhere'], '/nowhere/sequence is missing'),
+    (['--map', '--method', 'class_bf'], '--method class_bf'),
 ])
 def test_bad_input_is_named_in_one_line(executables, tmp_path, arguments, named):
     code, output, errors = run(executables, '--out', tmp_path, *arguments)

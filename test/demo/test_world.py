@@ -24,7 +24,7 @@ from demo_world.appearance import CLASSES, COLORS, Appearance, draw_appearance
 from demo_world.recording import find_boxes, record, write_fitted_map, write_true_map
 from demo_world.renderer import Light, Renderer
 from demo_world.room import make_room, move_objects
-from demo_world.trajectories import CAMERA, draw_views, mapping_walk, query_walk
+from demo_world.trajectories import CAMERA, draw_views, query_walk, true_map_walk
 from demo_world.worlds import find_worlds, hold_out
 
 
@@ -135,7 +135,7 @@ def test_what_is_recorded_is_a_tum_folder_and_repeatable(room, renderer, tmp_pat
 
 
 def test_a_map_fitted_to_boxes_is_near_the_truth(room, renderer, tmp_path):
-    write_fitted_map(tmp_path / 'map.yaml', room, renderer, mapping_walk(90), seed=0)
+    write_fitted_map(tmp_path / 'map.yaml', room, renderer, true_map_walk(90), seed=0)
     fitted = LandmarkMap.from_file(tmp_path / 'map.yaml')
     truth = {item.name: item.landmark()['center'] for item in room.objects}
     off = [np.linalg.norm(center - truth[name])

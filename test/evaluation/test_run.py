@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs: on any number of processes, broken off and resumed; and tuning."""
 
+import multiprocessing
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from clusters import kill_a_worker, local_cluster
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -60,9 +64,43 @@ def test_trials_differ_and_repeat(results, room, questions, methods):
     assert without_times(again) == without_times(results)
 
 
-def test_workers_do_not_matter(results, room, questions, methods):
-    assert without_times(run_methods(room, methods, questions, trials=3, workers=2)) \
-        == without_times(results)
+def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions, methods):
+    class Counted(list):
+        """Queries that count how often they are sent."""
+
+        def __reduce__(self):
+            sent.append(1)
+            return list, (list(self),)
+
+    sent = []
+    found = run_methods(room, methods, Counted(questions), trials=3, workers=2)
+    assert without_times(found) == without_times(results)
+    assert len(sent) == 2
+
+
+def test_a_dead_worker_costs_its_part_only(results, room, questions, methods):
+    parts = []
+
+    def kill_one(part):
+        if not parts:
+            os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+        parts.append(part)
+    survived = run_methods(room, methods, questions, trials=3, workers=2, advance=kill_one)
+    assert without_times(survived) == without_times(results)
+    assert sum(map(len, parts)) == len(results)
+
+
+def test_on_dask_with_a_dead_worker(results, room, questions, methods):
+    parts = []
+    with local_cluster() as cluster:
+        def kill_one(part):
+            if not parts:
+                kill_a_worker(cluster)
+            parts.append(part)
+        survived = run_methods(room, methods, questions, trials=3, advance=kill_one,
+                               scheduler=cluster.scheduler_address)
+    assert without_times(survived) == without_times(results)
+    assert sum(map(len, parts)) == len(results)
 
 
 def test_what_is_done_is_not_run_again(results, room, questions, methods):

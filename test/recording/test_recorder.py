@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from clusters import killing_a_worker, local_cluster
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
@@ -116,11 +117,31 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     assert not journal.exists()
 
 
-def test_two_workers_say_the_same(walk, recorded, tmp_path):
-    file = tmp_path / 'two.npz'
+@pytest.fixture(scope='module')
+def by_two_workers(walk, tmp_path_factory):
+    """A folder with the observations and the map that two local workers make."""
+    folder = tmp_path_factory.mktemp('two')
     assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--workers', 2, '--record-to',
-                          file, '--out', tmp_path / 'map.yaml')) == 0
-    assert_equal(load_recorded(file), load_recorded(recorded))
+                          folder / 'tum.npz', '--out', folder / 'map.yaml')) == 0
+    return folder
+
+
+def test_two_workers_say_the_same(recorded, by_two_workers):
+    assert_equal(load_recorded(by_two_workers / 'tum.npz'), load_recorded(recorded))
+
+
+def test_dask_makes_the_same_map_although_a_worker_dies(walk, by_two_workers, tmp_path):
+    journal = tmp_path / '.tum.npz.unfinished'
+    with local_cluster() as cluster, killing_a_worker(
+            cluster, lambda: journal.exists() and journal.stat().st_size > 15_000) as killed:
+        assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--scheduler',
+                              cluster.scheduler_address, '--record-to', tmp_path / 'tum.npz',
+                              '--out', tmp_path / 'map.yaml')) == 0
+    assert killed
+    assert (tmp_path / 'map.yaml').read_bytes() == (by_two_workers / 'map.yaml').read_bytes()
+    with np.load(tmp_path / 'tum.npz') as one, np.load(by_two_workers / 'tum.npz') as other:
+        for name in set(one.files) - {'detector_ms', 'clip_ms'}:
+            np.testing.assert_array_equal(one[name], other[name])
 
 
 def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path, capsys):

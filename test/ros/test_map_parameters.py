@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 from scene import make_room, write_map
 
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.map_file import write_map as write_whole_map
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import load_map
 
@@ -44,6 +48,17 @@ def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
     for field in ('centers', 'semi_axes', 'quats_xyzw'):
         np.testing.assert_array_equal(getattr(of_parameters, field)[rows],
                                       getattr(of_file, field))
+
+
+def test_weighted_labels_and_class_weights_come_both_ways(start_with, tmp_path):
+    room, path = make_room(), tmp_path / 'room.yaml'
+    details = LandmarkDetails(labels=(('a red mug', 0.75), ('a cup: "hot"', 0.25)),
+                              class_weights=(('a', 0.6), ('cell phone', 0.4)))
+    write_whole_map(path, replace(room, details=(details,) * len(room)))
+    for loaded in (load_map(start_with(path), ''), load_map(start_with(path), str(path))):
+        row = loaded.landmark_ids.index(room.landmark_ids[3])
+        assert loaded.weighted_labels[row] == ((room.labels[3], 0.75), *details.labels)
+        assert loaded.classes.sizes_of(loaded.classes.classes_of(['cell phone'])) == len(room)
 
 
 def test_one_landmark_in_numbers(load):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.studio.document import Document
@@ -60,7 +61,7 @@ def studio(path):
     folder = ASSETS / 'sequence'
     studio = Studio(Document(path), Recording(views_of_folder(folder)),
                     open_images(folder, None))
-    with serve_studio(studio, '127.0.0.1', 0) as studio.url:
+    with serve_studio(studio, '127.0.0.1', 0) as (studio.url, studio.server):
         yield studio
     studio.document.close()
 
@@ -187,3 +188,47 @@ def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
     assert set(LandmarkMap.from_file(path).landmark_ids) == set(
         LandmarkMap.from_file(ASSETS / 'map.yaml').landmark_ids)
     second.page.close()
+
+
+def on_screen(person, server, point):
+    """Return the pixel of the page at which a point (3,) of the map is."""
+    camera = next(iter(server.get_clients().values())).camera
+    canvas = person.page.locator('canvas').first.bounding_box()
+    right, down, forward = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix().T
+    offset = np.asarray(point) - camera.position
+    focal = canvas['height'] / 2 / np.tan(camera.fov / 2) / (offset @ forward)
+    return (canvas['x'] + canvas['width'] / 2 + focal * (offset @ right),
+            canvas['y'] + canvas['height'] / 2 + focal * (offset @ down))
+
+
+def drag(person, start, end):
+    person.page.mouse.move(*start)
+    person.page.mouse.down()
+    person.page.mouse.move(*(0.5 * np.add(start, end)), steps=4)
+    person.page.mouse.move(*end, steps=4)
+
+
+def test_drag_a_box_and_the_gizmo(person, studio):
+    document, server = studio.document, studio.server
+    camera = next(iter(server.get_clients().values())).camera
+    person.page.get_by_role('button', name='Look through this view').click()
+    pose = studio.map_from_camera
+    wait_for(lambda: np.allclose(camera.position, pose[:3, 3], atol=1e-3), 'looking through')
+    person.field('Draw boxes').check()
+    intrinsics = studio.recording.detections.camera
+    pixels = np.array([[300.0, 200.0], [360.0, 290.0]])
+    rays = np.column_stack([(pixels - (intrinsics.cx, intrinsics.cy))
+                            / (intrinsics.fx, intrinsics.fy), np.ones(2)])
+    corners = [on_screen(person, server, pose[:3, :3] @ ray + pose[:3, 3]) for ray in rays]
+    drag(person, *corners)
+    person.page.mouse.up()
+    wait_for(lambda: 0 in studio.drawn, 'the box')
+    assert np.allclose(studio.drawn[0], pixels.ravel(), atol=8.0)
+    person.picture('drawn')
+    person.field('Draw boxes').uncheck()
+
+    person.find('mug_2')
+    person.click(re.compile('^mug_2 '))
+    before = document.landmarks['mug_2'].center
+    wait_for(lambda: np.allclose(camera.look_at, before, atol=1e-2), 'looking at it')
+    person.picture('gizmo')

@@ -189,7 +189,7 @@ def test_the_page_is_for_this_machine_only(tmp_path):
     from cliploc_ros.studio.server import serve_studio
 
     document = Document(tmp_path / 'map.yaml')
-    with serve_studio(Studio(document), '127.0.0.1', 0) as url:
+    with serve_studio(Studio(document), '127.0.0.1', 0) as (url, _):
         assert answer(url) == 200
         assert answer(url, Host='evil.example') == 403, 'a name that points here'
         host = url.removeprefix('http://').rstrip('/')
@@ -204,7 +204,7 @@ def test_beyond_this_machine_the_url_has_a_token(tmp_path):
     from cliploc_ros.studio.server import serve_studio
 
     document = Document(tmp_path / 'map.yaml')
-    with serve_studio(Studio(document), '0.0.0.0', 0) as url:
+    with serve_studio(Studio(document), '0.0.0.0', 0) as (url, _):
         url = url.replace('0.0.0.0', '127.0.0.1')
         base, token = url.rstrip('/').rsplit('/', 1)
         assert len(token) >= 32 and answer(url) == 200

@@ -58,7 +58,7 @@ class Support:
         How much more similar their crops are to the labels of their landmarks than to the map's
         labels on average, in standard deviations, summed.
     same_class : float
-        Number of the objects that have the class of their landmark.
+        Number of the objects that have a class of their landmark.
     unlabelled : float
         Number of the objects that were matched by class alone.
     unexplained : float
@@ -163,9 +163,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
 
 
 def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Sequence[Match]) -> int:
-    """Return how many detections of the map's classes match no landmark."""
-    classes = landmark_map.classes.classes_of(frame.class_ids)
-    known = set(np.nonzero(classes >= 0)[0])
+    """Return how many detections of the map's classes match no landmark.
+
+    A class that a landmark is only taken for does not count: a real person is not expected in a
+    map because a teddy bear sometimes looks like one.
+    """
+    index = landmark_map.classes
+    known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
     return len(known - {match.detection for match in matches})
 
 
@@ -175,13 +179,13 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     """Return what each match (m, 5) adds to a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
+    classes = landmark_map.classes.classes_of(frame.class_ids)
     return np.column_stack([
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks),
         np.zeros(len(matches)) if frame.similarities is None
         else _likenesses(frame.similarities, detections, landmarks),
-        [frame.class_ids[match.detection] == landmark_map.class_ids[match.landmark]
-         for match in matches],
+        landmark_map.classes.have(landmarks, classes[detections]),
         np.full(len(matches), frame.similarities is None)])
 
 

@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,17 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class ClassIndex:
-    """The landmarks of each class: L landmarks, C classes.
+    """The landmarks of each class: L landmarks, C classes, m memberships.
+
+    A landmark is a member of its own class, and of others that the detector takes it for.
 
     Parameters
     ----------
     numbers : mapping
-        Number of each class name, 0 to C - 1.
+        Number of each class name, 0 to C - 1; own classes come first.
     of_landmarks : ndarray (L,) of int
-        Class number of each landmark.
-    landmarks : ndarray (L,) of int
+        Number of each landmark's own class.
+    landmarks : ndarray (m,) of int
         Landmarks grouped by class, in the map's order within a class.
     starts : ndarray (C + 1,) of int
         Where each class begins in landmarks.
@@ -31,12 +34,50 @@ class ClassIndex:
     starts: NDArray[np.int64]
 
     @staticmethod
-    def of(landmark_classes: Sequence[str]) -> 'ClassIndex':
-        """Return the index of a map's class names, one for each landmark."""
-        numbers = {name: number for number, name in enumerate(dict.fromkeys(landmark_classes))}
-        of_landmarks = np.array([numbers[name] for name in landmark_classes], dtype=np.int64)
-        return ClassIndex(numbers, of_landmarks, np.argsort(of_landmarks, kind='stable'),
-                          np.append(0, np.cumsum(np.bincount(of_landmarks))).astype(np.int64))
+    def of(landmark_classes: Sequence[str], others: Sequence[tuple[int, str]] = ()
+           ) -> 'ClassIndex':
+        """Return the index of a map's classes.
+
+        Parameters
+        ----------
+        landmark_classes : sequence of str
+            Own class of each landmark.
+        others : sequence of (int, str)
+            A landmark and another class of it, each pair once.
+        """
+        names = [*landmark_classes, *(name for _, name in others)]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        classes = np.array([numbers[name] for name in names], dtype=np.int64)
+        count = len(landmark_classes)
+        landmarks = np.append(np.arange(count), [row for row, _ in others]).astype(np.int64)
+        return ClassIndex(numbers, classes[:count], landmarks[np.lexsort((landmarks, classes))],
+                          np.append(0, np.cumsum(np.bincount(classes))).astype(np.int64))
+
+    @cached_property
+    def members(self) -> NDArray[np.int64]:
+        """Return the landmark and the class of each membership (m, 2), in the map's order."""
+        classes = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+        order = np.argsort(self.landmarks, kind='stable')
+        return np.column_stack([self.landmarks[order], classes[order]])
+
+    def are_own(self, classes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether each class (n,) is a landmark's own, not one that it is taken for."""
+        return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
+
+    def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
+             ) -> NDArray[np.bool_]:
+        """Return whether landmarks (p,) are members of classes (p,); below 0 is no class."""
+        # a class below 0 gets a key below 0, which no member has
+        keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
+        return np.asarray((self.of_landmarks[landmarks] == classes)
+                          | np.isin(keys, self._other_keys))
+
+    @cached_property
+    def _other_keys(self) -> NDArray[np.int64]:
+        """Return a key for each landmark and class of it that is not its own."""
+        landmarks, classes = self.members.T
+        other = classes != self.of_landmarks[landmarks]
+        return np.asarray(landmarks[other] * (len(self.starts) - 1) + classes[other])
 
     def classes_of(self, names: Sequence[str]) -> NDArray[np.int64]:
         """Return the number of each class name (n,); -1 for classes that the map lacks."""

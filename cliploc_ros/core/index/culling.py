@@ -27,17 +27,19 @@ _NEAR_ANGLE = np.radians(10.0)
 
 
 class SortedLandmarks(NamedTuple):
-    """All landmarks of a map along a Morton curve, so that neighbours have near rows: L of them.
+    """All landmarks of a map along a Morton curve, so that neighbours have near rows: m rows.
+
+    A landmark has a row for each of its classes.
 
     Parameters
     ----------
-    landmarks : ndarray (L, 9)
+    landmarks : ndarray (m, 9)
         Centre and shape of each.
-    radii : ndarray (L,)
+    radii : ndarray (m,)
         Greatest semi-axis of each [m].
-    numbers : ndarray (L,)
+    numbers : ndarray (m,)
         Row of each in the map.
-    classes : ndarray (L,) of int32
+    classes : ndarray (m,) of int32
         Class number of each.
     """
 
@@ -79,23 +81,24 @@ class Groups(NamedTuple):
 
 
 def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-                   classes: NDArray[np.int64]) -> SortedLandmarks:
+                   members: NDArray[np.int64]) -> SortedLandmarks:
     """Return the landmarks of a map along a Morton curve.
 
     Parameters
     ----------
     centers, shapes : ndarray (L, 3), (L, 6)
         See cliploc_ros.core.geometry.ellipsoid.
-    classes : ndarray (L,) of int
-        Class number of each landmark, from 0.
+    members : ndarray (m, 2) of int
+        Landmark and class number, see ClassIndex.members.
     """
-    numbers = np.argsort(_morton_codes(centers), kind='stable')
+    members = members[np.argsort(_morton_codes(centers[members[:, 0]]), kind='stable')]
+    numbers, classes = members.T
     centers, shapes = centers[numbers], shapes[numbers]
     # the greatest eigenvalue of a shape matrix is the square of the greatest semi-axis
     squares = np.linalg.eigvalsh(shapes[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))[:, 2]
     squares *= 1.0 + 1e-9
     return SortedLandmarks(np.column_stack([centers, shapes]), np.sqrt(squares),
-                           numbers.astype(np.int64), classes[numbers].astype(np.int32))
+                           np.ascontiguousarray(numbers), classes.astype(np.int32))
 
 
 def no_landmarks() -> SortedLandmarks:

@@ -29,7 +29,7 @@ class LabelEmbeddings:
     Parameters
     ----------
     unique : ndarray (U, d) float32
-        Unit rows, one for each different label.
+        One row for each different label: of unit length, or a weighted mean of such rows.
     of_landmarks : ndarray (L,) of int
         The row of each landmark's label. Every row belongs to a landmark.
     """

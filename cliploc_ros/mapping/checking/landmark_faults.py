@@ -131,8 +131,10 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     evidence = gather_evidence(views, landmarks, shown)
     expected = evidence.expected.copy()
     reach = _median_reach(views, landmarks, shown)
+    cameras = camera_centers(views, np.arange(len(views.rotations)))
     for row in np.nonzero(evidence.support == 0)[0]:
-        expected[row] = count_expected(views, landmarks.centers[row], landmarks.bases[row], reach)
+        expected[row] = count_expected(views, cameras, landmarks.centers[row],
+                                       landmarks.bases[row], reach)
     return Witness(landmarks, shown, evidence, expected, _fitted(views, landmarks, shown))
 
 

@@ -71,7 +71,7 @@ class Correction:
     explained: float
 
 
-class _Linear(NamedTuple):
+class Linear(NamedTuple):
     """m boxes: residuals (m, 4), their weights, and derivatives by landmark and pose."""
 
     residuals: NDArray[np.float64]
@@ -102,7 +102,7 @@ class _Cause(NamedTuple):
     units: tuple[str, ...]
     factors: tuple[float, ...]
     effects_px: tuple[float, ...]
-    differentiate: Callable[[Views, NDArray[np.int64], _Linear], NDArray[np.float64]]
+    differentiate: Callable[[Views, NDArray[np.int64], Linear], NDArray[np.float64]]
     apply: Callable[[Views, NDArray[np.float64]], Views]
 
 
@@ -131,7 +131,7 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
 def _intrinsics(camera: Camera) -> _Cause:
     focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
 
-    def differentiate(views: Views, rows: NDArray[np.int64], linear: _Linear
+    def differentiate(views: Views, rows: NDArray[np.int64], linear: Linear
                       ) -> NDArray[np.float64]:
         # a measured edge e = (px - c) / f gets smaller with f and c, its residual greater
         by_number = np.zeros((len(rows), 4, 4))
@@ -166,7 +166,8 @@ def _mount(camera: Camera) -> _Cause:
                   (focal / 200.0, focal / 200.0, 1.5, degree_px, degree_px,
                    300.0 * degree_px / focal),
                   lambda views, rows, linear: linear.by_pose,
-                  lambda views, values: _moved(views, np.tile(values, (len(views.rotations), 1))))
+                  lambda views, values: move_map(
+                      views, np.tile(values, (len(views.rotations), 1))))
 
 
 def _stamps(camera: Camera, views: Views) -> _Cause:
@@ -176,10 +177,10 @@ def _stamps(camera: Camera, views: Views) -> _Cause:
     return _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,), (pixels_per_ms,),
                   lambda views, rows, linear: np.einsum(
                       'mep,mp->me', linear.by_pose, twists[views.frames[rows]])[:, :, None],
-                  lambda views, values: _moved(views, values[0] * twists))
+                  lambda views, values: move_map(views, values[0] * twists))
 
 
-def _moved(views: Views, motions: NDArray[np.float64]) -> Views:
+def move_map(views: Views, motions: NDArray[np.float64]) -> Views:
     """Return the views with the map moved in the cameras by (F, 6): translation, rotation."""
     turns = Rotation.from_rotvec(motions[:, 3:]).as_matrix()
     return views._replace(
@@ -192,14 +193,14 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
     """Yield the numbers of a cause that fit best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
-    cost_before = cost = _cost(_linearize(views, rows, numbers, landmarks))
+    cost_before = cost = cost_of(linearize_boxes(views, rows, numbers, landmarks))
     for _ in range(_STEPS):
-        linear = _linearize(views, rows, numbers, landmarks)
+        linear = linearize_boxes(views, rows, numbers, landmarks)
         step, deviations = _solve(cause.differentiate(views, rows, linear), linear, numbers,
                                   viewpoints)
         moved = cause.apply(given, values + step)
-        refitted = _refit(moved, landmarks, rows, numbers)
-        trial_cost = _cost(_linearize(moved, rows, numbers, refitted))
+        refitted = refit_landmarks(moved, landmarks, rows, numbers)
+        trial_cost = cost_of(linearize_boxes(moved, rows, numbers, refitted))
         if trial_cost >= cost:
             break
         values, views, landmarks, cost = values + step, moved, refitted, trial_cost
@@ -216,8 +217,9 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
                             and explained > _MIN_EXPLAINED), explained)
 
 
-def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
-           numbers: NDArray[np.int64]) -> Landmarks:
+def refit_landmarks(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
+                    numbers: NDArray[np.int64]) -> Landmarks:
+    """Return the landmarks fitted to some rows, whose landmarks are numbers."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     for number, places in enumerate(group_boxes(numbers, len(centers))):
         if len(places):
@@ -226,16 +228,17 @@ def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
     return Landmarks(centers, bases, landmarks.classes)
 
 
-def _cost(linear: _Linear) -> float:
+def cost_of(linear: Linear) -> float:
     """Return the robust cost of residuals; their weight is 1 / (1 + r^2 / c^2)."""
     known = linear.weights > 0.0
     return float(-np.log(linear.weights[known]).sum())
 
 
-def _linearize(views: Views, rows: NDArray[np.int64], numbers: NDArray[np.int64],
-               landmarks: Landmarks) -> _Linear:
+def linearize_boxes(views: Views, rows: NDArray[np.int64], numbers: NDArray[np.int64],
+                    landmarks: Landmarks) -> Linear:
+    """Return residuals and derivatives of some rows, whose landmarks are numbers."""
     count = len(rows)
-    linear = _Linear(np.zeros((count, 4)), np.zeros((count, 4)),
+    linear = Linear(np.zeros((count, 4)), np.zeros((count, 4)),
                      np.zeros((count, 4, LANDMARK_SIZE)), np.zeros((count, 4, POSE_SIZE)))
     _linearize_all(views, rows, numbers, landmarks.centers, landmarks.bases, *linear)
     return linear
@@ -275,10 +278,10 @@ def _twists(views: Views) -> NDArray[np.float64]:
     return np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
 
 
-def _solve(derivatives: NDArray[np.float64], linear: _Linear, numbers: NDArray[np.int64],
+def _solve(derivatives: NDArray[np.float64], linear: Linear, numbers: NDArray[np.int64],
            viewpoints: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the step (G,) of a cause's numbers, and their standard deviations (G,)."""
-    free, residuals = _without_landmarks(derivatives, linear, numbers)
+    free, residuals = without_landmarks(derivatives, linear, numbers)
     weights = linear.weights
     information = np.einsum('meg,me,meh->gh', free, weights, free)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12))
@@ -291,9 +294,9 @@ def _solve(derivatives: NDArray[np.float64], linear: _Linear, numbers: NDArray[n
     return step, np.sqrt(np.maximum(np.diag(inverse @ gradients.T @ gradients @ inverse), 1e-24))
 
 
-def _without_landmarks(derivatives: NDArray[np.float64], linear: _Linear,
-                       numbers: NDArray[np.int64]
-                       ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def without_landmarks(derivatives: NDArray[np.float64], linear: Linear,
+                      numbers: NDArray[np.int64]
+                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return derivatives and residuals, less what corrections of the landmarks explain."""
     free, residuals = derivatives.copy(), linear.residuals.copy()
     for rows in group_boxes(numbers, int(numbers.max()) + 1):

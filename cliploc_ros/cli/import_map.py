@@ -1,0 +1,227 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``import_map``: a map of another system, or a table, becomes a map file."""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, split_ros_args
+from cliploc_ros.errors import DatasetError, MapError, MappingError, OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.map_formats.given_map import (
+        GivenMap,
+        ImportedMap,
+        LeftOut,
+        Placement,
+    )
+    from cliploc_ros.mapping.refit import RefitMap
+
+_FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
+_LEFT_OUT_SHOWN = 10
+EPILOG = """\
+formats:
+  msgloc    a JSON file with nodes
+  goreloc   NAME.objects
+  oaslam    map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks
+  csv       columns class_id x y z a b c, and optional ones; see doc/mapping.md
+
+examples:
+  import_map --from msgloc walk.json --out walk.yaml
+  import_map --from goreloc map.objects --refit office.npz --out office.yaml
+  import_map --from oaslam map_objects.txt --scale 2.31 --transform 0 0 1.2 -0.5 0.5 -0.5 0.5 \\
+             --refit office.npz --out office.yaml
+"""
+
+
+class _Result(NamedTuple):
+    """A map to write, what is not in it, and what to say about it."""
+
+    landmark_map: 'LandmarkMap'
+    left_out: 'tuple[LeftOut, ...]'
+    lines: tuple[str, ...]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Import a map; return the exit code."""
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
+    interrupt_on_sigterm()
+    return run_command(lambda: import_map(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='import_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Import a map of another system. An existing map is replaced only when the '
+        'new one is complete. Needs no sourced ROS.')
+    parser.add_argument('input', type=Path, metavar='IN', help='the file to import')
+    parser.add_argument('--from', dest='format', choices=_FORMATS, required=True,
+                        help='its format')
+    parser.add_argument('--out', type=Path, required=True, metavar='YAML',
+                        help='the map to write')
+    parser.add_argument('--report', type=Path, metavar='JSON',
+                        help='also write what was left out, and why')
+    parser.add_argument('--class-names', type=Path, metavar='FILE',
+                        help='a class name in each line, for formats with indices (COCO)')
+    place = parser.add_argument_group('where the map lies')
+    place.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
+    place.add_argument('--scale', type=float, default=1.0, metavar='METRES',
+                       help='metres in a unit of length of the file (%(default)s)')
+    place.add_argument('--transform', type=float, nargs=7, metavar='V',
+                       default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+                       help="x y z [m] qx qy qz qw of the file's coordinate frame in the map's")
+    refit = parser.add_argument_group('fit to a recording')
+    refit.add_argument('--refit', type=Path, metavar='NPZ',
+                       help='fit each landmark to the boxes of these observations')
+    refit.add_argument('--keep-unsupported', action='store_true',
+                       help='keep landmarks that cannot be fitted, where the file has them')
+    return parser
+
+
+def import_map(options: argparse.Namespace) -> int:
+    """Import as the command line asks; return the exit code."""
+    # Late, so that --help is fast.
+    from cliploc_ros.core.map_file import write_map
+    from cliploc_ros.datasets.map_formats.given_map import place
+
+    begin = time.monotonic()
+    _check_paths(options)
+    placement = _placement(options)
+    given = _read(options)
+    try:
+        imported = place(given, placement,
+                         f'import_map {options.format} {options.input.name}')
+    except DatasetError as error:
+        raise DatasetError(f'{options.input}: {error}') from error
+    result = _refit(imported, options) if options.refit else _as_given(imported)
+    write_map(options.out, result.landmark_map,
+              [f'imported by import_map from {options.input.name} ({options.format})',
+               *result.lines[:1]])
+    if options.report is not None:
+        _write_report(options.report, result)
+    print('\n'.join(printable(line) for line in result.lines))
+    print(f'left out: {len(result.left_out)}')
+    for one in result.left_out[:_LEFT_OUT_SHOWN]:
+        print(printable(f'  {one.landmark_id}: {one.reason}'))
+    if len(result.left_out) > _LEFT_OUT_SHOWN:
+        print(f'  and {len(result.left_out) - _LEFT_OUT_SHOWN} more: see --report')
+    print(f'wrote {options.out} with {len(result.landmark_map)} landmarks in '
+          f'{time.monotonic() - begin:.1f} s')
+    return 0
+
+
+def _check_paths(options: argparse.Namespace) -> None:
+    """Refuse outputs that cannot be written, or are an input, before the work is done."""
+    for name in ('out', 'report'):
+        path = getattr(options, name)
+        if path is None:
+            continue
+        if not path.parent.is_dir():
+            raise MapError(f'{path}: there is no folder {path.parent}; create it')
+        if path.is_dir():
+            raise MapError(f'{path} is a folder; name the file to write')
+        for other in (options.input, options.refit, options.class_names):
+            if other is not None and path.exists() and other.exists() and path.samefile(other):
+                raise OptionsError(f'--{name} {path} is an input; name another file')
+
+
+def _placement(options: argparse.Namespace) -> 'Placement':
+    from cliploc_ros.datasets.map_formats.given_map import Placement
+    from cliploc_ros.datasets.poses import mount_from_numbers
+
+    if not 0.0 < options.scale < float('inf'):
+        raise OptionsError(f'--scale {options.scale}: must be above 0')
+    if not options.frame_id.strip():
+        raise OptionsError('--frame-id: must not be empty')
+    try:
+        map_from_given = mount_from_numbers(options.transform)
+    except DatasetError as error:
+        raise OptionsError(f'--transform: {error}') from error
+    return Placement(options.frame_id, options.scale, map_from_given)
+
+
+def _read(options: argparse.Namespace) -> 'GivenMap':
+    """Return the content of the input."""
+    from cliploc_ros.datasets.map_formats.class_names import COCO, read_class_names
+    from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
+    from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
+    from cliploc_ros.datasets.map_formats.oaslam import read_oaslam
+    from cliploc_ros.datasets.map_formats.table import read_table
+
+    if options.format == 'csv':
+        if options.class_names is not None:
+            raise OptionsError('--class-names is not for csv, whose column class_id has names')
+        return read_table(options.input)
+    names = COCO if options.class_names is None else read_class_names(options.class_names)
+    readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
+    return readers[options.format](options.input, names)
+
+
+def _as_given(imported: 'ImportedMap') -> _Result:
+    lines = [f'{len(imported.landmark_map)} landmarks as the file has them',
+             *(f'note: {note}' for note in imported.notes),
+             'note: maps of other systems localize better after --refit OBSERVATIONS']
+    return _Result(imported.landmark_map, imported.left_out, tuple(lines))
+
+
+def _refit(imported: 'ImportedMap', options: argparse.Namespace) -> _Result:
+    """Return the map fitted to the observations that the command line names."""
+    from cliploc_ros.datasets.map_formats.given_map import LeftOut
+    from cliploc_ros.datasets.observations import load_observations
+    from cliploc_ros.mapping.refit import refit_map
+
+    detections = load_observations(options.refit)
+    try:
+        refit = refit_map(detections, imported.landmark_map)
+    except MappingError as error:
+        raise MappingError(f'{options.refit}: {error}') from error
+    left_out, kept = list(imported.left_out), []
+    for row, reason in enumerate(refit.reasons):
+        is_duplicate = refit.part_of[row] != row
+        if reason is None or (options.keep_unsupported and not is_duplicate):
+            kept.append(row)
+        else:
+            left_out.append(LeftOut(imported.landmark_map.landmark_ids[row], reason))
+    return _Result(refit.landmark_map.select(kept), tuple(left_out),
+                   tuple(_refit_lines(imported, refit, options.refit)))
+
+
+def _refit_lines(imported: 'ImportedMap', refit: 'RefitMap', observations: Path) -> list[str]:
+    """Return what fitting did, for the terminal."""
+    import numpy as np
+
+    fitted = [row for row, reason in enumerate(refit.reasons) if reason is None]
+    before, after = imported.landmark_map, refit.landmark_map
+    moved_m = np.linalg.norm(after.centers - before.centers, axis=1)
+    far = [row for row in fitted if moved_m[row] > 2.0 * before.semi_axes[row].max()]
+    lines = [f'{len(fitted)} of {len(before)} landmarks fitted to {observations.name}: explained '
+             f'boxes {refit.explained_before:.1%} -> {refit.explained:.1%}, median IoU '
+             f'{refit.iou_before:.3f} -> {refit.iou:.3f} (on the frames used for fitting)',
+             f'they moved by {np.median(moved_m[fitted]) * 100:.1f} cm (median)']
+    lines += [f'note: {note}' for note in (*imported.notes, *refit.notes)]
+    return lines + [f'note: {after.landmark_ids[row]} moved by {moved_m[row]:.2f} m, more than '
+                    'its size: check its label' for row in far]
+
+
+def _write_report(path: Path, result: _Result) -> None:
+    from cliploc_ros.replace_file import replace_file
+
+    report = {'landmarks': len(result.landmark_map), 'lines': result.lines,
+              'left_out': [one._asdict() for one in result.left_out]}
+    try:
+        with replace_file(path) as partial:
+            partial.write_text(json.dumps(report, indent=1))
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a reader of a map format returns, and how it becomes a map of ours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import DatasetError
+
+# A landmark with a thinner semi-axis is a fit that collapsed; a larger one is no object. Guesses.
+_SEMI_AXIS_RANGE_M = (1e-3, 100.0)
+_MAX_COORDINATE_M = 1e6
+_MAX_NORM_ERROR = 0.01
+
+
+class GivenLandmark(NamedTuple):
+    """A landmark as its file has it, in the file's coordinate frame and unit of length.
+
+    Parameters
+    ----------
+    landmark_id, label, class_id : str
+    center, semi_axes : sequence of 3 float
+    quat_xyzw : sequence of 4 float
+        Landmark axes into the file's axes.
+    details : LandmarkDetails
+    """
+
+    landmark_id: str
+    label: str
+    class_id: str
+    center: Sequence[float]
+    semi_axes: Sequence[float]
+    quat_xyzw: Sequence[float]
+    details: LandmarkDetails = LandmarkDetails()
+
+
+class LeftOut(NamedTuple):
+    """A landmark of the file that is not in the map, and why."""
+
+    landmark_id: str
+    reason: str
+
+
+class GivenMap(NamedTuple):
+    """The content of a file: landmarks, what could not be read as one, and notes on the file."""
+
+    landmarks: list[GivenLandmark]
+    left_out: list[LeftOut]
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a given map lies: x_map = map_from_given @ (scale * x_given).
+
+    Parameters
+    ----------
+    frame_id : str
+        Coordinate frame of the map.
+    scale : float
+        Metres in one unit of length of the file.
+    map_from_given : ndarray (4, 4)
+    """
+
+    frame_id: str
+    scale: float
+    map_from_given: NDArray[np.float64]
+
+
+class ImportedMap(NamedTuple):
+    """A map of ours, what was left out and why, and notes on the file."""
+
+    landmark_map: LandmarkMap
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+
+
+def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
+    """Return a given map in the coordinate frame and unit of ours.
+
+    Landmarks that no map can hold are left out.
+
+    Parameters
+    ----------
+    given : GivenMap
+    placement : Placement
+    source : str
+        What the landmarks say of where they come from.
+
+    Raises
+    ------
+    DatasetError
+        No landmark is left; the message says why the first one was left out.
+    """
+    kept: dict[str, GivenLandmark] = {}
+    left_out = list(given.left_out)
+    for landmark in given.landmarks:
+        reason = ('its id occurs before' if landmark.landmark_id in kept
+                  else _reason_against(landmark, placement.scale))
+        if reason is None:
+            kept[landmark.landmark_id] = landmark
+        else:
+            left_out.append(LeftOut(landmark.landmark_id, reason))
+    if not kept:
+        why = f'; the first one: {left_out[0].reason}' if left_out else ''
+        raise DatasetError(f'none of its {len(left_out)} landmarks can be used{why}')
+    ids, labels, class_ids, centers, semi_axes, quats, details = zip(*kept.values(), strict=True)
+    turn = placement.map_from_given[:3, :3]
+    rotations = Rotation.from_matrix(turn) * Rotation.from_quat(np.array(quats, dtype=np.float64))
+    landmark_map = LandmarkMap(
+        placement.frame_id, ids, labels, class_ids,
+        np.array(centers) * placement.scale @ turn.T + placement.map_from_given[:3, 3],
+        np.array(semi_axes) * placement.scale, rotations.as_quat(),
+        tuple(replace(one, source=source) for one in details))
+    return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
+
+
+def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:
+    """Return why no map can hold a landmark, or None."""
+    numbers = np.array([*landmark.center, *landmark.semi_axes, *landmark.quat_xyzw])
+    if not np.isfinite(numbers).all():
+        return 'it has numbers that are not finite'
+    semi_axes = numbers[3:6] * scale
+    least, most = _SEMI_AXIS_RANGE_M
+    if semi_axes.min() < least or semi_axes.max() > most:
+        shown = ' '.join(f'{axis:.3g}' for axis in semi_axes)
+        return f'its semi-axes are {shown} m, not {least:g} to {most:g}'
+    if np.abs(numbers[:3]).max() * scale > _MAX_COORDINATE_M:
+        return f'its centre is beyond {_MAX_COORDINATE_M:g} m'
+    norm = float(np.linalg.norm(numbers[6:]))
+    if abs(norm - 1.0) > _MAX_NORM_ERROR:
+        return f'its quaternion has the norm {norm:.3g}, not 1'
+    return None
+
+
+def make_id(class_id: str, number: int | str) -> str:
+    """Return an id for a landmark that has only a number: its class and the number."""
+    word = ''.join(char if char.isalnum() else '_' for char in class_id)
+    return f'{word}_{number}'

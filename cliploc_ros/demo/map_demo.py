@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo with a map of its own: build it from the mapping walk, judge it, wake up in it."""
+
+import json
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.observations import Recorded, load_recorded
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import map_page
+from cliploc_ros.demo.map_picture import draw_map_review
+from cliploc_ros.demo.map_review import count_sightings, review_map
+from cliploc_ros.demo.processes import DemoError, find_executable
+from cliploc_ros.demo.run import DemoOptions, WakeUpMap, prepare, run_demo
+from cliploc_ros.demo.truth import read_frames, read_objects
+from cliploc_ros.evaluation.methods import Method
+from cliploc_ros.evaluation.recording import make_queries_of
+from cliploc_ros.evaluation.run import run_methods
+from cliploc_ros.evaluation.summary import Summary, summarize
+from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.map_rows import embed_map
+from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.recording.networks import LoadNetworks
+from cliploc_ros.recording.recorder import record_every_frame
+from cliploc_ros.ros.parameter_tables import relocalizer_options
+
+
+def run_map_demo(options: DemoOptions) -> None:
+    """Build a map from the mapping walk, compare it with the room, and wake up in it.
+
+    Raises
+    ------
+    CliplocError
+        For missing or invalid assets, and if the map cannot be built or the nodes do not run.
+    """
+    if options.method.startswith('class'):
+        raise DemoError(f'--map compares labels, but --method {options.method} uses none: choose '
+                        'a hybrid_ or clip_ method')
+    prepare(options)
+    walk = options.assets / 'mapping'
+    if not walk.is_dir():
+        raise DemoError(f'{walk} is missing: run script/setup again, or choose another folder '
+                        'with --assets')
+    objects = read_objects(walk)
+    built = _build(options, walk)
+    review = review_map(
+        LandmarkMap.from_file(built.map_file), objects,
+        count_sightings(tuple(read_frames(walk)), built.recorded.detections),
+        built.report['left_out'])
+    print('\n'.join(map_page.console_lines(review)), flush=True)
+    successes = _judge(options, built.map_file)
+    print('\n' + '\n'.join(map_page.success_lines(successes)) + '\n', flush=True)
+    poses = built.recorded.detections.map_from_camera
+    draw_map_review(review, poses, options.out / map_page.PICTURE)
+    landmark_of = review.landmark_of
+    run_demo(replace(options, wake_up_map=WakeUpMap(
+        built.map_file, lambda object_id: landmark_of.get(object_id, ''),
+        map_page.section(review, successes, len(built.recorded.detections)))))
+
+
+@dataclass(frozen=True)
+class _Built:
+    """What build_map wrote: the map, its report, and what detector and CLIP said."""
+
+    map_file: Path
+    report: dict[str, Any]
+    recorded: Recorded
+
+
+def _build(options: DemoOptions, walk: Path) -> _Built:
+    """Build a map as a user does, with the installed executable."""
+    files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
+    arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
+                 '--record-to', files['npz'], '--model', options.assets / 'yolo.pt',
+                 '--clip-model', options.assets / 'clip.json',
+                 '--clip-pretrained', options.assets / 'clip.safetensors']
+    print('$ ' + ' '.join(map(str, arguments)), flush=True)
+    done = subprocess.run([str(find_executable('build_map')), *map(str, arguments[1:])],
+                          check=False)
+    if done.returncode:
+        raise DemoError(f'build_map ended with exit code {done.returncode}; its message is above')
+    return _Built(files['yaml'], json.loads(files['json'].read_text()),
+                  load_recorded(files['npz']))
+
+
+def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
+    """Return the success of one look at each image of the wake-ups, in the built and true map."""
+    clip = ClipOptions(model=str(options.assets / 'clip.json'),
+                       pretrained=str(options.assets / 'clip.safetensors'))
+    sequence = read_tum(options.assets / 'sequence')
+    print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
+    look = LoadNetworks(YoloOptions(model=str(options.assets / 'yolo.pt')), clip)()
+    recorded = record_every_frame(
+        tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
+    method = Method(options.method, relocalizer_options(options.values))
+    summaries = {}
+    for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):
+        landmark_map = LandmarkMap.from_file(file)
+        queries = make_queries_of(recorded, landmark_map, embed_map(
+            clip, landmark_map, str(file), options.values['landmark_embeddings']))
+        summaries[name], = summarize(run_methods(
+            landmark_map, [method], make_queries(queries, landmark_map), trials=1))
+    return summaries

@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable import_map, as a user starts it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from foreign_maps import goreloc_file, msgloc_text, oaslam_text, table_text
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations, save_observations
+
+
+def import_map(*args):
+    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.import_map', *map(str, args)],
+                          capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    return LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
+
+
+@pytest.fixture(scope='module')
+def observations(shared_data, tmp_path_factory):
+    """Every eighth frame of the office."""
+    whole = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
+    path = tmp_path_factory.mktemp('office') / 'office.npz'
+    save_observations(path, whole.select_frames(range(0, len(whole), 8)))
+    return path
+
+
+@pytest.fixture(scope='module')
+def table(office, tmp_path_factory):
+    """The office as another system may have it: 5 cm off on each axis, too large (simulated)."""
+    rng = np.random.default_rng(0)
+    text = table_text(LandmarkMap(
+        'map', office.landmark_ids, office.labels, office.class_ids,
+        office.centers + rng.normal(0.0, 0.05, office.centers.shape), office.semi_axes * 1.3,
+        office.quats_xyzw))
+    path = tmp_path_factory.mktemp('theirs') / 'theirs.csv'
+    path.write_text(text + 'ghost,a cup,cup,0,0,9,.1,.1,.1,0,0,0,1\nthin,,cup,0,0,9,.1,.1,0.0001,'
+                    '0,0,0,1\n')
+    return path
+
+
+def test_refits_to_a_recording(office, table, observations, tmp_path):
+    out, report = tmp_path / 'map.yaml', tmp_path / 'map.json'
+    done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
+                      '--report', report, '--frame-id', 'world')
+    assert done.returncode == 0, done.stderr
+    found = LandmarkMap.from_file(out)
+    assert found.frame_id == 'world'
+    assert f'{len(found)} of 41 landmarks fitted to office.npz' in done.stdout
+    places = dict(zip(office.landmark_ids, office.centers, strict=True))
+    errors_m = [np.linalg.norm(center - places[name])
+                for name, center in zip(found.landmark_ids, found.centers, strict=True)]
+    print(f'{len(found)} landmarks, median error {np.median(errors_m) * 100:.1f} cm')
+    assert len(found) >= 30 and np.median(errors_m) < 0.03
+    assert {one.source for one in found.details} == {'import_map csv theirs.csv'}
+    assert all(one.support >= 3 for one in found.details)
+    left_out = {one['landmark_id']: one['reason'] for one in json.loads(report.read_text())[
+        'left_out']}
+    assert len(left_out) == 42 - len(found)
+    assert 'semi-axes' in left_out['thin'] and 'ghost' in left_out
+
+
+def test_keeps_what_cannot_be_fitted_where_asked_for(table, observations, tmp_path):
+    out = tmp_path / 'map.yaml'
+    done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
+                      '--keep-unsupported')
+    assert done.returncode == 0, done.stderr
+    found = LandmarkMap.from_file(out)
+    assert found.centers[found.landmark_ids.index('ghost')].tolist() == [0.0, 0.0, 9.0]
+    assert found.details[found.landmark_ids.index('ghost')].support is None
+
+
+@pytest.mark.parametrize(('name', 'write'), [
+    ('msgloc', msgloc_text), ('goreloc', goreloc_file), ('oaslam', oaslam_text)])
+def test_every_format_becomes_a_map(office, name, write, tmp_path):
+    content = write(office)
+    path = tmp_path / 'theirs'
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    out = tmp_path / 'map.yaml'
+    done = import_map('--from', name, path, '--out', out, '--scale', 2,
+                      '--transform', 1, 2, 3, 0, 0, 0, 1)
+    assert done.returncode == 0, done.stderr
+    assert 'note: maps of other systems localize better after --refit' in done.stdout
+    np.testing.assert_allclose(LandmarkMap.from_file(out).centers,
+                               2.0 * office.centers + [1, 2, 3], atol=1e-4)
+
+
+def test_an_existing_map_stays_when_the_import_fails(office, observations, tmp_path):
+    old, link, table = tmp_path / 'old.yaml', tmp_path / 'link.yaml', tmp_path / 'far.csv'
+    old.write_text('precious')
+    link.symlink_to(old)
+    table.write_text(table_text(LandmarkMap(
+        'map', office.landmark_ids, office.labels, office.class_ids, office.centers + 1.0,
+        office.semi_axes, office.quats_xyzw)))
+    done = import_map('--from', 'csv', table, '--refit', observations, '--out', old)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f'error: {observations}: the map does not lie where')
+    done = import_map('--from', 'goreloc', table, '--out', link)
+    assert done.returncode == 1
+    assert 'no complete NAME.objects' in done.stderr
+    assert old.read_text() == 'precious' and link.is_symlink()
+    done = import_map('--from', 'csv', table, '--out', link)
+    assert done.returncode == 0, done.stderr
+    assert len(LandmarkMap.from_file(link)) == len(office)
+    assert old.read_text() == 'precious'
+    assert {path.name for path in tmp_path.iterdir()} == {'old.yaml', 'link.yaml', 'far.csv'}
+
+
+@pytest.mark.parametrize(('args', 'message'), [
+    (('--out', 'missing/map.yaml'), 'there is no folder missing; create it'),
+    (('--out', '.'), 'is a folder; name the file to write'),
+    (('--out', 'IN'), 'is an input; name another file'),
+    (('--out', 'm.yaml', '--report', 'IN'), 'is an input; name another file'),
+    (('--out', 'm.yaml', '--scale', 0), '--scale 0.0: must be above 0'),
+    (('--out', 'm.yaml', '--scale', 'nan'), '--scale nan: must be above 0'),
+    (('--out', 'm.yaml', '--transform', 0, 0, 0, 1, 1, 1, 1), '--transform: '),
+    (('--out', 'm.yaml', '--frame-id', ''), '--frame-id: must not be empty'),
+    (('--out', 'm.yaml', '--class-names', 'IN'), '--class-names is not for csv'),
+])
+def test_wrong_options_are_named(table, args, message):
+    before = table.read_bytes()
+    args = [table if arg == 'IN' else arg for arg in args]
+    done = import_map('--from', 'csv', table, *args)
+    assert done.returncode == 1
+    assert message in done.stderr and 'Traceback' not in done.stderr
+    assert table.read_bytes() == before

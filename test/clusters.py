@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Dask clusters on this machine."""
+
+import os
+import signal
+import threading
+import time
+from contextlib import contextmanager
+
+import dask
+from distributed import LocalCluster
+
+TIMEOUT_S = 300.0
+
+
+@contextmanager
+def local_cluster(workers=2, allowed_failures=3):
+    """A scheduler with some workers, each a process with one thread, which start again."""
+    with (dask.config.set({'distributed.scheduler.allowed-failures': allowed_failures}),
+          LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
+                       dashboard_address='127.0.0.1:0') as cluster):
+        yield cluster
+
+
+def kill_a_worker(cluster):
+    """Kill the process of the first worker; return its id."""
+    pid = min(nanny.pid for nanny in cluster.workers.values())
+    os.kill(pid, signal.SIGKILL)
+    return pid
+
+
+@contextmanager
+def killing_a_worker(cluster, when):
+    """Kill a worker as soon as a condition holds; yield what tells the processes killed."""
+    killed, stop = [], threading.Event()
+
+    def wait():
+        deadline = time.monotonic() + TIMEOUT_S
+        while not stop.is_set() and time.monotonic() < deadline:
+            if when():
+                killed.append(kill_a_worker(cluster))
+                return
+            time.sleep(0.005)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the demo says of the map it built: found, missed and false objects, and why."""
+
+import json
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.demo.map_page import console_lines, section
+from cliploc_ros.demo.map_picture import draw_map_review
+from cliploc_ros.demo.map_review import Sightings, count_sightings, review_map
+from cliploc_ros.demo.truth import TrueBox, TrueFrame, TrueObject, read_objects
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.evaluation.summary import Summary
+from cliploc_ros.mapping.posed_detections import PosedDetections
+
+HOSTILE = '<script>alert("&")</script>'
+
+
+def true_object(object_id, class_id, x, y=0.0, label='a thing'):
+    return TrueObject(object_id, class_id, label, np.array([x, y, 1.0]), np.full(3, 0.1),
+                      np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def make_map(*landmarks):
+    """Return a map of spheres with a radius of 11 cm: rows of id, class, x, y."""
+    ids, classes, xs, ys = zip(*landmarks, strict=True)
+    centers = np.c_[xs, ys, np.ones(len(ids))]
+    return LandmarkMap('map', ids, classes, classes, centers, np.full((len(ids), 3), 0.11),
+                       np.tile([0.0, 0.0, 0.0, 1.0], (len(ids), 1)))
+
+
+@pytest.fixture
+def review():
+    objects = [true_object('mug_1', 'mug', 0.0), true_object('mug_2', 'mug', 1.0),
+               true_object('can_1', 'can', 2.0, label=HOSTILE), true_object('book_1', 'book', 3.0),
+               true_object('box_1', 'box', 4.0), true_object('bowl_1', 'bowl', 5.0)]
+    built = make_map(('mug_a', 'mug', 0.03, 0.04), ('mug_b', 'mug', 0.06, 0.0),
+                     ('mug_c', 'mug', 2.02, 0.0), ('mug_d', 'mug', 8.0, 0.0),
+                     ('box_a', 'box', 4.0, 0.02))
+    left_out = [{'class_id': 'box', 'center': (3.0, 0.05, 1.0), 'reason': 'as box, nearer'},
+                {'class_id': 'book', 'center': (3.0, 0.09, 1.0), 'reason': 'seen from one side'}]
+    sightings = {name: Sightings(shown, Counter())
+                 for name, shown in (('mug_2', 4), ('can_1', 6), ('book_1', 3))}
+    return review_map(built, objects, sightings, left_out)
+
+
+def test_each_object_has_at_most_one_landmark_of_its_class(review):
+    pairs = review.landmark_of
+    assert pairs['box_1'] == 'box_a'
+    assert pairs['mug_1'] in ('mug_a', 'mug_b')
+    assert len(pairs) == 2
+    offsets = {review.objects[one.object_row].object_id: one.offset_m for one in review.found}
+    assert offsets['box_1'] == pytest.approx(0.02)
+    assert offsets['mug_1'] == pytest.approx(0.05)  # of the two, the nearer one is found
+    assert [one.size_ratio for one in review.found] == pytest.approx([1.1, 1.1])
+
+
+def test_false_landmarks_say_what_is_there(review):
+    ids = review.landmark_map.landmark_ids
+    false = {ids[landmark]: text for landmark, text in review.false.items()}
+    assert false == {'mug_b': 'mug_1 a second time', 'mug_c': f'can_1 is there: {HOSTILE}',
+                     'mug_d': 'nothing is there; bowl_1 is 3.00 m away'}
+
+
+def test_missed_objects_say_why(review):
+    missed = {review.objects[row].object_id: text for row, text in review.missed.items()}
+    assert missed == {
+        'mug_2': '4 images show it; detected in none',
+        'can_1': 'mapped as mug; 6 images show it; detected in none',
+        'book_1': 'left out as book, seen from one side; 3 images show it; detected in none',
+        'bowl_1': 'no image shows it'}
+
+
+def test_the_terminal_and_the_page_say_the_same(review):
+    lines = list(console_lines(review))
+    assert lines[0].startswith('2 of 6 objects found, 4 missed, 3 false; centres 3.5 cm off')
+    assert len(lines) == 1 + 4 + 3
+    errors = np.array([[0.1, 0.3, 2.0, np.inf]])
+    summary = Summary('auto', (0, 1, 2, 3), errors, errors > 1, errors, errors, errors,
+                      np.zeros((1, 4), int), np.zeros((1, 4), int), np.zeros(4, int))
+    html = section(review, {'built map': summary}, 30)
+    assert lines[0] in html
+    assert '<td>0.25</td><td>0.50</td><td>0.50</td>' in html
+    assert '<td>2 of 4</td><td>2</td>' in html
+    assert '<script>' not in html
+    assert html.count('&lt;script&gt;') == 2  # a label among the missed, and as what is there
+
+
+def test_the_picture_shows_something(review, tmp_path):
+    draw_map_review(review, np.tile(np.eye(4), (3, 1, 1)), tmp_path / 'map.png')
+    image = cv2.imread(str(tmp_path / 'map.png'))
+    assert min(image.shape[:2]) > 300
+    assert image.std() > 10
+
+
+def test_sightings_count_images_by_class():
+    boxes = [np.array([100.0, 100, 200, 200]), np.array([300.0, 100, 400, 200])]
+    shown = tuple(TrueBox(name, 'mug', '', box, 1.0, True)
+                  for name, box in zip(('a', 'b'), boxes, strict=True))
+    frames = [TrueFrame(None, '1000.000000', shown), TrueFrame(None, '1001.000000', shown[:1]),
+              TrueFrame(None, '1002.000000', shown)]  # the last one was no keyframe
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    # twice the same box in the first image, and nothing at the place of b
+    detections = PosedDetections(
+        camera, np.tile(np.eye(4), (2, 1, 1)), np.array([1000.0, 1001.0]), np.array([0, 3, 4]),
+        np.array([boxes[0], boxes[0] + 2, boxes[1] + 90, boxes[0]]), ('can', 'mug'),
+        np.array([1, 1, 1, 0]), np.ones(4))
+    found = count_sightings(frames, detections)
+    assert found['a'].shown == 3
+    assert found['a'].detected == {'mug': 1, 'can': 1}
+    assert found['b'].shown == 2
+    assert not found['b'].detected
+
+
+@pytest.mark.parametrize('content', ['', '[]', '{"objects": []}', '{"objects": [{"id": "a"}]}'])
+def test_a_truth_without_objects_is_named(tmp_path, content):
+    (tmp_path / 'truth.json').write_text(content)
+    with pytest.raises(DatasetError, match=r'truth\.json'):
+        read_objects(tmp_path)
+
+
+def test_the_shipped_walk_shows_the_room_before_anything_moved():
+    before, after = (read_objects(ASSETS / name) for name in ('mapping', 'sequence'))
+    moved = [old.object_id for old, new in zip(before, after, strict=True)
+             if np.linalg.norm(old.center - new.center) > 0.2]
+    assert len(before) == 64
+    assert len(moved) == 4
+    frames = json.loads((ASSETS / 'mapping' / 'truth.json').read_text())['frames']
+    assert len(frames) == len(list((ASSETS / 'mapping' / 'rgb').glob('*.jpg'))) == 30

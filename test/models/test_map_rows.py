@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A map's labels and images with a real, small CLIP."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import make_room
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    save_landmark_embeddings,
+)
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.models import ClipOptions, load_encoder
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
+
+ROOM = make_room()
+
+
+@pytest.fixture(scope='module')
+def clip(small_clip, tmp_path_factory):
+    return ClipOptions(model=small_clip.name, pretrained=str(small_clip.file), device='cpu',
+                       cache_dir=str(tmp_path_factory.mktemp('cache')))
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    write_map(tmp_path / 'room.yaml', ROOM)
+    return tmp_path / 'room.yaml'
+
+
+def images_of(key, ids=ROOM.landmark_ids, size=64):
+    means = np.random.default_rng(0).normal(size=(len(ids), size))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    return LandmarkEmbeddings(key, tuple(ids), means.astype(np.float16),
+                              np.zeros((0, size), np.float16), np.zeros(len(ids) + 1, np.int64))
+
+
+def test_labels_with_weights_are_mixed(clip, small_clip):
+    described = replace(ROOM, details=(
+        LandmarkDetails(labels=((ROOM.labels[0], 3.0), ('a red cup', 1.0))),
+        *[LandmarkDetails()] * (len(ROOM) - 1)))
+    rows = np.asarray(embed_map(clip, described, '', 'both'))
+    plain = np.asarray(embed_map(clip, ROOM, '', 'both'))
+    assert np.array_equal(rows[1:], plain[1:])
+    expected = np.array([3.0, 1.0]) @ small_clip.labels([ROOM.labels[0], 'a red cup'])
+    assert rows[0] == pytest.approx(expected / np.linalg.norm(expected), abs=1e-5)
+
+
+def test_each_label_is_in_the_cache_once(clip, tmp_path, caplog):
+    own = replace(clip, cache_dir=str(tmp_path))
+    labels = [(('a mug', 0.6), ('a cup', 0.4)), (('a cup', 0.9), ('a mug', 0.1)), 'a cup']
+    with caplog.at_level('INFO'):
+        first = np.asarray(load_encoder(own, labels).label_embeddings)
+        again = np.asarray(load_encoder(own, labels[::-1]).label_embeddings)
+    assert '2 labels encoded' in caplog.text and '2 labels cached' in caplog.text
+    assert np.array_equal(first, again[::-1])
+
+
+@pytest.mark.parametrize('compare', ['image', 'both'])
+def test_images_of_this_encoder_are_compared(clip, map_file, compare):
+    images = images_of(resolve_clip_weights(clip).key)
+    save_landmark_embeddings(embeddings_path(map_file), images)
+    plain = np.asarray(embed_map(clip, ROOM, str(map_file), 'text'))
+    rows = np.asarray(load_encoder_for_map(clip, ROOM, str(map_file), compare).label_embeddings)
+    assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, '', compare)))
+    similar = np.sum(rows * images.means, axis=1)
+    assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
+    if compare == 'image':
+        assert np.array_equal(rows, images.means)
+    # the order is that of the map, and landmarks that were added have their label
+    fewer = images_of(images.encoder_key).in_order(ROOM.landmark_ids[:0:-1])
+    save_landmark_embeddings(embeddings_path(map_file), fewer)
+    again = np.asarray(embed_map(clip, ROOM, str(map_file), compare))
+    assert np.isfinite(again).all()
+    assert np.argmax(again[1:] @ images.means[1:].T, axis=1).tolist() == list(range(len(ROOM) - 1))
+
+
+def damage(file):
+    file.write_bytes(file.read_bytes()[:-300])
+
+
+@pytest.mark.parametrize(('images', 'change', 'message'), [
+    (images_of('ViT-L-14:gelu:0123'), None, 'made with the encoder ViT-L-14:gelu:0123, not'),
+    (images_of('', size=32), None, 'made with the encoder'),
+    (images_of('', ids=('sofa',)), None, 'holds no landmark'),
+    (images_of(''), damage, 'build the map again'),
+], ids=['another encoder', 'another size', 'another map', 'damaged'])
+def test_images_that_cannot_be_used_leave_the_labels(clip, map_file, images, change, message,
+                                                     caplog):
+    if not images.encoder_key:
+        images = replace(images, encoder_key=resolve_clip_weights(clip).key)
+    file = embeddings_path(map_file)
+    save_landmark_embeddings(file, images)
+    if change is not None:
+        change(file)
+    rows = np.asarray(embed_map(clip, ROOM, str(map_file), 'both'))
+    assert np.array_equal(rows, np.asarray(embed_map(clip, ROOM, '', 'text')))
+    warning, = (one for one in caplog.records if one.levelname == 'WARNING')
+    assert message in warning.getMessage() and str(file) in warning.getMessage()
+
+
+def test_a_map_without_images_says_nothing(clip, map_file, caplog):
+    embed_map(clip, ROOM, str(map_file), 'both')
+    assert not [one for one in caplog.records if one.levelname == 'WARNING']

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The relocalizer with the demo's CLIP in a map whose objects only their images tell apart."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    load_landmark_embeddings,
+    save_landmark_embeddings,
+)
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.demo.truth import read_frames
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.localizer import load_localizer
+from cliploc_ros.ros.parameter_tables import RELOCALIZER
+from cliploc_ros.units import NS_PER_S
+
+HEADER = Header(frame_id='camera')
+FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))
+# Images of the landmarks come from its neighbours: another walk is not at hand.
+QUERY, NEIGHBOURS = FRAMES[34], FRAMES[32:34] + FRAMES[35:37]
+
+
+def read_image(frame):
+    return cv2.imread(str(frame.image))[..., ::-1].copy()
+
+
+def mapped(frame):
+    return [box for box in frame.boxes if box.in_map]
+
+
+def images_of(landmark_map, encoder):
+    """The mean embedding of each landmark that the neighbours show."""
+    sums = np.zeros((len(landmark_map), encoder.embed_dim))
+    for frame in NEIGHBOURS:
+        boxes = mapped(frame)
+        rows = [landmark_map.landmark_ids.index(box.object_id) for box in boxes]
+        sums[rows] += encoder.encode_crops(read_image(frame),
+                                           np.array([box.bbox_xyxy for box in boxes]))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    means = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0)
+    return LandmarkEmbeddings(encoder.key, landmark_map.landmark_ids, means.astype(np.float16),
+                              np.zeros((0, encoder.embed_dim), np.float16),
+                              np.zeros(len(landmark_map) + 1, np.int64))
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    """Values of the parameters for a map without names, and the image embeddings next to it."""
+    folder = tmp_path_factory.mktemp('nameless')
+    named = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    count = len(named)
+    write_map(folder / 'map.yaml',
+              replace(named, labels=('a thing',) * count, class_ids=('thing',) * count))
+    clip = ClipOptions(model=str(ASSETS / 'clip.json'), device='cpu', cache_dir=str(folder),
+                       pretrained=str(ASSETS / 'clip.safetensors'))
+    images = images_of(named, ClipEncoder(resolve_clip_weights(clip), clip))
+    save_landmark_embeddings(embeddings_path(folder / 'map.yaml'), images)
+    values = {row.name: row.default for row in RELOCALIZER}
+    return values | {
+        'map_file': str(folder / 'map.yaml'), 'clip_model': clip.model, 'device': 'cpu',
+        'clip_pretrained': clip.pretrained, 'cache_dir': str(folder), 'time_budget_ms': 1e4}
+
+
+@pytest.fixture(scope='module')
+def frame():
+    """The query as messages: its boxes are true, and its detector knows things only."""
+    image, boxes = read_image(QUERY), mapped(QUERY)
+    detections = Detections(np.array([box.bbox_xyxy for box in boxes]), ('thing',) * len(boxes),
+                            np.ones(len(boxes)))
+    camera, _ = find_camera(None, ASSETS / 'sequence')
+    info = CameraInfo(header=HEADER, width=camera.width, height=camera.height,
+                      k=camera.matrix.ravel(), p=np.c_[camera.matrix, np.zeros(3)].ravel())
+    return Frame(Image(header=HEADER, width=camera.width, height=camera.height, encoding='rgb8',
+                       step=3 * camera.width, data=image.tobytes()),
+                 info, detections_to_msg(detections, HEADER), 0.0)
+
+
+def finds(localizer, frame, values) -> bool:
+    """Return whether the pose is accepted; it then has to be right."""
+    found = localizer.localize(frame, values, RobotState(np.eye(4))).found
+    if found.accepted:
+        truth = read_tum(ASSETS / 'sequence').pose_at(round(float(QUERY.timestamp) * NS_PER_S))
+        distance_m, angle_deg = pose_error(found.map_from_camera, truth)
+        assert distance_m < 0.25 and angle_deg < 5.0
+    return found.accepted
+
+
+@pytest.mark.parametrize(('compare', 'accepted'), [('both', True), ('image', True),
+                                                   ('text', False)])
+def test_images_tell_objects_apart(make_node, world, frame, compare, accepted):
+    values = world | {'landmark_embeddings': compare}
+    assert finds(load_localizer(make_node(), values), frame, values) is accepted
+
+
+def test_reload_map_reads_the_images_again(make_node, world, frame, caplog):
+    file, node = embeddings_path(world['map_file']), make_node()
+    content = file.read_bytes()
+    localizer = load_localizer(node, world)
+    assert finds(localizer, frame, world)
+    try:
+        file.unlink()
+        localizer = localizer.reloaded(node, world)
+        assert not finds(localizer, frame, world) and not caplog.records
+        file.write_bytes(content)
+        foreign = replace(load_landmark_embeddings(file), encoder_key='ViT-L-14:gelu:0123')
+        save_landmark_embeddings(file, foreign)
+        localizer = localizer.reloaded(node, world)
+        assert not finds(localizer, frame, world)
+        assert str(file) in caplog.text and 'ViT-L-14:gelu:0123' in caplog.text
+    finally:
+        file.write_bytes(content)
+    assert finds(localizer.reloaded(node, world), frame, world)
