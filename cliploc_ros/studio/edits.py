@@ -167,7 +167,7 @@ def _together(parts: Sequence[Landmark]) -> tuple[NDArray[np.float64], NDArray[n
 def split(landmarks: Landmarks, landmark_id: str) -> Change:
     """Make two landmarks of one: halves of its longest axis."""
     old = _get(landmarks, landmark_id)
-    axes = old.semi_axes
+    axes = old.semi_axes.copy()
     longest = int(np.argmax(axes))
     half_way = 0.5 * old.basis[:, longest]
     axes[longest] = max(0.5 * axes[longest], LEAST_SEMI_AXIS_M)

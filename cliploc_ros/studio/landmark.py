@@ -59,21 +59,21 @@ class Landmark:
         """Return the detector class."""
         return str(self.fields['class_id'])
 
-    @property
+    @cached_property
     def center(self) -> NDArray[np.float64]:
         """Return the centre (3,) [m]."""
-        return np.array(self.fields['center'], dtype=np.float64)
+        return _fixed(np.array(self.fields['center'], dtype=np.float64))
 
-    @property
+    @cached_property
     def semi_axes(self) -> NDArray[np.float64]:
         """Return the semi-axes (3,) [m]."""
-        return np.array(self.fields['semi_axes'], dtype=np.float64)
+        return _fixed(np.array(self.fields['semi_axes'], dtype=np.float64))
 
-    @property
+    @cached_property
     def quat_xyzw(self) -> NDArray[np.float64]:
         """Return the unit quaternion (4,) from landmark axes to map axes."""
         quat_xyzw = np.array(self.fields['orientation'], dtype=np.float64)
-        return np.asarray(quat_xyzw / np.linalg.norm(quat_xyzw))
+        return _fixed(quat_xyzw / np.linalg.norm(quat_xyzw))
 
     @property
     def basis(self) -> NDArray[np.float64]:
@@ -95,6 +95,11 @@ class Landmark:
         together = {**self.fields, **fields}
         return replace(self, fields={name: value for name, value in together.items()
                                      if value is not None or name not in fields})
+
+
+def _fixed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    values.setflags(write=False)
+    return values
 
 
 def check_landmark(landmark_id: str, landmark: Landmark, source: str) -> None:

@@ -163,7 +163,7 @@ class LandmarkPanel:
             self._edit(slider, partial(self._resize, axis))
 
     def _resize(self, axis: int, landmarks: Any, key: str, length: float) -> Change:
-        semi_axes = landmarks[key].semi_axes
+        semi_axes = landmarks[key].semi_axes.copy()
         semi_axes[axis] = length
         return edits.set_axes(landmarks, key, semi_axes)
 

@@ -23,6 +23,8 @@ SELECTED_RGB = (255, 220, 0)
 DRAWN_RGB = (255, 0, 220)
 _DETECTED_RGB = (255, 255, 255)
 _BLANK = 70
+# More outlines hide the image, and a drag would wait for them.
+_MAX_OUTLINES = 200
 # Subpixel bits of OpenCV's drawing functions; larger coordinates overflow its integers.
 _SHIFT = 4
 _MAX_PIXEL = 20_000.0
@@ -106,7 +108,10 @@ def draw(camera: Camera, image: NDArray[np.uint8] | None, boxes_xyxy: NDArray[np
         picture = image.copy()
     for box in boxes_xyxy:
         _rectangle(picture, box, _DETECTED_RGB, 1)
-    for one in reversed(outlines):
+    # the farthest first, so that the nearest lie on top
+    shown = [one for number, one in enumerate(outlines)
+             if number < _MAX_OUTLINES or one.landmark_id in selection]
+    for one in reversed(shown):
         is_selected = one.landmark_id in selection
         points = outline_points(one.ellipse)
         if np.abs(points).max() < _MAX_PIXEL:

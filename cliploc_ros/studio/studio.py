@@ -281,7 +281,7 @@ class Studio:
         rows = []
         for key, one in self.document.landmarks.items():
             text = f'{key} · {one.label} · {one.class_id}'
-            if all(word in text.casefold() for word in wanted):
+            if not wanted or all(word in text.casefold() for word in wanted):
                 is_open = key in self._checks and key not in self.accepted
                 severity = self._checks[key].severity if is_open else 0.0
                 rows.append(Row(key, ('🔒 ' if one.is_locked else '') + text, severity))

@@ -208,8 +208,8 @@ def drag(person, start, end):
     person.page.mouse.move(*end, steps=4)
 
 
-def test_drag_a_box_and_the_gizmo(person, studio):
-    document, server = studio.document, studio.server
+def test_a_box_is_dragged_on_the_image(person, studio):
+    server = studio.server
     camera = next(iter(server.get_clients().values())).camera
     person.page.get_by_role('button', name='Look through this view').click()
     pose = studio.map_from_camera
@@ -225,10 +225,30 @@ def test_drag_a_box_and_the_gizmo(person, studio):
     wait_for(lambda: 0 in studio.drawn, 'the box')
     assert np.allclose(studio.drawn[0], pixels.ravel(), atol=8.0)
     person.picture('drawn')
-    person.field('Draw boxes').uncheck()
 
+
+def test_the_gizmo_is_dragged(person, studio):
+    """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
+    document, server = studio.document, studio.server
     person.find('mug_2')
     person.click(re.compile('^mug_2 '))
-    before = document.landmarks['mug_2'].center
-    wait_for(lambda: np.allclose(camera.look_at, before, atol=1e-2), 'looking at it')
+    before = document.landmarks['mug_2']
+    camera = next(iter(server.get_clients().values())).camera
+    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'looking at it')
+    near = before.center + np.array([-0.9, -0.9, 0.7])
+    camera.position, camera.look_at = near, before.center
+    # the camera reports where it is: another report shows that the browser moved it
+    person.page.mouse.wheel(0, 1)
+    wait_for(lambda: np.linalg.norm(camera.position - near) < 0.2, 'coming near')
     person.picture('gizmo')
+    up = np.array([0.0, 0.0, 1.0])
+    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.3, 0.5))
+    drag(person, grip, goal)
+    wait_for(lambda: document.landmarks['mug_2'].center[2] > before.center[2] + 0.1, 'the drag')
+    person.page.mouse.up()
+    person.picture('dragged')
+    moved = document.landmarks['mug_2'].center - before.center
+    assert abs(moved[2] - 0.2) < 0.08 and np.abs(moved[:2]).max() < 1e-3
+    person.click(re.compile('^Undo'))
+    wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
+    assert document.to_undo is None

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's actions and its gate, without a browser."""
 
+import resource
 import shutil
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -10,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits
@@ -158,6 +162,38 @@ def test_images_that_are_none(tmp_path, folder):
 
     with pytest.raises(CliplocError):
         open_images(tmp_path / folder, BagTopics())
+
+
+@pytest.mark.needs('viser')
+def test_a_large_map_with_many_views(tmp_path):
+    """Prints the processor time of the server's side: 5,000 landmarks, 1,000 views."""
+    from cliploc_ros.studio.server import serve_studio
+
+    rng = np.random.default_rng(0)
+    path = tmp_path / 'map.yaml'
+    count = 5000
+    write_map(path, LandmarkMap(
+        'map', tuple(f'id_{number}' for number in range(count)), ('a cup',) * count,
+        ('cup',) * count, rng.uniform(-30, 30, (count, 3)) * (1, 1, 0.05),
+        np.full((count, 3), 0.1), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    one = views_of_folder(ASSETS / 'sequence')
+    views = one.select_frames(np.arange(1000) % len(one))
+    times = [time.process_time()]
+    studio = Studio(Document(path), Recording(views))
+    with serve_studio(studio, '127.0.0.1', 0):
+        times.append(time.process_time())
+        for step in range(20):
+            here = studio.document.landmarks['id_7'].center
+            studio.document.apply(edits.move(studio.document.landmarks, 'id_7', here + 0.01),
+                                  gesture='drag')
+            assert studio.picture().any(), step
+        times.append(time.process_time())
+    opened_s, dragged_s = np.diff(times)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f'{count} landmarks, 1000 views: open {opened_s:.2f} s, one step of a drag with its '
+          f'picture {dragged_s / 20 * 1000:.0f} ms; peak memory of the whole test process '
+          f'{peak_mb:.0f} MB')
+    studio.document.close()
 
 
 # ---- who may open the page
