@@ -15,7 +15,8 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, MapError
+from cliploc_ros.replace_file import replace_file
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.panels import LandmarkPanel, MapPanel, TablePanel, ViewPanel
 from cliploc_ros.studio.picture import SELECTED_RGB
@@ -124,6 +125,22 @@ class Page:
                 color: Any) -> None:
         for one in [client] if client is not None else self.server.get_clients().values():
             one.add_notification(title, text, auto_close_seconds=8, color=color)
+
+    def export(self) -> str:
+        """Write the scene as one page that opens without a server.
+
+        Raises
+        ------
+        MapError
+            The page cannot be written.
+        """
+        path = self.studio.document.path.with_suffix('.html')
+        try:
+            with replace_file(path) as partial:
+                partial.write_text(self.server.scene.as_html(), encoding='utf-8')
+        except OSError as error:
+            raise MapError(f'{path}: cannot be written: {error.strerror}') from error
+        return f'wrote {path.name}; open it in a browser'
 
     def look_at_selection(self, event: Any) -> None:
         """Let the camera of whoever selected orbit the selection."""

@@ -82,6 +82,7 @@ class MapPanel:
         self._save = _button(page, 'Save', self._do_save, 'S', 'cmd/ctrl')
         self._undo = _button(page, 'Undo', page.studio.undo, 'Z', 'cmd/ctrl')
         self._redo = _button(page, 'Redo', page.studio.redo, 'Y', 'cmd/ctrl')
+        _button(page, 'Export as one page', page.export)
         with gui.add_folder('The file changed on disk', visible=False) as self._conflict:
             _button(page, 'Overwrite it', self._overwrite, color='red')
             _button(page, 'Reload it (undo takes back)', self._reload)

@@ -8,6 +8,7 @@ import shutil
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -70,7 +71,7 @@ class Person:
     """Who looks at the page."""
 
     def __init__(self, chromium, url):
-        self.page = chromium.new_page(viewport={'width': 1200, 'height': 1000})
+        self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
         self.page.set_default_timeout(TIMEOUT_S * 1000)
         self.foreign = []
         self.page.on('request', self.note)
@@ -252,3 +253,25 @@ def test_the_gizmo_is_dragged(person, studio):
     person.click(re.compile('^Undo'))
     wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
     assert document.to_undo is None
+
+
+def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
+    person.click('Export as one page')
+    exported = path.with_suffix('.html')
+    wait_for(exported.is_file, 'the export')
+    page = chromium.new_page(viewport={'width': 600, 'height': 400})
+    foreign = []
+    page.on('request', lambda request: foreign.append(request.url) if request.url.startswith(
+        ('http', 'ws')) else None)
+    page.goto(exported.as_uri())
+
+    def shows_colours():
+        image = cv2.imdecode(np.frombuffer(page.screenshot(timeout=TIMEOUT_S * 1000), np.uint8),
+                             cv2.IMREAD_COLOR).astype(int)
+        return ((image.max(axis=2) - image.min(axis=2)) > 60).mean() > 0.005
+
+    wait_for(shows_colours, 'the ellipsoids')
+    if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
+        page.screenshot(path=Path(folder) / 'exported.png', timeout=TIMEOUT_S * 1000)
+    assert foreign == []
+    page.close()

@@ -45,7 +45,7 @@ def office(tmp_path, shared_data):
     path = tmp_path / 'map.yaml'
     shutil.copy(folder / 'map.yaml', path)
     detections = load_observations(folder / 'observations.npz')
-    studio = Studio(Document(path), Recording(detections.select_frames(range(0, 2583, 8))))
+    studio = Studio(Document(path), Recording(detections.select_frames(range(0, 2583, 80))))
     yield studio
     studio.document.close()
 
@@ -143,7 +143,7 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     document = office.document
     before = office.relocalize_all()
     accepted = sum(one.verdict == 'accepted' for one in office.answers)
-    assert 'simulated' in before and '(was' not in before and accepted > 30
+    assert 'simulated' in before and '(was' not in before and accepted > 10
     accepted_view = next(one.view for one in office.answers if one.verdict == 'accepted')
     office.show_view(accepted_view)
     assert f'view {accepted_view}: accepted' in office.relocalize_here()
@@ -182,7 +182,7 @@ def test_a_large_map_with_many_views(tmp_path):
     studio = Studio(Document(path), Recording(views))
     with serve_studio(studio, '127.0.0.1', 0):
         times.append(time.process_time())
-        for step in range(20):
+        for step in range(5):
             here = studio.document.landmarks['id_7'].center
             studio.document.apply(edits.move(studio.document.landmarks, 'id_7', here + 0.01),
                                   gesture='drag')
@@ -191,7 +191,7 @@ def test_a_large_map_with_many_views(tmp_path):
     opened_s, dragged_s = np.diff(times)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f'{count} landmarks, 1000 views: open {opened_s:.2f} s, one step of a drag with its '
-          f'picture {dragged_s / 20 * 1000:.0f} ms; peak memory of the whole test process '
+          f'picture {dragged_s / 5 * 1000:.0f} ms; peak memory of the whole test process '
           f'{peak_mb:.0f} MB')
     studio.document.close()
 
