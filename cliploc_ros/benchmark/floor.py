@@ -198,7 +198,7 @@ def evaluate(folder: Path, workers: int) -> str:
     """Run evaluate; return its results in a line."""
     from cliploc_ros.cli.evaluate import main as run
 
-    _run(run, '--queries', folder / 'queries.npz', '--map', folder / 'map.yaml', '--methods',
+    _run(run, folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map', folder / 'map.yaml', '--methods',
          'auto', '--trials', 1, '--no-figures', '--workers', workers, '--out', folder)
     results = json.loads((folder / 'results.json').read_text())
     right = [one['solved'] and one['error_m'] <= 1.0 for one in results]
@@ -212,13 +212,12 @@ def check(folder: Path) -> None:
     """Run check_map."""
     from cliploc_ros.cli.check_map import main as run
 
-    _run(run, folder / 'map.yaml', '--observations', folder / 'observations.npz', '--out',
+    _run(run, folder / 'check_map.log', folder / 'map.yaml', '--observations', folder / 'observations.npz', '--out',
          folder / 'check')
 
 
-def _run(command: Callable[[Sequence[str]], int], *arguments: object) -> None:
-    with (Path(str(arguments[-1])).with_suffix('.log').open('w') as log,
-          contextlib.redirect_stdout(log)):
+def _run(command: Callable[[Sequence[str]], int], log: Path, *arguments: object) -> None:
+    with log.open('w') as file, contextlib.redirect_stdout(file):
         command([str(argument) for argument in arguments])
 
 

@@ -50,12 +50,22 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
         with replace_file(path) as partial, partial.open('w', encoding='utf-8') as file:
             file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
             file.writelines(f'{line}\n' for line in _lines(landmark_map))
-        embeddings_path(path).unlink(missing_ok=True)
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
+    _replace_embeddings(embeddings_path(path), embeddings)
+
+
+def _replace_embeddings(path: Path, embeddings: LandmarkEmbeddings | None) -> None:
+    """Write embeddings, or remove those of the map that was there before."""
     if embeddings is not None:
-        save_landmark_embeddings(embeddings_path(path), embeddings)
+        save_landmark_embeddings(path, embeddings)
+        return
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise MapError(f'{path}: is not of the map that was written; it cannot be removed: '
+                       f'{error.strerror}') from error
 
 
 def _lines(landmark_map: LandmarkMap) -> Iterator[str]:

@@ -10,6 +10,11 @@ import yaml
 from scene import make_room
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    load_embeddings_of_map,
+)
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.map_file import write_map
 from cliploc_ros.errors import MapError
@@ -63,6 +68,19 @@ def test_the_old_map_stays_when_the_new_one_cannot_be_written(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ['map.yaml']
     with pytest.raises(MapError, match='cannot be written'):
         write_map(tmp_path / 'missing' / 'map.yaml', make_room())
+
+
+def test_image_embeddings_belong_to_one_map(tmp_path):
+    path, room = tmp_path / 'map.yaml', make_room()
+    rows = np.eye(12, 16, dtype=np.float16)
+    seen = LandmarkEmbeddings('key', room.landmark_ids, rows, rows, np.arange(13))
+    write_map(path, room, embeddings=seen)
+    assert load_embeddings_of_map(path, room.landmark_ids).is_known.all()
+    write_map(path, room)
+    assert load_embeddings_of_map(path, room.landmark_ids) is None
+    embeddings_path(path).mkdir()
+    with pytest.raises(MapError, match=r'map\.embeddings\.npz: .*cannot be removed'):
+        write_map(path, room)
 
 
 def test_labels_may_stand_in_place_of_a_label():

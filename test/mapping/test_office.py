@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
 
+from cliploc_ros.benchmark.pose_errors import disturb, draw_errors, offsets_m
 from cliploc_ros.core.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.building import build_map
@@ -104,29 +104,23 @@ def test_the_map_relocalizes(office, shared_data, even_map, required, tmp_path):
 
 
 def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required):
-    rng = np.random.default_rng(0)
-    keep = np.exp(-np.diff(even.stamps_s) / 3.0)
-    errors = rng.normal(size=(len(even), 6))
-    for frame in range(1, len(even)):
-        errors[frame] = (keep[frame - 1] * errors[frame - 1]
-                         + np.sqrt(1 - keep[frame - 1]**2) * errors[frame])
-    errors *= np.repeat([0.05, np.radians(1.0)], 3)
-    poses = even.map_from_camera.copy()
-    poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
-    poses[:, :3, 3] += errors[:, :3]
-    noisy = even.with_poses(poses)
+    given = PoseErrors(0.05, 1.0, 3.0)
+    noisy = disturb(even, draw_errors('correlated', even.stamps_s, given,
+                                      np.random.default_rng(0)))
 
     def median_offset(built):
         """Return how far landmarks lie from those of true poses [m]."""
-        found = built.landmark_map
-        names = np.array(found.class_ids)
-        return float(np.median([
-            np.linalg.norm(found.centers[names == name] - center, axis=1).min(initial=np.inf)
-            for center, name in zip(even_map.centers, even_map.class_ids, strict=True)]))
+        return float(np.median(offsets_m(built.landmark_map, even_map)))
 
     plain = build_map(noisy)
-    joint = build_map(noisy, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
+    joint = build_map(noisy, MappingOptions(pose_errors=given))
     print(f'plain: {len(plain.landmark_map)} landmarks, off by {median_offset(plain):.3f} m; '
           f'joint: {len(joint.landmark_map)}, off by {median_offset(joint):.3f} m')
     assert median_offset(joint) <= required['joint_share'] * median_offset(plain)
     assert len(joint.landmark_map) < len(plain.landmark_map)
+
+
+def test_poses_of_motion_capture_are_left_alone(even, even_map):
+    built = build_map(even, MappingOptions(estimate_pose_errors=True))
+    assert built.report.pose_change_m == 0.0
+    assert (built.landmark_map.centers == even_map.centers).all()

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the poses, and of the mount, estimated from the boxes of a simulated walk."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walk import look_at, make_table, nearest_errors, see, walk_around
+
+from cliploc_ros.benchmark.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.joint import Prior
+from cliploc_ros.mapping.landmarks import landmarks_of_map
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
+from cliploc_ros.mapping.views import make_views
+
+ESTIMATING = MappingOptions(estimate_pose_errors=True)
+#: The camera is 3 cm and 2 degrees away from where the given poses have it.
+MOUNT = make_transform(Rotation.from_rotvec(np.radians([1.2, -1.2, 1.0])).as_matrix(),
+                       np.array([0.02, -0.01, 0.02]))
+
+
+@pytest.fixture(scope='module')
+def seen():
+    return see(make_table(), walk_around(frames=120), noise_px=2.0)
+
+
+def draft_of(detections):
+    built = build_map(detections)
+    return (make_views(detections, MappingOptions()),
+            landmarks_of_map(built.landmark_map, detections.class_names), built.shown)
+
+
+def test_true_poses_are_found_to_be_true(seen):
+    assert significant_pose_errors(*draft_of(seen)) is None
+    plain, built = build_map(seen), build_map(seen, ESTIMATING)
+    assert built.report == plain.report
+    assert (built.landmark_map.centers == plain.landmark_map.centers).all()
+
+
+@pytest.mark.parametrize(('kind', 'given'), [('independent', PoseErrors(0.02, 0.5)),
+                                             ('correlated', PoseErrors(0.04, 0.8, 3.0))])
+def test_errors_are_estimated(seen, kind, given):
+    errors = draw_errors(kind, seen.stamps_s, given, np.random.default_rng(2))
+    disturbed = disturb(seen, errors)
+    views, landmarks, shown = draft_of(disturbed)
+    found = estimate_pose_errors(views, landmarks, shown, views)
+    # a walk of 24 s holds eight independent errors of 3 s
+    assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
+    assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
+    assert (found.correlation_s < 0.3) == (kind == 'independent')
+
+
+def test_estimated_errors_are_refined_and_reported(seen):
+    errors = draw_errors('correlated', seen.stamps_s, PoseErrors(0.05, 1.0, 3.0),
+                         np.random.default_rng(1))
+    disturbed, table = disturb(seen, errors), make_table()
+    plain, built = build_map(disturbed), build_map(disturbed, ESTIMATING)
+    assert len(built.landmark_map) == len(table)
+    assert (np.median(aligned_offsets_m(built.landmark_map, table))
+            < 0.5 * np.median(aligned_offsets_m(plain.landmark_map, table)))
+    assert any(note.startswith('poses are off by about') for note in built.report.notes)
+    assert built.report.pose_change_m > 0.02
+
+
+def test_too_few_boxes_give_no_estimate():
+    few = see(make_table(), walk_around(frames=12))
+    assert estimate_pose_errors(*draft_of(few), make_views(few, MappingOptions())) is None
+
+
+def test_the_determinant_of_the_prior_is_that_of_its_matrix():
+    stamps = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 7))
+    prior = Prior.of(stamps, PoseErrors(0.05, 1.0, 3.0))
+    total = 0.0
+    for axis in range(6):
+        matrix = np.diag(prior.diagonal[:, axis])
+        matrix += np.diag(prior.beside[:-1, axis], 1) + np.diag(prior.beside[:-1, axis], -1)
+        total += np.linalg.slogdet(matrix)[1]
+    assert prior.log_determinant() == pytest.approx(total)
+
+
+def test_a_wrong_mount_is_corrected():
+    # near and far, and not always straight at the table: that hides a shift in the map's place
+    poses = np.array([look_at(np.array([r * np.cos(a), r * np.sin(a), 1.5 + 0.3 * np.sin(2 * a)]),
+                              (0.4 * np.sin(5 * a), 0.4 * np.cos(4 * a), 0.8))
+                      for a, r in zip(np.linspace(0.0, 5.0, 120),
+                                      2.0 + 0.6 * np.sin(np.linspace(0.0, 15.0, 120)),
+                                      strict=True)])
+    seen = see(make_table(), poses, noise_px=2.0)
+    wrong = seen.with_poses(seen.map_from_camera @ np.linalg.inv(MOUNT))
+    table = make_table()
+    plain, built = build_map(wrong), build_map(wrong, MappingOptions(refine_mount=True))
+    found = built.mount.given_from_corrected
+    assert found[:3, 3] == pytest.approx(MOUNT[:3, 3], abs=0.005)
+    turn = Rotation.from_matrix(found[:3, :3].T @ MOUNT[:3, :3])
+    assert np.degrees(turn.magnitude()) < 0.2
+    assert np.abs(built.map_from_camera - seen.map_from_camera).max() < 0.01
+    assert np.median(nearest_errors(built.landmark_map, table)) < 0.006
+    assert np.median(offsets_m(plain.landmark_map, table)) > 0.02
+    assert any('mount corrected: x (right) +' in note for note in built.report.notes)
+
+
+def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
+    """A camera that looks level and turns about the vertical: its y axis is the vertical."""
+    angles = np.linspace(0.0, 5.0, 80)
+    level = np.array([look_at(np.array([2.2 * np.cos(a), 2.2 * np.sin(a), 0.8]),
+                              (0.2 * np.sin(3 * a), 0.2 * np.cos(2 * a), 0.8)) for a in angles])
+    seen = see(make_table(), level, noise_px=1.0)
+    raised = make_transform(np.eye(3), np.array([0.03, 0.06, 0.0]))
+    wrong = seen.with_poses(level @ np.linalg.inv(raised))
+    built = build_map(wrong, MappingOptions(refine_mount=True))
+    found = built.mount.given_from_corrected[:3, 3]
+    assert found[0] == pytest.approx(0.03, abs=0.01)
+    assert abs(found[1]) < 0.01
+    (note,) = [one for one in built.report.notes if 'not observable' in one]
+    assert note.startswith('mount not observable from this motion: y (down);')
