@@ -162,7 +162,10 @@ class Page:
             camera.look_at = pose[:3, 3] + pose[:3, 2]
             camera.up_direction = -pose[:3, 1]
             camera.wxyz = wxyz_of(pose)
-            camera.fov = 2.2 * float(np.arctan(intrinsics.height / (2.0 * intrinsics.fy)))
+            # the whole image, also where the panels leave a narrow gap
+            half = max(intrinsics.height / intrinsics.fy,
+                       intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
+            camera.fov = 2.0 * float(np.arctan(1.1 * half))
 
     def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
         self.select(event, landmark_id,

@@ -20,7 +20,7 @@ from cliploc_ros.studio.trials import Answer
 # More labels than these hide the map, and slow the browser down.
 _MAX_LABELS = 150
 _MAX_LABEL_LENGTH = 60
-_LABEL_M = 0.05
+_LABEL_M = 0.035
 _MAX_CAMERAS = 1000
 _FRUSTUM_M = 0.08
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
