@@ -127,6 +127,11 @@ def make_room(seed: int, counts: Mapping[str, int] | None = None, unknown: int =
     return Room(seed, furniture, tuple(objects))
 
 
+def find_places(seed: int) -> list[Slot]:
+    """Return all places for objects in the room of a seed."""
+    return _furnish(np.random.default_rng(seed))[1]
+
+
 def move_objects(room: Room, count: int, seed: int) -> Room:
     """Swap some mapped objects of the room in pairs."""
     rng = np.random.default_rng(seed)

@@ -8,9 +8,10 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cliploc_ros.cli.map_labels import add_label_options, prepare_labels
+from cliploc_ros.cli.map_labels import Labeller, add_label_options, prepare_labels
+from cliploc_ros.cli.map_update import OldMap, read_old_map, update_old_map, with_usual_noise
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.mapping.building import BuiltMap
+    from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+    from cliploc_ros.mapping.posed_detections import PosedDetections
 
 EPILOG = """\
 examples:
@@ -31,6 +34,7 @@ examples:
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
+  build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
 
@@ -51,6 +55,8 @@ def make_parser() -> argparse.ArgumentParser:
     add_source_options(parser)
     parser.add_argument('--out', type=Path, required=True, metavar='YAML',
                         help='the map to write')
+    parser.add_argument('--update', type=Path, metavar='YAML',
+                        help='bring this map up to date; --out may be the same file')
     parser.add_argument('--report', type=Path, metavar='JSON',
                         help='also write what was found and left out, and why')
     parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
@@ -61,7 +67,7 @@ def make_parser() -> argparse.ArgumentParser:
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise is given, or estimated from the boxes)')
+                       '--pose-noise or --update is given, or estimated from the boxes)')
     poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
@@ -81,10 +87,10 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.map_file import write_map
-    from cliploc_ros.mapping.building import build_map
 
     begin = time.monotonic()
     _check_folder(options.out)
+    old = None if options.update is None else read_old_map(options.update)
     recorded = read_source(options)
     detections = recorded.detections
     if recorded.without_pose:
@@ -92,20 +98,55 @@ def build(options: argparse.Namespace) -> int:
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = prepare_labels(options, detections)
-    with _ProgressBar() as bar:
-        built = build_map(detections, _mapping_options(options), bar.show)
-    head = [f'built by build_map from {source_of(options).name}', *built.report.lines()[:2]]
-    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
-    write_map(options.out, landmark_map, head, embeddings)
+    made = _build(options, detections, labeller) if old is None else _update(
+        options, old, detections, labeller)
+    write_map(options.out, made.landmark_map, made.comments, made.embeddings)
     if options.report is not None:
-        _write_report(options.report, built)
-    print('\n'.join(built.report.lines()))
+        _write_report(options.report, made.report)
+    print('\n'.join(made.lines))
     if labeller.note:
         print(f'note: {labeller.note}')
-    if built.mount is not None:
-        print(_mount_option(options, built.mount.given_from_corrected))
     print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')
     return 0
+
+
+class _Made(NamedTuple):
+    """A map, what belongs next to it and to its head, and the report: as text and for JSON."""
+
+    landmark_map: 'LandmarkMap'
+    embeddings: 'LandmarkEmbeddings | None'
+    comments: list[str]
+    lines: list[str]
+    report: dict[str, Any]
+
+
+def _build(options: argparse.Namespace, detections: 'PosedDetections', labeller: Labeller
+           ) -> _Made:
+    from cliploc_ros.mapping.building import build_map
+
+    with _ProgressBar() as bar:
+        built = build_map(detections, _mapping_options(options), bar.show)
+    lines = built.report.lines()
+    head = [f'built by build_map from {source_of(options).name}', *lines[:2]]
+    if built.mount is not None:
+        lines.append(_mount_option(options, built.mount.given_from_corrected))
+    return _Made(*labeller.describe(built.landmark_map, detections, built.shown), head, lines,
+                 built.report.as_dict())
+
+
+def _update(options: argparse.Namespace, old: OldMap, detections: 'PosedDetections',
+            labeller: Labeller) -> _Made:
+    if options.refine_mount:
+        raise OptionsError('--refine-mount is for new maps, not for --update')
+    mapping = _mapping_options(options)
+    if mapping.pose_errors is None and options.joint is None:
+        mapping = with_usual_noise(mapping)
+    updated = update_old_map(old, detections, mapping, labeller)
+    lines = updated.report.lines()
+    head = [f'{options.update.name}, updated by build_map from {source_of(options).name}',
+            lines[0]]
+    return _Made(updated.landmark_map, updated.embeddings, head, lines,
+                 updated.report.as_dict())
 
 
 def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
@@ -150,12 +191,12 @@ def _check_folder(path: Path) -> None:
         raise MappingError(f'{path} is a folder; name the map file to write')
 
 
-def _write_report(path: Path, built: 'BuiltMap') -> None:
+def _write_report(path: Path, report: dict[str, Any]) -> None:
     from cliploc_ros.replace_file import replace_file
 
     try:
         with replace_file(path) as partial:
-            partial.write_text(json.dumps(built.report.as_dict(), indent=1))
+            partial.write_text(json.dumps(report, indent=1))
     except OSError as error:
         raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
 

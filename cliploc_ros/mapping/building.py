@@ -38,6 +38,10 @@ from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
 
+class NothingFoundError(MappingError):
+    """The boxes show no landmark that is good enough for a map."""
+
+
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
 
@@ -98,7 +102,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     notes += pose_notes
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
-        raise MappingError(_nothing_found(draft))
+        raise NothingFoundError(_nothing_found(draft))
     return replace(_finish(detections, given, views, draft, options, notes), mount=mount)
 
 

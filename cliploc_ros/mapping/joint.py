@@ -60,8 +60,16 @@ class Equations(NamedTuple):
     pose_gradient: NDArray[np.float64]   # (F, 6)
 
 
+class Anchors(NamedTuple):
+    """Where L landmarks are known to be: centres (L, 3) and their deviations (L,) [m]."""
+
+    centers: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+
+
 def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                   errors: PoseErrors, iterations: int = 20) -> tuple[Views, Landmarks]:
+                   errors: PoseErrors, iterations: int = 20, anchors: Anchors | None = None
+                   ) -> tuple[Views, Landmarks]:
     """Return the views with refined poses, and the refined landmarks.
 
     Parameters
@@ -76,9 +84,11 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
     errors : PoseErrors
     iterations : int
         The most steps of Levenberg and Marquardt.
+    anchors : Anchors, optional
+        Where the landmarks are known to be from before.
     """
     rows = np.nonzero(shown >= 0)[0]
-    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors))
+    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors)
     state = State(views, landmarks, pose_errors(given, views))
     cost, equations = problem.linearize(state)
     damping = 1e-4
@@ -173,6 +183,7 @@ class Problem(NamedTuple):
     rows: NDArray[np.int64]
     landmarks: NDArray[np.int64]
     prior: Prior
+    anchors: Anchors | None = None
 
     def linearize(self, state: State) -> tuple[float, Equations]:
         """Return the cost of a state and its normal equations."""
@@ -184,6 +195,8 @@ class Problem(NamedTuple):
             np.zeros((count, LANDMARK_SIZE)), np.zeros((frames, POSE_SIZE)))
         cost = _accumulate(state.views, self.rows, self.landmarks, state.landmarks.centers,
                            state.landmarks.bases, *equations)
+        if self.anchors is not None:
+            cost += _hold(self.anchors, state.landmarks, equations)
         pull = self.prior.gradient(state.errors)
         equations.pose_gradient[:] += pull
         return cost + 0.5 * float((pull * state.errors).sum()), equations
@@ -241,6 +254,16 @@ class Problem(NamedTuple):
         bands[0] += prior.diagonal
         bands[POSE_SIZE] = prior.beside
         return bands.reshape(POSE_SIZE + 1, -1)
+
+
+def _hold(anchors: Anchors, landmarks: Landmarks, equations: Equations) -> float:
+    """Add the anchors to the normal equations; return their cost."""
+    weights = 1.0 / np.square(anchors.sigmas)[:, None]
+    offsets = landmarks.centers - anchors.centers
+    equations.landmark_gradient[:, :3] += weights * offsets
+    for axis in range(3):
+        equations.of_landmarks[:, axis, axis] += weights[:, 0]
+    return 0.5 * float((weights * np.square(offsets)).sum())
 
 
 @compiled

@@ -87,7 +87,7 @@ def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
             continue
         keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
                       else (second, first))
-        if _seen_apart(views, rows_of[keep], rows_of[drop]) > options.max_seen_apart:
+        if seen_apart(views, rows_of[keep], rows_of[drop]) > options.max_seen_apart:
             continue
         rows = np.sort(np.concatenate([rows_of[keep], rows_of[drop]]))
         fit = fit_ellipsoid(views, rows, centers[keep], bases[keep])
@@ -129,7 +129,7 @@ def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:
     return float(np.sqrt(offset @ np.linalg.solve(shape, offset)))
 
 
-def _seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+def seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
     """Return in which share of the frames of the rarer landmark both have a box of their own.
 
     Two boxes that overlap well are one object under two classes.

@@ -80,6 +80,17 @@ class PosedDetections:
             depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
             embeddings=None if self.embeddings is None else self.embeddings[boxes])
 
+    def select_boxes(self, boxes: NDArray[np.bool_]) -> 'PosedDetections':
+        """Return all frames with some of their boxes: those of a mask (n,)."""
+        counts = np.bincount(self.frames[boxes], minlength=len(self))
+        return replace(
+            self, frame_offsets=np.cumsum(np.concatenate([[0], counts])),
+            bboxes_xyxy=self.bboxes_xyxy[boxes], classes=self.classes[boxes],
+            scores=self.scores[boxes],
+            depths=None if self.depths is None else self.depths[boxes],
+            depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
+            embeddings=None if self.embeddings is None else self.embeddings[boxes])
+
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)

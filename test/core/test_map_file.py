@@ -10,6 +10,11 @@ import yaml
 from scene import make_room
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    load_embeddings_of_map,
+)
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.map_file import write_map
 from cliploc_ros.errors import MapError
@@ -40,6 +45,15 @@ def test_a_written_map_is_read_back(tmp_path):
     assert loaded.quats_xyzw == pytest.approx(room.quats_xyzw, abs=2e-5)
 
 
+def test_tiny_weights_stay_above_zero(tmp_path):
+    tiny = LandmarkDetails(labels=(('a cup', 1.0), ('a mug', 1e-9)),
+                           class_weights=(('cup', 1.0), ('bowl', 1e-9)))
+    write_map(tmp_path / 'map.yaml', replace(make_room(), details=(tiny,) * 12))
+    loaded = LandmarkMap.from_file(tmp_path / 'map.yaml').details[0]
+    assert 0.0 < loaded.labels[1][1] < 1e-3
+    assert 0.0 < loaded.class_weights[1][1] < 1e-3
+
+
 def test_a_map_without_details_has_none(tmp_path):
     write_map(tmp_path / 'map.yaml', make_room())
     assert LandmarkMap.from_file(tmp_path / 'map.yaml').details == ()
@@ -63,6 +77,19 @@ def test_the_old_map_stays_when_the_new_one_cannot_be_written(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ['map.yaml']
     with pytest.raises(MapError, match='cannot be written'):
         write_map(tmp_path / 'missing' / 'map.yaml', make_room())
+
+
+def test_image_embeddings_belong_to_one_map(tmp_path):
+    path, room = tmp_path / 'map.yaml', make_room()
+    rows = np.eye(12, 16, dtype=np.float16)
+    seen = LandmarkEmbeddings('key', room.landmark_ids, rows, rows, np.arange(13))
+    write_map(path, room, embeddings=seen)
+    assert load_embeddings_of_map(path, room.landmark_ids).is_known.all()
+    write_map(path, room)
+    assert load_embeddings_of_map(path, room.landmark_ids) is None
+    embeddings_path(path).mkdir()
+    with pytest.raises(MapError, match=r'map\.embeddings\.npz: .*cannot be removed'):
+        write_map(path, room)
 
 
 def test_labels_may_stand_in_place_of_a_label():

@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which object of the recording is which landmark of the old map.
+
+Every landmark gets at most one object of its class, and every object at most one landmark, so that
+the sum of gains is the greatest possible (Hungarian method). A gain is a log-likelihood ratio of
+look and size, plus a bonus for an object that is where the landmark was. A landmark or an object
+stays alone if it gains nothing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from cliploc_ros.mapping.updating.known import Known
+from cliploc_ros.mapping.updating.looks import Looks
+from cliploc_ros.mapping.updating.objects import Objects
+
+# Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
+# that are exchanged do; and looks decide whether a new object is a missing one.
+_IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 6.0, 4.0, 2.0
+_MAX_LOOK_GAIN = 5.0
+# Of equal objects the nearer one is chosen.
+_GAIN_PER_M = 0.02
+# A second choice that gains hardly less makes the first one ambiguous.
+_AMBIGUOUS_GAIN = 1.0
+# Of the logarithm of an object's size, and the largest difference. Guesses.
+_SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
+# Objects in their place from which the usual similarity of two looks is learned.
+_FEWEST_LOOKS = 8
+# A landmark in its place is doubted if its look fits worse than usual by so many deviations.
+_DOUBT = 1.0
+
+
+class Identities(NamedTuple):
+    """Who is who.
+
+    Parameters
+    ----------
+    objects : ndarray (L,) of int
+        The object that each old landmark is, -1 for none.
+    rivals : dict of int to tuple of int
+        Old landmarks that an object could be as well, for the objects of which this is so.
+    """
+
+    objects: NDArray[np.int64]
+    rivals: dict[int, tuple[int, ...]]
+
+
+class _LookModel(NamedTuple):
+    """How similar the looks of one object are, and those of two objects of one class."""
+
+    own: float
+    other: float
+    sigma: float
+
+    def gains(self, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
+        middle = 0.5 * (self.own + self.other)
+        gains = (self.own - self.other) * (cosines - middle) / self.sigma ** 2
+        return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
+
+    def is_doubtful(self, cosines: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.asarray(cosines < self.own - _DOUBT * self.sigma)
+
+
+def identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
+             ) -> Identities:
+    """Return which object each old landmark is.
+
+    Parameters
+    ----------
+    known : Known
+    objects : Objects
+    is_gone : ndarray (L,) of bool
+        Landmarks that may be any new object; others only the one in their place or near it.
+    looks : Looks, optional
+    """
+    held = np.nonzero(objects.owners >= 0)[0]
+    result = np.full(len(is_gone), -1, dtype=np.int64)
+    result[objects.owners[held]] = held
+    groups = _class_groups(known, objects)
+    model = _learn_looks(known, objects, looks, groups)
+    doubtful = np.zeros(len(held), dtype=np.bool_)
+    if looks is not None and model is not None:
+        own = np.einsum('ld,ld->l', looks.landmarks[objects.owners[held]], looks.objects[held])
+        is_known = (looks.landmarks[objects.owners[held]].any(axis=1)
+                    & looks.objects[held].any(axis=1))
+        doubtful = is_known & model.is_doubtful(own.astype(np.float64))
+    near = {row for rows in objects.near for row in rows}
+    searched = is_gone.copy()
+    searched[list(near)] = True
+    searched[objects.owners[held]] = doubtful
+    offered = objects.owners < 0
+    offered[held] = doubtful
+    rivals: dict[int, tuple[int, ...]] = {}
+    for group in np.unique(groups[objects.landmarks.classes[offered]]):
+        rows = np.nonzero(searched & (known.landmarks.classes >= 0)
+                          & (groups[known.landmarks.classes] == group))[0]
+        columns = np.nonzero(offered & (groups[objects.landmarks.classes] == group))[0]
+        if len(rows) and len(columns):
+            gains = _gains(known, objects, is_gone, rows, columns)
+            if looks is not None and model is not None:
+                gains += model.gains(looks.similarities(rows, columns))
+            result[rows], close = _assign(gains, rows, columns)
+            rivals |= close
+    return Identities(result, rivals)
+
+
+def _class_groups(known: Known, objects: Objects) -> NDArray[np.int64]:
+    """Return a group for each class: the classes of one landmark belong together."""
+    count = 1 + max(int(known.named.classes.max(initial=0)),
+                    int(objects.landmarks.classes.max(initial=0)),
+                    int(known.landmarks.classes.max(initial=0)))
+    main = known.landmarks.classes[known.owners]
+    links = coo_matrix((np.ones(len(main)), (main, known.named.classes)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def _learn_looks(known: Known, objects: Objects, looks: Looks | None, groups: NDArray[np.int64]
+                 ) -> _LookModel | None:
+    """Return how looks compare, learned from the landmarks in their place; None if too few."""
+    if looks is None:
+        return None
+    held = np.nonzero(objects.owners >= 0)[0]
+    own, other = [np.empty(0)], [np.empty(0)]
+    classes = groups[objects.landmarks.classes[held]]
+    for group in np.unique(classes):
+        columns = held[classes == group]
+        cosines = looks.similarities(objects.owners[columns], columns)
+        is_own = np.eye(len(columns), dtype=np.bool_)
+        own.append(cosines[is_own])
+        other.append(cosines[~is_own])
+    same, different = (values[np.isfinite(values)] for values in map(np.concatenate, (own, other)))
+    if len(same) < _FEWEST_LOOKS or len(different) < _FEWEST_LOOKS:
+        return None
+    middle, elsewhere = float(np.median(same)), float(np.median(different))
+    if middle <= elsewhere:
+        return None  # looks tell nothing here
+    spreads = [1.4826 * float(np.median(np.abs(values - center)))
+               for values, center in ((same, middle), (different, elsewhere))]
+    return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
+
+
+def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDArray[np.int64],
+           columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the gains (k, j) by place, class and size; -inf where a pair is impossible."""
+    sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
+             for one in (known.landmarks.select(rows), objects.landmarks.select(columns))]
+    change = np.abs(sizes[0][:, None] - sizes[1][None])
+    ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
+                            - objects.landmarks.centers[columns][None], axis=2)
+    gains = _ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA) - _GAIN_PER_M * ways_m
+    named = set(zip(known.owners.tolist(), known.named.classes.tolist(), strict=True))
+    for place, row in enumerate(rows):
+        for column, number in enumerate(columns):
+            if objects.owners[number] == row:
+                gains[place, column] = _IN_PLACE_GAIN
+            elif int(row) in objects.near[number]:
+                gains[place, column] += _NEAR_GAIN - _ELSEWHERE_GAIN
+            elif (change[place, column] > _MAX_SIZE_CHANGE
+                  or not (is_gone[row] or row in objects.owners)
+                  or (int(row), int(objects.landmarks.classes[number])) not in named):
+                gains[place, column] = -np.inf
+    return gains
+
+
+def _assign(gains: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+            ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
+    """Return the object of each row, -1 for none, and the rivals of the rows."""
+    useful = np.maximum(np.nan_to_num(gains, neginf=0.0), 0.0)
+    chosen = np.full(len(rows), -1, dtype=np.int64)
+    rivals = {}
+    for place, column in zip(*linear_sum_assignment(useful, maximize=True), strict=True):
+        if useful[place, column] <= 0.0:
+            continue
+        chosen[place] = columns[column]
+        close = gains[:, column] > gains[place, column] - _AMBIGUOUS_GAIN
+        close[place] = False
+        if close.any():
+            rivals[int(columns[column])] = tuple(int(row) for row in rows[close])
+    return chosen, rivals

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording says of each place of a map: its object is there, it is gone, or neither."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.mapping.evidence import best_ious, gather_evidence
+from cliploc_ros.mapping.landmarks import join_landmarks
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.updating.alignment import has_moved
+from cliploc_ros.mapping.updating.finding import Finds, close_pairs, find_new, without_copies
+from cliploc_ros.mapping.updating.known import Known, Refits, find_known, refit
+from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.mapping.updating.presence import probability_there, usual_ratios
+from cliploc_ros.mapping.updating.sight import Sight, look_for
+from cliploc_ros.mapping.views import Views
+
+# New objects hide old places, and objects that are gone no longer do.
+_ROUNDS = 2
+# Overlaps with which a box is near a landmark, and on it whatever its class. Guesses.
+_NEAR_IOU, _SAME_IOU = 0.02, 0.5
+
+
+class Judged(NamedTuple):
+    """What the recording says: L old landmarks, m finds, n boxes.
+
+    Parameters
+    ----------
+    shown : ndarray (n,) of int
+        The old landmark that each box shows in its place, L + the find, or -1 for none.
+    refits : Refits
+        The old landmarks where the recording puts them.
+    finds : Finds
+    sight : Sight
+        Of the old places, then of the finds.
+    is_gone : ndarray (L,) of bool
+    is_there : ndarray (L,) of bool
+        Neither: the recording does not tell.
+    """
+
+    shown: NDArray[np.int64]
+    refits: Refits
+    finds: Finds
+    sight: Sight
+    is_gone: NDArray[np.bool_]
+    is_there: NDArray[np.bool_]
+
+
+def judge(detections: PosedDetections, views: Views, known: Known, options: UpdateOptions
+          ) -> Judged:
+    """Return what the recording says of each place of the map, and what else it shows.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+    views : Views
+        With poses in the coordinate frame of the map.
+    known : Known
+    options : UpdateOptions
+    """
+    mapping, count = options.mapping, len(known.landmarks.centers)
+    shown = find_known(views, known, mapping.association_iou)
+    refits = refit(views, known.landmarks, shown, mapping.min_viewpoints)
+    displaced = has_moved(known, refits, options)
+    sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_), options)
+    is_gone = displaced | _is_absent(known, sight, options)
+    finds = find_new(detections, views, _free(views, known, refits, shown, is_gone), mapping)
+    finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
+    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), options)
+    _, sight = _look(views, known, finds, shown, is_gone, options)
+    usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    often = sight.seen_ratio[count:] >= options.min_new_share * (np.median(usual) if len(usual)
+                                                                 else 1.0)
+    finds = finds.select(np.nonzero(often)[0])
+    both = shown
+    for _ in range(_ROUNDS):
+        both, sight = _look(views, known, finds, shown, is_gone, options)
+        is_gone = displaced | _is_absent(known, sight.select(slice(count)), options)
+    own_sight = sight.select(slice(count))
+    there = probability_there(own_sight, usual_ratios(known, own_sight, options), options)
+    fits = gather_evidence(views, refits.landmarks, _held(shown, is_gone)).median_iou
+    is_there = (~is_gone & (fits >= mapping.min_median_iou)
+                & (refits.is_known | (there > options.there_above)))
+    return Judged(both, refits, finds, sight, is_gone, is_there)
+
+
+def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
+          is_gone: NDArray[np.bool_], options: UpdateOptions) -> tuple[NDArray[np.int64], Sight]:
+    """Return the landmark or find that each box shows, and the sight of all their places."""
+    own = _held(shown, is_gone)
+    both = np.where((own < 0) & (finds.shown >= 0), len(is_gone) + finds.shown, own)
+    is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
+    return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid,
+                          options)
+
+
+def _free(views: Views, known: Known, refits: Refits, shown: NDArray[np.int64],
+          is_gone: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which boxes (n,) may show new objects.
+
+    A box near a landmark that has no better one is no proof of a new object; nor is a box on a
+    landmark in its place, which may be another name for it.
+    """
+    own = _held(shown, is_gone)
+    near = _held(find_known(views, known, _NEAR_IOU), is_gone)
+    in_place = refits.landmarks.select(np.unique(own[own >= 0]))
+    nameless = best_ious(views._replace(classes=np.zeros_like(views.classes)),
+                         in_place._replace(classes=np.zeros_like(in_place.classes)))
+    return np.asarray((own < 0) & (near < 0) & (nameless < _SAME_IOU))
+
+
+def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the landmark (n,) that each box shows, without those that are gone."""
+    return np.where((shown >= 0) & ~is_gone[shown], shown, -1)
+
+
+def _is_absent(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np.bool_]:
+    """Tell which objects (L,) are not in their place.
+
+    A detector that never found a class in this recording may not know it, or not at these sizes.
+    """
+    is_told = (known.landmarks.classes >= 0) & (sight.expected >= options.least_views)
+    there = probability_there(sight, usual_ratios(known, sight, options), options)
+    return np.asarray(is_told & (there < options.gone_below))
+
+
+def _with_displaced(finds: Finds, refits: Refits, shown: NDArray[np.int64],
+                    displaced: NDArray[np.bool_], merge_distance: float) -> Finds:
+    """Return the finds with the landmarks that stand a little off their place, if not found."""
+    rows = np.nonzero(displaced)[0]
+    moved = refits.landmarks.select(rows)
+    found_again = {new for new, _, _ in close_pairs(moved, finds.landmarks, merge_distance)}
+    rows = rows[[new not in found_again for new in range(len(rows))]]
+    numbers = np.full(len(displaced) + 1, -1, dtype=np.int64)
+    numbers[rows] = len(finds.details) + np.arange(len(rows))
+    return Finds(join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
+                 finds.details + (LandmarkDetails(),) * len(rows),
+                 np.where(finds.shown >= 0, finds.shown, numbers[shown]), finds.left_out)

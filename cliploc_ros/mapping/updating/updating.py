@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The entry point of an update: a map and a new recording of its place in, a new map out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+from cliploc_ros.mapping.input_checks import check_input
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.updating.alignment import Alignment, align
+from cliploc_ros.mapping.updating.describing import describe
+from cliploc_ros.mapping.updating.fates import decide_fates
+from cliploc_ros.mapping.updating.identity import identify
+from cliploc_ros.mapping.updating.judging import Judged, judge
+from cliploc_ros.mapping.updating.known import Known, known_landmarks
+from cliploc_ros.mapping.updating.looks import (
+    compare_looks,
+    renew_embeddings,
+    why_not_comparable,
+)
+from cliploc_ros.mapping.updating.objects import gather_objects
+from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.mapping.updating.renewal import renew
+from cliploc_ros.mapping.updating.report import UpdateReport
+from cliploc_ros.mapping.views import make_views, map_from_cameras
+
+
+@dataclass(frozen=True)
+class UpdatedMap:
+    """The result of an update: F frames, n boxes.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        Old landmarks in their order, then new ones.
+    report : UpdateReport
+    shown : ndarray (n,) of int
+        Row of the landmark that each box shows, -1 for none.
+    first_new : int
+        Row of the first new landmark.
+    map_from_camera : ndarray (F, 4, 4)
+        The poses in the coordinate frame of the map.
+    embeddings : LandmarkEmbeddings, optional
+        Image embeddings of the new map.
+    """
+
+    landmark_map: LandmarkMap
+    report: UpdateReport
+    shown: NDArray[np.int64]
+    first_new: int
+    map_from_camera: NDArray[np.float64]
+    embeddings: LandmarkEmbeddings | None
+
+
+def update_map(old: LandmarkMap, detections: PosedDetections,
+               options: UpdateOptions | None = None,
+               embeddings: LandmarkEmbeddings | None = None) -> UpdatedMap:
+    """Update a map with a new recording of its place.
+
+    Parameters
+    ----------
+    old : LandmarkMap
+    detections : PosedDetections
+        Of the new recording, with poses in the coordinate frame of the map or nearly so.
+    options : UpdateOptions, optional
+    embeddings : LandmarkEmbeddings, optional
+        How the old landmarks look. Ignored if another encoder looked at the recording.
+
+    Raises
+    ------
+    MappingError
+        The recording does not belong to this map, or no map can be made of it; the message says
+        what to correct.
+    """
+    options = options or UpdateOptions()
+    given = make_views(detections, options.mapping)
+    notes = check_input(detections, given, options.mapping)
+    known = known_landmarks(old, detections.class_names, options)
+    aligned = align(given, known, options)
+    judged = judge(detections, aligned.views, known, options)
+    _check_belongs(judged, options)
+    objects = gather_objects(aligned.views, known, judged, options)
+    unlike = why_not_comparable(embeddings, detections)
+    looks = None if embeddings is None or unlike else compare_looks(
+        embeddings, old.landmark_ids, detections, objects.shown, len(objects.owners))
+    fates = decide_fates(known, judged, objects,
+                         identify(known, objects, judged.is_gone, looks), options)
+    updated = renew(old, known, objects, fates, detections.class_names, options)
+    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
+    if unlike:
+        notes.append(f'looks are not compared: {unlike}')
+    notes += _notes(old, known, aligned, detections, options)
+    report = UpdateReport(
+        frames=len(detections), viewpoints=int(given.viewpoints[-1]) + 1,
+        offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
+        pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
+        **describe(old, updated, objects, fates, judged), left_out=judged.finds.left_out,
+        notes=tuple(notes))
+    rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
+    has_object = fates.objects[kept] >= 0
+    rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
+    rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
+    shown = rows_of[objects.shown]
+    return UpdatedMap(updated, report, shown, len(kept), map_from_cameras(aligned.views),
+                      renew_embeddings(embeddings, updated.landmark_ids, detections, shown))
+
+
+def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
+    """Refuse a recording that shows hardly any of the landmarks in their places.
+
+    Raises
+    ------
+    MappingError
+        Names the numbers.
+    """
+    count, there = len(judged.is_there), int(judged.is_there.sum())
+    in_view = int((judged.is_there | (judged.sight.expected[:count] >= options.least_views)).sum())
+    if there >= min(options.min_confirmed, count) and \
+            there >= options.min_confirmed_share * in_view:
+        return
+    raise MappingError(
+        f'the recording does not belong to this map: of {in_view} landmarks in view, {there} are '
+        'where the map says; check the map, the coordinate frame of the poses and the detector, '
+        'give --pose-noise if the poses have errors, or build a new map')
+
+
+def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections,
+           options: UpdateOptions) -> list[str]:
+    """Return what the user should know of the input."""
+    notes = []
+    if aligned.offset_m > options.least_offset_m or aligned.offset_deg > options.least_offset_deg:
+        notes.append(f'the poses are {aligned.offset_m * 100:.1f} cm and {aligned.offset_deg:.1f} '
+                     'degrees off the map as a whole; this is corrected')
+    unseen = sorted({old.class_ids[row] for row in np.nonzero(known.landmarks.classes < 0)[0]})
+    if unseen:
+        notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; '
+                     'landmarks of it are kept: the detector may not know it')
+    last_seen = max((one.last_seen or 0.0 for one in known.details), default=0.0)
+    if last_seen > float(detections.stamps_s[-1]):
+        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
+                     f'last seen at {last_seen:.0f} s: an older recording, or another clock')
+    return notes

@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""build_map labels a map with the demo's CLIP, and stores what it saw next to the map."""
+
+import contextlib
+import io
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.build_map import main
+from cliploc_ros.core.landmark_embeddings import embeddings_path, load_embeddings_of_map
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations, save_observations
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',
+        '--device', 'cpu')
+# a short walk sees objects from one side
+SHORT = ('--min-baseline', '0.5')
+IMAGES = 12
+COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
+
+
+def build(*args):
+    return main([str(arg) for arg in (*args, *SHORT)])
+
+
+@pytest.fixture(scope='module', autouse=True)
+def own_cache(tmp_path_factory):
+    """Phrases are encoded once in this module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('XDG_CACHE_HOME', str(tmp_path_factory.mktemp('cache')))
+        yield
+
+
+@pytest.fixture(scope='module')
+def walk(tmp_path_factory):
+    """The first images of the demo's walk."""
+    folder = tmp_path_factory.mktemp('walk') / 'tum'
+    shutil.copytree(ASSETS / 'sequence', folder)
+    rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#']
+    (folder / 'rgb.txt').write_text('\n'.join(rows[:IMAGES]) + '\n')
+    return folder
+
+
+@pytest.fixture(scope='module')
+def observations(walk):
+    """What the networks said of the walk, and a map labelled with the shipped vocabulary."""
+    file = walk.parent / 'walk.npz'
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = build('--tum', walk, '--model', ASSETS / 'yolo.pt', *CLIP, '--keyframes', 0, 0,
+                     '--record-to', file, '--out', walk.parent / 'shipped.yaml')
+    assert code == 0
+    return file
+
+
+def true_labels(built):
+    """Return the true label of each landmark that lies at the place of one, else ''."""
+    true = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    distances = np.linalg.norm(built.centers[:, None] - true.centers, axis=2)
+    return [true.labels[row] if distance < 0.15 else ''
+            for row, distance in zip(distances.argmin(axis=1), distances.min(axis=1),
+                                     strict=True)]
+
+
+def first_colour(label):
+    return next((word for word in label.split() if word in COLOURS), None)
+
+
+def test_labels_from_the_shipped_vocabulary(observations):
+    path = observations.with_name('shipped.yaml')
+    built = LandmarkMap.from_file(path)
+    assert len(built) >= 8
+    pairs = [(first_colour(label), first_colour(true))
+             for label, true in zip(built.labels, true_labels(built), strict=True) if true]
+    assert len(pairs) >= 6
+    assert np.mean([found == meant for found, meant in pairs]) >= 0.6
+    for label, details in zip(built.labels, built.details, strict=True):
+        assert details.labels[0][0] == label
+        assert len(details.labels) == 6
+    embeddings = load_embeddings_of_map(path, built.landmark_ids)
+    assert embeddings.encoder_key == load_observations(observations).encoder_key
+    assert embeddings.is_known.all()
+    assert embeddings.means.shape == (len(built), 128)
+
+
+def test_phrases_of_a_user(observations, tmp_path, capsys):
+    """A pattern that the shipped vocabulary lacks."""
+    words = tmp_path / 'words.yaml'
+    classes = {one.split('_')[0] for one in LandmarkMap.from_file(
+        observations.with_name('shipped.yaml')).class_ids}
+    words.write_text(''.join(
+        f"{name}:\n  phrases: ['a {{colour}} {name} {{pattern}}', 'a {{colour}} {name}']\n"
+        f"  colour: [{', '.join(COLOURS)}]\n  pattern: ['with {{second}} bands']\n"
+        for name in sorted(classes)))
+    assert build('--observations', observations, *CLIP, '--vocabulary', words,
+                 '--out', tmp_path / 'm.yaml') == 0
+    built = LandmarkMap.from_file(tmp_path / 'm.yaml')
+    assert 'note:' not in capsys.readouterr().out
+    assert any('bands' in text for details in built.details for text, _ in details.labels)
+
+
+def test_without_the_encoder_labels_are_class_names(observations, tmp_path, capsys):
+    """The default model is another one: no download, a map, the images, and a reason."""
+    path = tmp_path / 'm.yaml'
+    assert build('--observations', observations, '--out', path) == 0
+    assert ("note: labels are class names: the embeddings are of CLIP model 'clip', not "
+            "'ViT-L-14'; give the --clip-model") in capsys.readouterr().out
+    built = LandmarkMap.from_file(path)
+    assert built.labels == built.class_ids
+    assert load_embeddings_of_map(path, built.landmark_ids).is_known.all()
+
+
+def test_a_vocabulary_that_cannot_be_used_is_an_error(observations, tmp_path, capsys):
+    words, old = tmp_path / 'words.yaml', tmp_path / 'old.yaml'
+    words.write_text('mug: [my mug]')
+    old.write_text('precious')
+    assert build('--observations', observations, '--out', old, '--vocabulary', words) == 1
+    assert "not 'ViT-L-14'" in capsys.readouterr().err
+    words.write_text('mug: 3')
+    assert build('--observations', observations, *CLIP, '--out', old, '--vocabulary', words) == 1
+    assert "class 'mug': expected a list" in capsys.readouterr().err
+    assert old.read_text() == 'precious'
+
+
+def test_other_weights_of_the_same_name_do_not_label(observations, tmp_path, capsys):
+    other = tmp_path / 'other.npz'
+    seen = load_observations(observations)
+    save_observations(other, replace(seen, encoder_key=seen.encoder_key + '0'))
+    assert build('--observations', other, *CLIP, '--out', tmp_path / 'm.yaml') == 0
+    assert 'note: labels are class names: the embeddings are of the weights clip:' in (
+        capsys.readouterr().out)
+    narrow = tmp_path / 'narrow.npz'
+    save_observations(narrow, replace(seen, embeddings=seen.embeddings[:, :64]))
+    assert build('--observations', narrow, *CLIP, '--out', tmp_path / 'm.yaml') == 0
+    assert 'the embeddings have 64 numbers, but' in capsys.readouterr().out
+
+
+def test_images_of_a_replaced_map_are_removed(observations, tmp_path, capsys):
+    path = tmp_path / 'm.yaml'
+    assert build('--observations', observations, *CLIP, '--out', path) == 0
+    assert embeddings_path(path).exists()
+    bare = tmp_path / 'bare.npz'
+    save_observations(bare, replace(load_observations(observations), embeddings=None))
+    assert build('--observations', bare, '--out', path) == 0
+    assert not embeddings_path(path).exists()
+    assert 'the observations have no CLIP embeddings' in capsys.readouterr().out
+    built = LandmarkMap.from_file(path)
+    assert built.labels == built.class_ids
+    assert all(details.labels is None for details in built.details)

@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Labels and image embeddings of a built map, on simulated embeddings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from walk import make_table, see, walk_around
+
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.labelling import Phrases, embed_landmarks, label_landmarks
+from cliploc_ros.mapping.posed_detections import PosedDetections
+
+SIZE = 32
+
+
+def unit(rows):
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def make_phrases(name, count, rng):
+    return Phrases(tuple(f'{name} {number}' for number in range(count)),
+                   unit(rng.normal(size=(count, SIZE))))
+
+
+def with_crops(detections: PosedDetections, crops) -> PosedDetections:
+    return replace(detections, embeddings=np.asarray(crops, dtype=np.float16),
+                   encoder_key='simulated')
+
+
+@pytest.fixture
+def static():
+    """Ten frames at one place, then a frame at each of two others; one box in each."""
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[10, 0, 3], poses[11, 0, 3] = 1.0, 2.0
+    seen = see(make_table(1), walk_around(12, 90.0))
+    assert len(seen.classes) == 12
+    return replace(seen, map_from_camera=poses)
+
+
+def test_crops_of_a_built_map_name_their_phrase():
+    """Each object's crops are its true phrase, another one's, and noise."""
+    rng = np.random.default_rng(1)
+    table = make_table()
+    seen = see(table, walk_around(40))
+    phrases = {name: make_phrases(name, 300, rng) for name in set(table.class_ids)}
+    built = build_map(seen)
+    true_rows = np.argmin(np.linalg.norm(
+        built.landmark_map.centers[:, None] - table.centers, axis=2), axis=1)
+    meant = np.array([phrases[name].embeddings[7 * row]
+                      for row, name in enumerate(table.class_ids)])
+    crops = unit(rng.normal(size=(len(seen.classes), SIZE)))
+    known = built.shown >= 0
+    crops[known] = unit(0.4 * meant[true_rows[built.shown[known]]] + crops[known])
+    seen = with_crops(seen, crops)
+    ids = built.landmark_map.landmark_ids
+    embeddings = embed_landmarks(ids, seen, built.shown)
+    labelled = label_landmarks(built.landmark_map, embeddings, phrases)
+    assert len(labelled) == len(table)
+    for row, true_row in enumerate(true_rows):
+        assert labelled.labels[row] == f'{table.class_ids[true_row]} {7 * true_row}'
+        texts, weights = zip(*labelled.details[row].labels, strict=True)
+        assert texts[0] == labelled.labels[row]
+        assert len(set(texts)) == 6
+        assert list(weights) == sorted(weights, reverse=True)
+        assert sum(weights) == pytest.approx(1.0, abs=1e-3)
+        assert labelled.details[row].support == built.landmark_map.details[row].support
+    np.testing.assert_array_equal(labelled.centers, built.landmark_map.centers)
+
+
+def test_weights_are_those_of_clip():
+    axes = np.eye(SIZE, dtype=np.float32)
+    crop = unit(axes[0] + 0.99 * axes[1] + 0.9 * axes[2])
+    embeddings = replace(
+        embed_landmarks(['a'], with_crops(see(make_table(1), walk_around(1)), crop[None]),
+                        np.array([0])), landmark_ids=('thing_0',))
+    phrases = {'book': Phrases(('zero', 'one', 'two'), axes[:3])}
+    (first, second, third) = label_landmarks(make_table(1), embeddings, phrases).details[0].labels
+    assert (first[0], second[0], third[0]) == ('zero', 'one', 'two')
+    assert first[1] / second[1] == pytest.approx(np.exp(100 * (crop[0] - crop[1])), rel=0.1)
+    assert third[1] > 0.0
+
+
+def test_frames_of_one_viewpoint_share_the_weight_of_one(static):
+    axes = np.eye(SIZE)
+    crops = axes[[0] * 10 + [1, 2]]
+    mean = embed_landmarks(['it'], with_crops(static, crops), np.zeros(12, dtype=int)).means[0]
+    np.testing.assert_allclose(mean[:3], np.full(3, 3 ** -0.5), atol=1e-3)
+    assert not mean[3:].any()
+
+
+def test_medoids_stand_for_all_crops(static):
+    """Three sights of an object, one of them once: three crops, each one of the crops."""
+    axes = np.eye(SIZE)
+    crops = unit(axes[[0] * 6 + [1] * 4 + [2, 1]] + 1e-3)
+    embeddings = embed_landmarks(['no', 'it'], with_crops(static, crops), np.ones(12, dtype=int))
+    assert embeddings.medoid_offsets.tolist() == [0, 0, 3]
+    assert sorted(np.argmax(embeddings.medoids, axis=1)) == [0, 1, 2]
+    assert embeddings.is_known.tolist() == [False, True]
+
+
+def test_five_medoids_at_most_and_one_of_equal_crops(static):
+    several = embed_landmarks(['it'], with_crops(static, np.eye(SIZE)[:12]),
+                              np.zeros(12, dtype=int))
+    assert several.medoid_offsets.tolist() == [0, 5]
+    equal = embed_landmarks(['it'], with_crops(static, np.eye(SIZE)[[3] * 12]),
+                            np.zeros(12, dtype=int))
+    assert equal.medoid_offsets.tolist() == [0, 1]
+    assert np.argmax(equal.means[0]) == np.argmax(equal.medoids[0]) == 3
+
+
+def test_crops_that_say_nothing_leave_the_class_name(static):
+    """Zero rows, crops that cancel out, and a landmark that no box shows."""
+    table = make_table(3)
+    axes = np.eye(SIZE)
+    crops = np.zeros((12, SIZE))
+    crops[10], crops[11] = axes[0], -axes[0]
+    shown = np.array([0] * 9 + [-1] + [1, 1])
+    embeddings = embed_landmarks(table.landmark_ids, with_crops(static, crops), shown)
+    assert not embeddings.is_known.any()
+    assert embeddings.medoid_offsets.tolist() == [0, 0, 0, 0]
+    assert label_landmarks(table, embeddings, {}).labels == table.labels
+
+
+def test_a_landmark_of_two_classes_takes_phrases_of_both():
+    axes = np.eye(SIZE, dtype=np.float32)
+    table = make_table(1)
+    embeddings = replace(
+        embed_landmarks(['thing_0'], with_crops(see(table, walk_around(1)), axes[[1]]),
+                        np.array([0])))
+    phrases = {'book': Phrases(('a book', 'a thing'), axes[[0, 2]]),
+               'cup': Phrases(('a cup', 'a thing'), axes[[1, 2]])}
+    assert label_landmarks(table, embeddings, phrases).labels == ('a book',)
+    both = replace(table, details=(LandmarkDetails(class_weights=(('book', 0.7), ('cup', 0.3))),))
+    labelled = label_landmarks(both, embeddings, phrases)
+    assert labelled.labels == ('a cup',)
+    assert [text for text, _ in labelled.details[0].labels] == ['a cup', 'a book', 'a thing']
+    assert labelled.details[0].class_weights == both.details[0].class_weights
+
+
+def test_many_crops_of_one_landmark_take_bounded_memory(static):
+    """40,000 crops would have 12 GB of cosines; those used are spread over all."""
+    count = 40_000
+    frames = 12
+    offsets = np.linspace(0, count, frames + 1).astype(np.int64)
+    many = replace(static, frame_offsets=offsets, classes=np.zeros(count, dtype=np.int64),
+                   bboxes_xyxy=np.tile([0.0, 0, 9, 9], (count, 1)), scores=np.ones(count))
+    crops = np.zeros((count, SIZE), dtype=np.float16)
+    crops[:count // 2, 0] = crops[count // 2:, 1] = 1.0
+    embeddings = embed_landmarks(['it'], with_crops(many, crops), np.zeros(count, dtype=int))
+    assert embeddings.medoid_offsets.tolist() == [0, 2]
+    assert embeddings.means[0, 1] > embeddings.means[0, 0] > 0.1  # the last frames weigh more

@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Phrases: what the grammar makes, what is shipped for COCO, and what a user's file adds."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.vocabulary.grammar import MOST_PHRASES, expand_phrases
+from cliploc_ros.vocabulary.print_phrases import main
+from cliploc_ros.vocabulary.vocabulary import load_vocabulary, shipped_classes
+
+
+def test_a_small_grammar_written_out():
+    assert expand_phrases({
+        'phrases': ['a {kind}', 'a {colour} {name} {pattern}'],
+        'kind': ['mug', 'tea cup'], 'colour': ['red', 'orange'],
+        'pattern': ['with {second} dots', 'with a {second} label'],
+    }) == ('a mug', 'a tea cup',
+           'a red mug with orange dots', 'a red mug with an orange label',
+           'an orange mug with red dots', 'an orange mug with a red label')
+
+
+def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
+    assert expand_phrases({'phrases': ['{size} or {size}', 'big or big'],
+                           'size': ['big', 'tiny']}) == ('big or big', 'tiny or tiny')
+
+
+def test_articles():
+    phrases = expand_phrases({'phrases': ['a {kind} and a {kind}', 'A {kind}, data {kind}'],
+                              'kind': ['apple', 'umbrella', 'unicorn', 'used car', 'mug']})
+    assert phrases[:5] == (
+        'an apple and an apple', 'an umbrella and an umbrella', 'a unicorn and a unicorn',
+        'a used car and a used car', 'a mug and a mug')
+    assert phrases[5] == 'An apple, data apple'
+
+
+@pytest.mark.parametrize(('rules', 'message'), [
+    ({'phrases': ['a {brand}']}, r'\{brand\} has no words; add the rule brand'),
+    ({'phrases': ['a {phrases}']}, r'\{phrases\} has no words'),
+    ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'does not end'),
+    ({'phrases': ['{a}'], 'a': ['x {a}']}, 'does not end'),
+    ({'phrases': ['{second}'], 'colour': ['red']}, None),
+    ({'phrases': ['{colour} {second}'], 'colour': ['red']}, 'needs two colours'),
+    ({'phrases': ['x' * 201]}, 'more than 200 characters'),
+    ({'phrases': ['{a} {b} {c} {d}'], **{name: [f'{name}{i}' for i in range(1000)]
+                                         for name in 'abcd'}}, 'more than 2000 phrases'),
+    ({'phrases': ['{a} {b} {c} {d}'], **{name: ['same'] * 1000 for name in 'abcd'}},
+     'more than 2000 phrases'),
+])
+def test_rules_that_cannot_be_used(rules, message):
+    if message is None:
+        assert expand_phrases(rules) == ('red',)
+        return
+    with pytest.raises(OptionsError, match=message):
+        expand_phrases(rules)
+
+
+def test_all_coco_classes_are_shipped():
+    file = Path(importlib.util.find_spec('ultralytics').origin).parent / 'cfg/datasets/coco.yaml'
+    names = yaml.safe_load(file.read_text(encoding='utf-8'))['names'].values()
+    assert len(names) == 80
+    assert set(shipped_classes()) == set(names)
+
+
+@pytest.mark.parametrize('name', [*shipped_classes(), 'unheard-of thing'])
+def test_shipped_phrases_are_english(name):
+    phrases = load_vocabulary().phrases(name)
+    assert 40 <= len(phrases) <= 1000
+    assert len(set(phrases)) == len(phrases)
+    for phrase in phrases:
+        assert re.fullmatch(r"[a-z][a-z' -]+[a-z]", phrase)
+        assert not re.search(r'\ba [aeio]|\ban [^aeiou]|  ', phrase), phrase
+        assert len(phrase.split()) <= 14  # CLIP reads 75 tokens, the demo's 22
+
+
+def test_a_phrase_of_each_part_of_the_issue():
+    """Colour, material, pattern, size and kind."""
+    phrases = load_vocabulary().phrases('cup')
+    for phrase in ('a tea cup', 'a red mug', 'a small blue cup', 'a white ceramic cup',
+                   'a red cup with white dots'):
+        assert phrase in phrases
+
+
+def test_any_class_name_is_described():
+    vocabulary = load_vocabulary()
+    assert 'a red tv monitor with blue stripes' in vocabulary.phrases('tv_monitor')
+    assert 'a red colour' in vocabulary.phrases('{colour}')
+    assert 'an object' in vocabulary.phrases('_')
+    with pytest.raises(OptionsError, match='more than 200 characters'):
+        vocabulary.phrases('x' * 500)
+
+
+def test_a_users_file_adds_phrases(tmp_path):
+    file = tmp_path / 'our.yaml'
+    file.write_text("cup:\n  - our {colour} team mug\n  - the chief's cup\n"
+                    'robot:\n  grammar: device\n  kind: [robot, cleaning robot]\n'
+                    "  brand: [Alpha]\n  phrases: ['a {colour} {brand} {kind}']\n")
+    ours = load_vocabulary(file)
+    assert ours.phrases('cup')[0] == 'our red team mug'
+    assert "the chief's cup" in ours.phrases('cup')
+    assert set(load_vocabulary().phrases('cup')) < set(ours.phrases('cup'))
+    assert 'a silver Alpha cleaning robot' in ours.phrases('robot')
+    assert ours.phrases('dog') == load_vocabulary().phrases('dog')
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('', 'holds no YAML mapping'),
+    ('{}', 'holds no classes'),
+    ('- cup', 'holds no YAML mapping'),
+    ('cup: mug', "class 'cup': expected a list of phrases or a mapping of rules, not 'mug'"),
+    ('cup:', "class 'cup': expected"),
+    ('cup: []', "class 'cup': phrases: expected a list of text"),
+    ('cup: [7]', 'phrases: 7 is no text'),
+    ('cup: [no]', 'phrases: False is no text'),
+    ("cup: ['  ']", 'is no text'),
+    ('cup: [[a]]', 'is no text'),
+    ('cup: ["a {brand} mug"]', r"class 'cup': \{brand\} has no words"),
+    ('cup: {kind: mug}', "class 'cup': kind: expected a list of text, not 'mug'"),
+    ('cup: {grammar: pottery}', "grammar: 'pottery' is none of general, crockery"),
+    ('cup: {grammar: [device]}', 'is none of general'),
+    ('cup: {second: [red]}', 'second: has a meaning of its own'),
+    ('cup: {name: [red]}', 'name: has a meaning of its own'),
+    ('cup: &x [a]\nmug: *x', 'an alias'),
+    ('cup: [a\n', 'not valid YAML'),
+    ('cup: [a]\ncup: [b]', 'is repeated'),
+    ('\x00', 'not valid YAML'),
+])
+def test_a_malformed_file_is_refused(tmp_path, text, message):
+    file = tmp_path / 'wrong.yaml'
+    file.write_text(text)
+    with pytest.raises(CliplocError, match=message) as caught:
+        load_vocabulary(file)
+    assert str(file) in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(CliplocError, match=r'none\.yaml: No such file'):
+        load_vocabulary(tmp_path / 'none.yaml')
+
+
+def test_the_command_prints_phrases(tmp_path, capsys):
+    file = tmp_path / 'our.yaml'
+    file.write_text('gadget: [our gadget]')
+    assert main(['gadget', '--vocabulary', str(file)]) == 0
+    assert capsys.readouterr().out.startswith('our gadget\na gadget\n')
+    assert main([]) == 0
+    counts = dict(reversed(line.split(maxsplit=1)) for line in
+                  capsys.readouterr().out.splitlines())
+    assert len(counts) == 80
+    assert all(0 < int(count) < MOST_PHRASES for count in counts.values())
+    assert main(['cup', '--vocabulary', str(tmp_path)]) == 1
+    assert 'error:' in capsys.readouterr().err
