@@ -78,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     print(f'{options.objects} objects, {options.frames} frames; simulated', flush=True)
     show('simulate', measure(simulate, options))
-    built = measure(build, options.out)
+    built = measure(build, options.out, MappingOptions(estimate_pose_errors=True))
     show('build_map', built)
     for stage, seconds in built.result.items():
         print(f'    {stage:22} {seconds:8.1f} s of processor time')
@@ -145,7 +145,7 @@ def _embeddings(rows: int, size: int) -> NDArray[np.float16]:
     return found
 
 
-def build(folder: Path) -> dict[str, float]:
+def build(folder: Path, options: MappingOptions) -> dict[str, float]:
     """Build the map as build_map does; return the processor time [s] of each stage."""
     begin, stage = time.process_time(), 'reading'
     stages: dict[str, float] = {}
@@ -158,7 +158,7 @@ def build(folder: Path) -> dict[str, float]:
 
     detections = load_observations(folder / 'observations.npz')
     tell('starting', 0.0)
-    built = build_map(detections, MappingOptions(estimate_pose_errors=True), tell)
+    built = build_map(detections, options, tell)
     tell('writing', 1.0)
     write_map(folder / 'map.yaml', built.landmark_map, built.report.lines()[:2])
     (folder / 'report.json').write_text(json.dumps(built.report.as_dict()))
