@@ -94,12 +94,12 @@ def make_changed_room(folder: Path, images: int, seed: int, free_places: bool = 
     write_true_map(folder / 'map_after.yaml', replace(
         after, objects=tuple(replace(o, in_map=True) for o in after.objects)))
     (folder / 'changes.json').write_text(json.dumps(changes, indent=1))
-    for name, room, light, poses in (
+    for number, (name, room, light, poses) in enumerate((
             ('before', before, _LIGHT_BEFORE, round_walk(images, 0.0, 1.45)),
-            ('after', after, _LIGHT_AFTER, round_walk(images, 0.7, 1.3))):
+            ('after', after, _LIGHT_AFTER, round_walk(images, 0.7, 1.3)))):
         with tqdm(total=images, desc=name, unit='image') as bar:
-            record(folder / name, room, Renderer(room, CAMERA, light), poses, seed=seed + 5,
-                   rate_hz=2.0, advance=bar.update)
+            record(folder / name, room, Renderer(room, CAMERA, light), poses,
+                   seed=seed + 5 + number, rate_hz=2.0, advance=bar.update)
 
 
 def main() -> None:

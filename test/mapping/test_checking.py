@@ -269,6 +269,18 @@ def test_stretches_without_landmarks_become_advice(detections):
                for text in report.advice), report.advice
 
 
+def test_too_few_views_are_named_as_the_cause(detections):
+    # two of nine objects are not in the map
+    known = {name: values[:7] for name, values in vars(TABLE).items() if name in (
+        'landmark_ids', 'labels', 'class_ids', 'centers', 'semi_axes', 'quats_xyzw')}
+    part = replace(TABLE, **known)
+    few = check_map(part, detections.select_frames(range(0, 120, 12)), options=QUICK)
+    assert few.advice[0].startswith('record more views: of 10 frames, 10 show a landmark '
+                                    '(median), and 22% of the boxes belong to none'), few.advice
+    many = check_map(part, detections, options=QUICK)
+    assert not any('more views' in text for text in many.advice)
+
+
 def test_detector_has_the_misses_and_noise_of_the_recording():
     detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
     views, witness = witness_of(TABLE, detections)

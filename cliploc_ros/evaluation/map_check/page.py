@@ -14,15 +14,16 @@ from cliploc_ros.mapping.checking.report import CheckReport, RecordingCheck, sha
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
 _STYLE = f"""\
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1100px;
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1200px;
   padding: 0 1rem }}
 img {{ max-width: 100%; border: 1px solid #ddd }}
 table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
   margin: 1rem 0 }}
 th, td {{ text-align: left; vertical-align: top; padding: .25rem .7rem;
   border-bottom: 1px solid #ddd; unicode-bidi: isolate }}
-td {{ min-width: 4.5rem; max-width: 22rem; overflow-wrap: anywhere }}
-td.number, th.number {{ text-align: right; min-width: 0; white-space: nowrap }}
+td {{ min-width: 6rem; max-width: 24rem; overflow-wrap: anywhere }}
+td.text {{ min-width: 11rem }}
+td.number, th.number {{ text-align: right; min-width: 0 }} td.number {{ white-space: nowrap }}
 li, h1, figcaption {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
 .scroll {{ overflow-x: auto }}
 .verdict {{ border-left: 6px solid; padding: .6rem 1rem; background: #f6f6f6 }}
@@ -108,7 +109,7 @@ def _verdicts(trials: Sequence[Trial]) -> str:
 
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
-            '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps')
+            '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
     rows = ''.join(_landmark_row(one) for one in landmarks[:_MOST_LANDMARKS])
     rest = len(landmarks) - _MOST_LANDMARKS
     more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
@@ -116,15 +117,15 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
             '<p class="note">frames: with the landmark, of those that should show it. seen: '
             'their share. baseline: greatest angle between two views. deviation: of the centre '
             'on its worst axis. offset: from the centre to where its boxes put it. IoU: median '
-            'of its boxes. thinness: least by greatest semi-axis. overlaps: with their '
-            'normalized distance.</p>')
+            'of its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
+            'distance of an overlap.</p>')
 
 
 def _landmark_row(one: LandmarkCheck) -> str:
     overlaps = ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)
     label = one.class_id if one.label == one.class_id else f'{one.label} ({one.class_id})'
     faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
-    texts = [_cell(one.landmark_id, grade(one)), _cell(label), _cell(faults)]
+    texts = [_cell(one.landmark_id, grade(one)), _cell(label, 'text'), _cell(faults, 'text')]
     support = '' if one.support is None else (
         str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
     numbers = [support, _number(one.seen_ratio, 100.0, 0), _number(one.baseline_deg, 1.0, 0),

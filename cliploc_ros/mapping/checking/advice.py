@@ -21,6 +21,9 @@ _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # A shorter run of refused frames is no side of a room.
 _MIN_SPAN = 2
 _FEW_LANDMARKS = 3
+# Fewer frames of a landmark leave others unmapped, if besides more than this share of the boxes
+# belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
+_FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
 # A wrong pose this near to where a double would put the camera is due to the double [m]. A guess.
 _SAME_POSE_M = 1.0
 # A camera sees a place from this far, twice the radius of what counts as one place [m].
@@ -30,9 +33,9 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 def give_advice(report: CheckReport) -> list[str]:
     """Return what to do, one sentence or two each."""
-    advice = [*_on_look_alikes(report), *_on_duplicates(report), *_on_landmarks(report),
-              *_on_corrections(report), *_on_misled(report), *_on_spans(report),
-              *_on_grid(report)]
+    advice = [*_on_look_alikes(report), *_on_duplicates(report), *_on_few_views(report),
+              *_on_landmarks(report), *_on_corrections(report), *_on_misled(report),
+              *_on_spans(report), *_on_grid(report)]
     return advice or ['nothing to do: the map reaches all thresholds that were checked']
 
 
@@ -79,12 +82,24 @@ def _on_duplicates(report: CheckReport) -> Iterator[str]:
     yield from _more(len(pairs), 'pairs of duplicates')
 
 
+def _on_few_views(report: CheckReport) -> Iterator[str]:
+    if report.recording is None:
+        return
+    frames = float(np.median([one.support or 0 for one in report.landmarks]))
+    unexplained = 1.0 - report.recording.as_given.explained
+    if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
+        yield (f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
+               f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass all '
+               f'objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+
+
 def _on_landmarks(report: CheckReport) -> Iterator[str]:
     faulty = [one for one in report.landmarks if one.severity >= SERIOUS and one.faults
               and 'same object as' not in one.faults[0]]
     for one in faulty[:_MOST_OF_A_KIND]:
         yield f'{one.landmark_id} {one.faults[0]}'
-    yield from _more(len(faulty), 'landmarks with a serious fault')
+    yield from _more(len(faulty), 'landmarks with a serious fault: record the place again, and '
+                     'update the map')
 
 
 def _on_corrections(report: CheckReport) -> Iterator[str]:

@@ -22,6 +22,7 @@ from cliploc_ros.mapping.merging import normalized_distance, seen_apart
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import LeftOut
+from cliploc_ros.mapping.updating.options import UpdateOptions
 from cliploc_ros.mapping.views import Views, map_from_cameras
 
 
@@ -81,28 +82,32 @@ def find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool
 
 
 def without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArray[np.int64],
-                   in_place: NDArray[np.bool_], options: MappingOptions) -> Finds:
+                   options: UpdateOptions) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
+
+    Of two landmarks that lie in one another, the boxes are those of one object: parts of it, or
+    another name for it. If they only touch, frames that show both tell them apart.
 
     Parameters
     ----------
     views : Views
     finds : Finds
     old : Landmarks
+        Those with boxes are in their place.
     old_shown : ndarray (n,) of int
         The old landmark that each box shows, -1 for none.
-    in_place : ndarray (L,) of bool
-        Those of which boxes show that they are in their place.
-    options : MappingOptions
+    options : UpdateOptions
     """
     rows_of_old = group_boxes(old_shown, len(old.centers))
     rows_of_new = group_boxes(finds.shown, len(finds.details))
-    pairs = close_pairs(finds.landmarks, old, options.merge_distance)
-    copies = {new for new, row, distance in pairs
-              if in_place[row] and distance < (options.merge_distance
-                             if old.classes[row] == finds.landmarks.classes[new]
-                             else options.class_merge_distance)
-              and seen_apart(views, rows_of_old[row], rows_of_new[new]) <= options.max_seen_apart}
+    copies = set()
+    for new, row, distance in close_pairs(finds.landmarks, old, options.mapping.merge_distance):
+        is_one_class = old.classes[row] == finds.landmarks.classes[new]
+        if len(rows_of_old[row]) and (
+                (is_one_class and distance < options.least_move_shapes)
+                or seen_apart(views, rows_of_old[row], rows_of_new[new])
+                <= options.mapping.max_seen_apart):
+            copies.add(new)
     return finds.select(np.array([new for new in range(len(finds.details)) if new not in copies],
                                  dtype=np.int64))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
-from cliploc_ros.mapping.evidence import gather_evidence
+from cliploc_ros.mapping.evidence import best_ious, gather_evidence
 from cliploc_ros.mapping.landmarks import join_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.updating.alignment import has_moved
@@ -21,7 +21,8 @@ from cliploc_ros.mapping.views import Views
 
 # New objects hide old places, and objects that are gone no longer do.
 _ROUNDS = 2
-_NEAR_IOU = 0.02
+# Overlaps with which a box is near a landmark, and on it whatever its class. Guesses.
+_NEAR_IOU, _SAME_IOU = 0.02, 0.5
 
 
 class Judged(NamedTuple):
@@ -67,12 +68,9 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Upda
     displaced = has_moved(known, refits, options)
     sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_), options)
     is_gone = displaced | _is_absent(known, sight, options)
-    # a box that is only near a landmark is no proof of it, and none of a new object
-    is_near = _held(find_known(views, known, _NEAR_IOU), is_gone) >= 0
-    finds = find_new(detections, views, ~is_near & (_held(shown, is_gone) < 0), mapping)
+    finds = find_new(detections, views, _free(views, known, refits, shown, is_gone), mapping)
     finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
-    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), ~is_gone,
-                           mapping)
+    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), options)
     _, sight = _look(views, known, finds, shown, is_gone, options)
     usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
     often = sight.seen_ratio[count:] >= options.min_new_share * (np.median(usual) if len(usual)
@@ -98,6 +96,21 @@ def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
     return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid,
                           options)
+
+
+def _free(views: Views, known: Known, refits: Refits, shown: NDArray[np.int64],
+          is_gone: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which boxes (n,) may show new objects.
+
+    A box near a landmark that has no better one is no proof of a new object; nor is a box on a
+    landmark in its place, which may be another name for it.
+    """
+    own = _held(shown, is_gone)
+    near = _held(find_known(views, known, _NEAR_IOU), is_gone)
+    in_place = refits.landmarks.select(np.unique(own[own >= 0]))
+    nameless = best_ious(views._replace(classes=np.zeros_like(views.classes)),
+                         in_place._replace(classes=np.zeros_like(in_place.classes)))
+    return np.asarray((own < 0) & (near < 0) & (nameless < _SAME_IOU))
 
 
 def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
