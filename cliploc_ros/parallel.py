@@ -35,7 +35,7 @@ _TASKS_A_WORKER = 2
 _MOST_DEATHS_IN_A_ROW = 3
 # A cluster that lost all its workers starts new ones in this time, or never.
 _CHECK_S, _RESTART_S = 5.0, 60.0
-_CONNECT_S = 5
+_CONNECT_S = 10
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 

@@ -8,11 +8,11 @@ Each step runs in a process of its own, so that its peak memory is its own.
 """
 
 import argparse
-import contextlib
 import json
 import multiprocessing
 import os
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -33,12 +33,15 @@ from cliploc_ros.benchmark.floors import (
     make_floor,
     see_floor,
 )
+from cliploc_ros.benchmark.pose_errors import disturb, draw_errors
 from cliploc_ros.command import run_command
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations, save_observations
 from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.labelling import embed_landmarks
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 
 # Similarities of crops and labels: of any, of the same class, of the object itself. Guesses that
 # give a top-1 of about one half.
@@ -63,6 +66,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--frames', type=int, default=36000, help='at 10 Hz (%(default)s)')
     parser.add_argument('--embeddings', type=int, default=0, metavar='N',
                         help='numbers of the embedding of each crop; 0: none (%(default)s)')
+    parser.add_argument('--pose-noise', type=float, nargs=2, default=(0.0, 0.0),
+                        metavar=('METRES', 'DEGREES'), help='errors of the poses on each axis, '
+                        'correlated over 3 s (0 0)')
     parser.add_argument('--queries', type=int, default=100, help='of evaluate (%(default)s)')
     parser.add_argument('--workers', type=int, default=2, help='of evaluate (%(default)s)')
     parser.add_argument('--check', action='store_true', help='also run check_map: minutes')
@@ -72,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     print(f'{options.objects} objects, {options.frames} frames; simulated', flush=True)
     show('simulate', measure(simulate, options))
-    built = measure(build, options.out)
+    built = measure(build, options.out, MappingOptions(estimate_pose_errors=True))
     show('build_map', built)
     for stage, seconds in built.result.items():
         print(f'    {stage:22} {seconds:8.1f} s of processor time')
@@ -112,6 +118,10 @@ def show(name: str, measured: Measured) -> None:
 def simulate(options: argparse.Namespace) -> None:
     """Write the observations of a way through a floor."""
     seen = _seen(options, options.seed).detections
+    if any(options.pose_noise):
+        seen = disturb(seen, draw_errors('correlated', seen.stamps_s,
+                                         PoseErrors(*options.pose_noise),
+                                         np.random.default_rng(options.seed)))
     if options.embeddings:
         seen = replace(seen, embeddings=_embeddings(len(seen.classes), options.embeddings),
                        encoder_key='simulated')
@@ -135,7 +145,7 @@ def _embeddings(rows: int, size: int) -> NDArray[np.float16]:
     return found
 
 
-def build(folder: Path) -> dict[str, float]:
+def build(folder: Path, options: MappingOptions) -> dict[str, float]:
     """Build the map as build_map does; return the processor time [s] of each stage."""
     begin, stage = time.process_time(), 'reading'
     stages: dict[str, float] = {}
@@ -148,10 +158,13 @@ def build(folder: Path) -> dict[str, float]:
 
     detections = load_observations(folder / 'observations.npz')
     tell('starting', 0.0)
-    built = build_map(detections, progress=tell)
+    built = build_map(detections, options, tell)
     tell('writing', 1.0)
     write_map(folder / 'map.yaml', built.landmark_map, built.report.lines()[:2])
     (folder / 'report.json').write_text(json.dumps(built.report.as_dict()))
+    if detections.embeddings is not None:
+        tell('choosing embeddings', 1.0)
+        embed_landmarks(built.landmark_map.landmark_ids, detections, built.shown)
     tell('end', 1.0)
     return stages
 
@@ -196,10 +209,9 @@ def _write_queries(options: argparse.Namespace, floor: Floor, built: LandmarkMap
 
 def evaluate(folder: Path, workers: int) -> str:
     """Run evaluate; return its results in a line."""
-    from cliploc_ros.cli.evaluate import main as run
-
-    _run(run, '--queries', folder / 'queries.npz', '--map', folder / 'map.yaml', '--methods',
-         'auto', '--trials', 1, '--no-figures', '--workers', workers, '--out', folder)
+    _run('evaluate', folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map',
+         folder / 'map.yaml', '--methods', 'auto', '--trials', 1, '--no-figures', '--workers',
+         workers, '--out', folder)
     results = json.loads((folder / 'results.json').read_text())
     right = [one['solved'] and one['error_m'] <= 1.0 for one in results]
     accepted = [one['accepted'] for one in results]
@@ -210,16 +222,14 @@ def evaluate(folder: Path, workers: int) -> str:
 
 def check(folder: Path) -> None:
     """Run check_map."""
-    from cliploc_ros.cli.check_map import main as run
-
-    _run(run, folder / 'map.yaml', '--observations', folder / 'observations.npz', '--out',
-         folder / 'check')
+    _run('check_map', folder / 'check_map.log', folder / 'map.yaml', '--observations',
+         folder / 'observations.npz', '--out', folder / 'check')
 
 
-def _run(command: Callable[[Sequence[str]], int], *arguments: object) -> None:
-    with (Path(str(arguments[-1])).with_suffix('.log').open('w') as log,
-          contextlib.redirect_stdout(log)):
-        command([str(argument) for argument in arguments])
+def _run(executable: str, log: Path, *arguments: object) -> None:
+    with log.open('w') as file:  # check_map ends with 1 if the map misses a threshold
+        subprocess.call([sys.executable, '-m', f'cliploc_ros.cli.{executable}',
+                         *map(str, arguments)], stdout=file)
 
 
 if __name__ == '__main__':

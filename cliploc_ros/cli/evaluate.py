@@ -112,7 +112,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
     group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
     group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
-    group.add_argument('--landmark-embeddings', choices=COMPARED, default='both',
+    group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
     group.add_argument('--device', default='auto', help='(%(default)s)')

@@ -89,11 +89,11 @@ def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
     if details.labels is not None:
         yield f'{_INDENT}labels:'
         yield f'{_INDENT}  text: [{", ".join(_quoted(text) for text, _ in details.labels)}]'
-        yield f'{_INDENT}  weight: {_floats([weight for _, weight in details.labels])}'
+        yield f'{_INDENT}  weight: {_floats(_weight(weight) for _, weight in details.labels)}'
     if details.class_weights is not None:
         yield f'{_INDENT}class_weights:'
         for name, weight in details.class_weights:
-            yield f'{_INDENT}  {_quoted(name)}: {weight:.4f}'
+            yield f'{_INDENT}  {_quoted(name)}: {_weight(weight):.4f}'
     if details.support is not None:
         yield f'{_INDENT}support: {details.support}'
     for name, digits in (('position_sigma', 4), ('seen_ratio', 3), ('baseline_deg', 1),
@@ -102,6 +102,11 @@ def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
             yield f'{_INDENT}{name}: {value:.{digits}f}'
     if details.source is not None:
         yield f'{_INDENT}source: {_quoted(details.source)}'
+
+
+def _weight(weight: float) -> float:
+    """Return a weight that does not become 0 when written, which the reader refuses."""
+    return max(weight, 1e-4)
 
 
 def _quoted(text: str) -> str:

@@ -5,6 +5,7 @@
 Mapping, evaluation and the map editor read the same file, so that the networks run once.
 """
 
+import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,12 @@ OPTIONAL = {
 }
 _KIND_NAMES = {'f': 'floats', 'U': 'a string', 'fiu': 'numbers', 'iu': 'integers', 'US': 'strings'}
 _MAX_ROTATION_ERROR = 1e-3
+# These are large, and few of their rows are in use at once.
+_MAPPED = ('embeddings',)
+_ROWS_AT_ONCE = 10_000
+# Of a member of a zip file: where the lengths of its name and of a further field stand, and where
+# the name begins.
+_ZIP_LENGTHS, _ZIP_HEAD = 26, 30
 
 
 @dataclass(frozen=True)
@@ -175,8 +182,9 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             hint = (' (this is a query file: map from an observation file)'
                     if 'similarities' in content.files else '')
             raise _ArrayError(f'array {missing[0]} is missing{hint}')
-        return {name: _read_array(content, name) for name in LAYOUT | OPTIONAL
-                if name in content.files}
+        return {name: _map_array(path, content, name) if name in _MAPPED
+                else _read_array(content, name)
+                for name in LAYOUT | OPTIONAL if name in content.files}
 
 
 def _read_array(content: Any, name: str) -> NDArray[Any]:
@@ -184,8 +192,32 @@ def _read_array(content: Any, name: str) -> NDArray[Any]:
         array = np.asarray(content[name])
         return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
     except Exception as error:  # whatever numpy and zipfile meet in a broken file
-        raise _ArrayError(f'array {name} cannot be read: {error}; record the observations again'
-                          ) from error
+        raise _damaged(name, error) from error
+
+
+def _map_array(path: Path, content: Any, name: str) -> NDArray[Any]:
+    """Return an array that stays in the file, so that memory holds only the rows in use."""
+    try:
+        member = content.zip.getinfo(f'{name}.npy')
+        with content.zip.open(member) as stream:
+            version = np.lib.format.read_magic(stream)
+            shape, by_columns, dtype = np.lib.format.read_array_header_1_0(stream)
+            start = stream.tell()
+            while stream.read(1 << 20):  # to the end, where zipfile compares the check sum
+                pass
+        with path.open('rb') as file:
+            file.seek(member.header_offset + _ZIP_LENGTHS)
+            start += member.header_offset + _ZIP_HEAD + sum(struct.unpack('<HH', file.read(4)))
+    except Exception as error:  # whatever numpy and zipfile meet in a broken file
+        raise _damaged(name, error) from error
+    if (member.compress_type != zipfile.ZIP_STORED or version != (1, 0) or by_columns
+            or dtype.hasobject or 0 in shape):
+        return _read_array(content, name)
+    return np.memmap(path, dtype, 'r', start, shape)
+
+
+def _damaged(name: str, error: Exception) -> _ArrayError:
+    return _ArrayError(f'array {name} cannot be read: {error}; record the observations again')
 
 
 def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
@@ -216,7 +248,9 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
             rows = arrays[name].reshape(len(arrays[name]), -1)
             _refuse(name, 'is not finite', ~np.isfinite(rows).all(axis=1))
     if 'embeddings' in arrays:
-        _refuse('embeddings', 'is not finite', ~np.isfinite(arrays['embeddings']).all(axis=1))
+        _refuse('embeddings', 'is not finite', np.concatenate([
+            ~np.isfinite(rows).all(axis=1) for rows in np.array_split(
+                arrays['embeddings'], len(arrays['embeddings']) // _ROWS_AT_ONCE + 1)]))
     if 'depths' in arrays:
         _refuse('depths', 'is not positive', arrays['depths'] <= 0.0)  # NaN is none
     offsets = arrays['frame_offsets'].astype(np.int64)

@@ -4,12 +4,13 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Result
+from cliploc_ros.replace_file import replace_file
 
 
 class Journal:
@@ -60,26 +61,46 @@ class Journal:
             It cannot be written.
         """
         try:
-            with self._path.open('w', encoding='utf-8') as self._file:
-                self._line(run)
-                if done:
-                    self.add(done)
-                yield self
+            with replace_file(self._path) as partial:  # results of hours stay on a full disk
+                partial.write_text(''.join(map(_line, [run, *([_plain(done)] if done else [])])))
+            self._file = self._path.open('a', encoding='utf-8')
         except OSError as error:
-            raise OptionsError(f'{self._path}: cannot be written: {error.strerror}; continue with '
-                               '--resume') from error
+            raise self._unwritable(error) from error
+        try:
+            yield self
+        finally:
+            with suppress(OSError):  # of a full disk, which was reported when it happened
+                self._file.close()
 
     def add(self, results: Sequence[Result]) -> None:
-        """Write the results of a part."""
-        self._line([result.as_dict() for result in results])
+        """Write the results of a part.
+
+        Raises
+        ------
+        OptionsError
+            They cannot be written.
+        """
+        try:
+            self._file.write(_line(_plain(results)))
+            self._file.flush()
+        except OSError as error:
+            raise self._unwritable(error) from error
 
     def remove(self) -> None:
         """Remove the file; the run is finished."""
         self._path.unlink(missing_ok=True)
 
-    def _line(self, content: object) -> None:
-        self._file.write(json.dumps(content) + '\n')
-        self._file.flush()
+    def _unwritable(self, error: OSError) -> OptionsError:
+        return OptionsError(f'{self._path}: cannot be written: {error.strerror}; make room and '
+                            'continue with --resume')
+
+
+def _plain(results: Sequence[Result]) -> list[dict[str, Any]]:
+    return [result.as_dict() for result in results]
+
+
+def _line(content: object) -> str:
+    return json.dumps(content) + '\n'
 
 
 def _whole(lines: list[str]) -> Iterator[Any]:

@@ -24,13 +24,18 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
     if viewpoints < options.min_viewpoints:
         return f'seen from {viewpoints} viewpoints, not {options.min_viewpoints}'
     if ratio < options.min_seen_ratio:
-        return f'seen in {ratio:.0%} of the frames that show its place, not ' \
-               f'{options.min_seen_ratio:.0%}: rarely detected, or moved'
+        return f'seen in {_floor(100 * ratio)} % of the frames that show its place, not ' \
+               f'{100 * options.min_seen_ratio:g} %: rarely detected, or moved'
     if baseline < options.min_baseline_deg:
-        return f'seen from one side only: {baseline:.0f} degrees, not ' \
-               f'{options.min_baseline_deg:.0f}'
+        return f'seen from one side only: {_floor(baseline)} degrees, not ' \
+               f'{options.min_baseline_deg:g}'
     if sigma > max(options.max_position_sigma_m, options.max_position_sigma_share * size_m):
         return f'its position is uncertain: {sigma:.2f} m'
     if evidence.median_iou[number] < options.min_median_iou:
         return f'its boxes do not fit one ellipsoid: median IoU {evidence.median_iou[number]:.2f}'
     return None
+
+
+def _floor(value: float) -> str:
+    """Return one decimal, never rounded up: 19.97 stays below 20."""
+    return f'{np.floor(10.0 * value) / 10.0:.1f}'

@@ -3,7 +3,8 @@
 """One embedding for each landmark, made of all labels that describe it.
 
 Different labels are encoded in parts, each once. U different labels of d numbers and R different
-descriptions take 4 d (R + min(U, PART)) bytes while they load, and 4 d R bytes afterwards.
+descriptions take 4 d (R + min(U, PART)) bytes while they load, besides their texts, and 4 d R
+bytes afterwards.
 """
 
 from collections.abc import Callable, Sequence

@@ -103,7 +103,7 @@ RELOCALIZER = (
                  read_only=True),
     ParameterRow('clip_checkpoint_path', '', 'Local file with the weights of that tag; empty: '
                  'download them once.', read_only=True),
-    ParameterRow('landmark_embeddings', 'both', "What crops are compared with: the map's labels "
+    ParameterRow('landmark_embeddings', 'image', "What crops are compared with: the map's labels "
                  "('text'), the images next to map_file ('image'), or both. Without images of "
                  'this CLIP: labels.', choices=COMPARED, read_only=True),
     _DEVICE,

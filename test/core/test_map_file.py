@@ -45,6 +45,15 @@ def test_a_written_map_is_read_back(tmp_path):
     assert loaded.quats_xyzw == pytest.approx(room.quats_xyzw, abs=2e-5)
 
 
+def test_tiny_weights_stay_above_zero(tmp_path):
+    tiny = LandmarkDetails(labels=(('a cup', 1.0), ('a mug', 1e-9)),
+                           class_weights=(('cup', 1.0), ('bowl', 1e-9)))
+    write_map(tmp_path / 'map.yaml', replace(make_room(), details=(tiny,) * 12))
+    loaded = LandmarkMap.from_file(tmp_path / 'map.yaml').details[0]
+    assert 0.0 < loaded.labels[1][1] < 1e-3
+    assert 0.0 < loaded.class_weights[1][1] < 1e-3
+
+
 def test_a_map_without_details_has_none(tmp_path):
     write_map(tmp_path / 'map.yaml', make_room())
     assert LandmarkMap.from_file(tmp_path / 'map.yaml').details == ()

@@ -63,6 +63,23 @@ def test_a_written_file_is_read_back(tmp_path):
     assert (again.camera, again.class_names) == (first.camera, first.class_names)
 
 
+def test_embeddings_stay_in_the_file(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(3, 300_000)).astype(np.float16)
+    given = replace(load_observations(save(tmp_path / 'o.npz', make_arrays())), embeddings=rows)
+    save_observations(tmp_path / 'large.npz', given)
+    loaded = load_observations(tmp_path / 'large.npz')
+    assert isinstance(loaded.embeddings, np.memmap)
+    assert (loaded.embeddings == rows).all()
+    save(tmp_path / 'compressed.npz', make_arrays() | {'embeddings': rows})
+    assert (load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
+
+    content = bytearray((tmp_path / 'large.npz').read_bytes())
+    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as a failing disk does
+    (tmp_path / 'large.npz').write_bytes(content)
+    with pytest.raises(DatasetError, match='array embeddings cannot be read: Bad CRC-32'):
+        load_observations(tmp_path / 'large.npz')
+
+
 def test_reads_the_shared_file(shared_data):
     loaded = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
     assert len(loaded) == 2583

@@ -217,6 +217,11 @@ def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     print(f'\nstopped after {done} parts, then resumed')
 
 
+def test_a_scheduler_that_is_not_there(files, tmp_path, evaluate_here):
+    arguments = small(files, '--scheduler', 'tcp://127.0.0.1:9', '--out', tmp_path)
+    assert_error(evaluate_here(*arguments), 'no Dask scheduler answers at tcp://127.0.0.1:9')
+
+
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
     """Every third image of the demo's walk, the last without its true pose; also as a bag."""

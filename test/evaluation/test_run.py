@@ -4,6 +4,7 @@
 
 import multiprocessing
 import os
+import resource
 import signal
 from dataclasses import replace
 
@@ -150,3 +151,20 @@ def test_a_journal_forgets_only_a_line_cut_off(results, tmp_path):
     journal._path.write_text('\n'.join([lines[0], 'rubbish', lines[1]]))
     with pytest.raises(OptionsError, match='damaged'):
         journal.read({'trials': 3})
+
+
+def test_a_journal_survives_a_full_disk(results, tmp_path):
+    journal = Journal(tmp_path / 'journal')
+    with journal.writing({'trials': 3}, results[:2]):
+        pass
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
+    try:
+        with (pytest.raises(OptionsError, match='make room and continue with --resume'),
+              journal.writing({'trials': 3}, journal.read({'trials': 3}))):
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert journal.read({'trials': 3}) == results[:2]

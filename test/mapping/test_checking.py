@@ -15,6 +15,7 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.evaluation.map_check.output import DATA, PAGE, write_report
+from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
 from cliploc_ros.mapping.checking.cross_validation import make_folds
 from cliploc_ros.mapping.checking.detector_model import measure_detector
@@ -163,7 +164,27 @@ def test_identical_rooms_fail_the_check():
     assert not report.passed
     assert any('look alike' in text for text in report.failures)
     assert 'nothing tells them apart' in report.advice[0]
+    assert not any('map more objects' in text for text in report.advice)  # that would not help
     assert sum(one.verdict == 'accepted' for one in report.grid.trials) == 0
+
+
+def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double():
+    other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
+    report = check_map(joined(TABLE, other), options=QUICK)
+    seen = next(one for one in report.grid.trials if one.landmarks > 3)
+
+    def misled_to(estimate):
+        trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
+        grid = replace(report.grid, trials=(*report.grid.trials, trial))
+        return give_advice(replace(report, grid=grid))
+
+    side = np.sign(5.0 - seen.position[0])  # to the other room
+    into_double = misled_to(seen.position + np.array([10.0 * side, 0.2, 0.0]))
+    assert '1 of the checked views are accepted in the wrong one' in into_double[0]
+    assert not any('would be misled' in text for text in into_double)
+    elsewhere = misled_to(seen.position + np.array([0.0, 7.0, 0.0]))
+    assert 'are accepted in the wrong one' not in elsewhere[0]
+    assert any('would be misled by 10.0 m' in text for text in elsewhere)
 
 
 def test_a_hand_written_map_gets_a_shorter_report():
@@ -246,6 +267,18 @@ def test_stretches_without_landmarks_become_advice(detections):
     report = check_map(TABLE, gap, options=QUICK)
     assert any(text.startswith('record this side: 2 frames at 5 s') and 'see no landmarks' in text
                for text in report.advice), report.advice
+
+
+def test_too_few_views_are_named_as_the_cause(detections):
+    # two of nine objects are not in the map
+    known = {name: values[:7] for name, values in vars(TABLE).items() if name in (
+        'landmark_ids', 'labels', 'class_ids', 'centers', 'semi_axes', 'quats_xyzw')}
+    part = replace(TABLE, **known)
+    few = check_map(part, detections.select_frames(range(0, 120, 12)), options=QUICK)
+    assert few.advice[0].startswith('record more views: of 10 frames, 10 show a landmark '
+                                    '(median), and 22% of the boxes belong to none'), few.advice
+    many = check_map(part, detections, options=QUICK)
+    assert not any('more views' in text for text in many.advice)
 
 
 def test_detector_has_the_misses_and_noise_of_the_recording():

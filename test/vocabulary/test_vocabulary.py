@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from cliploc_ros.errors import CliplocError, OptionsError
-from cliploc_ros.vocabulary.__main__ import main
 from cliploc_ros.vocabulary.grammar import MOST_PHRASES, expand_phrases
+from cliploc_ros.vocabulary.print_phrases import main
 from cliploc_ros.vocabulary.vocabulary import load_vocabulary, shipped_classes
 
 

@@ -14,14 +14,17 @@ from cliploc_ros.mapping.checking.report import CheckReport, RecordingCheck, sha
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
 _STYLE = f"""\
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1100px;
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1200px;
   padding: 0 1rem }}
 img {{ max-width: 100%; border: 1px solid #ddd }}
 table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
   margin: 1rem 0 }}
 th, td {{ text-align: left; vertical-align: top; padding: .25rem .7rem;
-  border-bottom: 1px solid #ddd; overflow-wrap: anywhere }}
-td.number, th.number {{ text-align: right; overflow-wrap: normal; white-space: nowrap }}
+  border-bottom: 1px solid #ddd; unicode-bidi: isolate }}
+td {{ min-width: 6rem; max-width: 24rem; overflow-wrap: anywhere }}
+td.text {{ min-width: 11rem }}
+td.number, th.number {{ text-align: right; min-width: 0 }} td.number {{ white-space: nowrap }}
+li, h1, figcaption {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
 .scroll {{ overflow-x: auto }}
 .verdict {{ border-left: 6px solid; padding: .6rem 1rem; background: #f6f6f6 }}
 .passed {{ border-color: {ACCEPTED} }} .failed {{ border-color: {FAULTY} }}
@@ -105,30 +108,31 @@ def _verdicts(trials: Sequence[Trial]) -> str:
 
 
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
-    head = ('landmark', 'class', '#frames', '#seen [%]', '#baseline [deg]', '#deviation [cm]',
-            '#offset [cm]', '#median IoU', '#thinness', 'overlaps (normalized distance)', 'faults')
+    head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
+            '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
     rows = ''.join(_landmark_row(one) for one in landmarks[:_MOST_LANDMARKS])
     rest = len(landmarks) - _MOST_LANDMARKS
     more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
     return (f'<div class="scroll"><table>{_head(head)}{rows}</table></div>{more}'
             '<p class="note">frames: with the landmark, of those that should show it. seen: '
             'their share. baseline: greatest angle between two views. deviation: of the centre '
-            'on its worst axis. offset: from the centre to where its boxes put it. thinness: '
-            'least by greatest semi-axis.</p>')
+            'on its worst axis. offset: from the centre to where its boxes put it. IoU: median '
+            'of its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
+            'distance of an overlap.</p>')
 
 
 def _landmark_row(one: LandmarkCheck) -> str:
     overlaps = ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)
-    texts = [_cell(f'{one.landmark_id}: {one.label}' if one.label != one.class_id
-                   else one.landmark_id, grade(one)), _cell(one.class_id)]
+    label = one.class_id if one.label == one.class_id else f'{one.label} ({one.class_id})'
+    faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
+    texts = [_cell(one.landmark_id, grade(one)), _cell(label, 'text'), _cell(faults, 'text')]
     support = '' if one.support is None else (
         str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
     numbers = [support, _number(one.seen_ratio, 100.0, 0), _number(one.baseline_deg, 1.0, 0),
                _number(one.position_sigma_m, 100.0, 1), _number(one.offset_m, 100.0, 1),
                _number(one.median_iou, 1.0, 2), _number(one.thinness, 1.0, 2)]
-    faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
     return '<tr>' + ''.join([*texts, *(_cell(text, 'number') for text in numbers),
-                             _cell(overlaps), _cell(faults)]) + '</tr>'
+                             _cell(overlaps)]) + '</tr>'
 
 
 def _look_alikes(report: CheckReport) -> str:

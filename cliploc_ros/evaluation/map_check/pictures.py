@@ -4,6 +4,7 @@
 
 import io
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,7 +38,9 @@ _MARGIN_M = 0.4
 _LARGEST_IN = 9.0
 _HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B'])
 _UNSEEN = '#DDDDDD'
-_MOST_NAMES = 45
+_MOST_NAMES = 30
+# Width and height of a name in shares of the picture.
+_NAME_ROOM = np.array([0.09, 0.035])
 _MOST_LOOK_ALIKES = 6
 
 
@@ -57,7 +60,8 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                _png(_frames_figure(landmark_map, report, bounds)))
         yield ('time', 'The same frames over time: how many landmarks of the map the detector '
                'found, and the verdict.', _png(_time_figure(report.recording.trials)))
-    yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault.',
+    yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault; '
+           'where these are many, with a serious one.',
            _png(_landmarks_figure(landmark_map, report, bounds)))
     if report.look_alikes:
         yield ('look_alikes', 'Places that look alike, joined in pairs.',
@@ -219,17 +223,22 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
     stamps = np.array([one.stamp_s or 0.0 for one in trials])
     stamps -= stamps[0]
     width = 0.8 * (float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0)
+    handles: list[Line2D | Patch] = []
     for verdict, color in VERDICT_COLORS.items():
         chosen = np.array([one.verdict == verdict for one in trials])
         counts = np.array([one.landmarks for one in trials])
-        axes.bar(stamps[chosen], counts[chosen], width=width, label=f'{verdict} '
-                 f'({chosen.sum()})', edgecolor=color, linewidth=1.0,
-                 color='white' if verdict == 'refused' else color,
-                 hatch='////' if verdict == 'refused' else None)
+        style: dict[str, Any] = {
+            'edgecolor': color, 'linewidth': 1.0,
+            'facecolor': 'white' if verdict == 'refused' else color,
+            'hatch': '////' if verdict == 'refused' else None}
+        axes.bar(stamps[chosen], counts[chosen], width=width, **style)
+        # a patch of its own, since bars that are missing give the legend no colour
+        handles.append(Patch(label=f'{verdict} ({chosen.sum()})', **style))
         none = chosen & (counts == 0)
         axes.plot(stamps[none], np.zeros(none.sum()), 'x', color=color, clip_on=False, zorder=5)
     axes.set(xlabel='time from the first frame [s]', ylabel='landmarks detected')
-    axes.legend(frameon=False, fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1.0, 1.0))
+    axes.legend(handles=handles, frameon=False, fontsize=9, ncols=3, loc='lower right',
+                bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
@@ -240,11 +249,12 @@ def _landmarks_figure(landmark_map: LandmarkMap, report: CheckReport,
     colors = [GRADE_COLORS[grades[name]] for name in landmark_map.landmark_ids]
     _draw_outlines(axes, landmark_map, colors, alpha=0.6)
     row_of = {name: row for row, name in enumerate(landmark_map.landmark_ids)}
-    named = [one for one in report.landmarks if one.faults][:_MOST_NAMES]
-    for place, names in _stacked(landmark_map.centers[[row_of[one.landmark_id] for one in named],
-                                                      :2],
-                                 [one.landmark_id for one in named],
-                                 0.03 * float((bounds[1] - bounds[0]).max())):
+    named = [one.landmark_id for one in report.landmarks if one.faults]
+    if len(named) > _MOST_NAMES:
+        named = [name for name in named if grades[name] == 'faulty'][:_MOST_NAMES]
+    room = _NAME_ROOM * float((bounds[1] - bounds[0]).max())
+    for place, names in _stacked(landmark_map.centers[[row_of[name] for name in named], :2],
+                                 named, room):
         _name(axes, place, '\n'.join(names))
     if report.recording is not None:
         axes.plot(*report.recording.path_xyz[:, :2].T, color=FAINT, linewidth=0.8, zorder=2)
@@ -255,13 +265,13 @@ def _landmarks_figure(landmark_map: LandmarkMap, report: CheckReport,
     return figure
 
 
-def _stacked(places: NDArray[np.float64], names: Sequence[str], distance_m: float
+def _stacked(places: NDArray[np.float64], names: Sequence[str], room_m: NDArray[np.float64]
              ) -> list[tuple[NDArray[np.float64], list[str]]]:
-    """Return places and the names to write there; names that would overlap share one."""
+    """Return places and the names to write there; names nearer than some room share one."""
     stacks: list[tuple[NDArray[np.float64], list[str]]] = []
     for place, name in zip(places, names, strict=True):
         for other, there in stacks:
-            if np.linalg.norm(other - place) < distance_m:
+            if (np.abs(other - place) < room_m).all():
                 there.append(name)
                 break
         else:

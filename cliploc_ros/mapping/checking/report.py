@@ -200,7 +200,8 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
 
     views = [*report.grid.trials, *report.queries]
     demand(report.faulty <= limits.max_faulty,
-           f'landmarks with a serious fault: {report.faulty:.0%} > {limits.max_faulty:.0%}')
+           f'landmarks with a serious fault: {_percent(report.faulty)} > '
+           f'{_percent(limits.max_faulty)}')
     demand(report.duplicates <= limits.max_duplicates,
            f'pairs of duplicates: {report.duplicates} > {limits.max_duplicates}')
     demand(len(report.look_alikes) <= limits.max_look_alikes,
@@ -210,19 +211,27 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
         views += recording.trials
         quality = recording.held_out
         demand(quality.explained >= limits.min_explained,
-               f'held-out boxes explained: {quality.explained:.0%} < {limits.min_explained:.0%}')
+               f'held-out boxes explained: {_percent(quality.explained)} < '
+               f'{_percent(limits.min_explained)}')
         demand(quality.median_iou >= limits.min_iou,
-               f'held-out median IoU: {quality.median_iou:.2f} < {limits.min_iou:.2f}')
+               f'held-out median IoU: {quality.median_iou:.4g} < {limits.min_iou:g}')
         accepted = share(recording.trials, 'accepted')
         demand(accepted >= limits.min_accepted,
-               f'recorded frames accepted: {accepted:.0%} < {limits.min_accepted:.0%}')
+               f'recorded frames accepted: {_percent(accepted)} < '
+               f'{_percent(limits.min_accepted)}')
     positions = report.grid.accepted_positions
     demand(positions >= limits.min_positions,
-           f'positions with an accepted heading: {positions:.0%} < {limits.min_positions:.0%}')
+           f'positions with an accepted heading: {_percent(positions)} < '
+           f'{_percent(limits.min_positions)}')
     misled = share(views, 'misled')
     demand(misled <= limits.max_misled,
-           f'views that mislead a robot: {misled:.1%} > {limits.max_misled:.1%}')
+           f'views that mislead a robot: {_percent(misled)} > {_percent(limits.max_misled)}')
     return failures
+
+
+def _percent(value: float) -> str:
+    """Return a share with so many digits that one just below its limit looks below it."""
+    return f'{100.0 * value:.4g} %'
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:

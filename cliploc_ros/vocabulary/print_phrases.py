@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Print the phrases of classes: ``python -m cliploc_ros.vocabulary cup --vocabulary my.yaml``."""
+"""Print phrases: ``python -m cliploc_ros.vocabulary.print_phrases cup --vocabulary my.yaml``."""
 
 import argparse
 import sys
@@ -13,7 +13,8 @@ from cliploc_ros.vocabulary.vocabulary import load_vocabulary, shipped_classes
 
 def main(args: Sequence[str] | None = None) -> int:
     """Print phrases; return the exit code."""
-    parser = argparse.ArgumentParser(prog='python -m cliploc_ros.vocabulary', description=__doc__)
+    parser = argparse.ArgumentParser(prog='print_phrases',
+                                     description='Print the phrases of classes.')
     parser.add_argument('classes', nargs='*', metavar='CLASS',
                         help='print its phrases; none: the number of phrases of each class')
     parser.add_argument('--vocabulary', type=Path, metavar='FILE', help="with the user's phrases")

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated floor: what mapping finds of it, and that far landmarks are passed over safely."""
+
+from argparse import Namespace
+
+import numpy as np
+import pytest
+
+from cliploc_ros.benchmark import floor as benchmark
+from cliploc_ros.benchmark.floors import CLASS_NAMES, compare_maps, make_floor, see_floor
+from cliploc_ros.mapping.association import find_overlaps
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.evidence import ious_with
+from cliploc_ros.mapping.landmarks import landmarks_of_map
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.views import make_views
+
+
+@pytest.fixture(scope='module')
+def floor():
+    return make_floor(150)
+
+
+@pytest.fixture(scope='module')
+def seen(floor):
+    return see_floor(floor, 1080)
+
+
+def test_mapping_finds_the_objects_of_a_floor(floor, seen):
+    built = build_map(seen.detections).landmark_map
+    against = compare_maps(built, seen, floor)
+    print(f'{against.found} of {against.visible} objects found, {against.false} false, centre '
+          f'error {100 * np.median(against.center_errors_m):.2f} cm')
+    assert against.found + against.missed == against.visible > 100
+    assert against.found >= 0.9 * against.visible
+    assert against.false <= 2
+    assert np.median(against.center_errors_m) < 0.005
+
+
+def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
+    views = make_views(seen.detections, MappingOptions())
+    landmarks = landmarks_of_map(floor.landmark_map, CLASS_NAMES)
+    landmarks.classes[7] = -1  # of a class that the recording does not know
+    found = find_overlaps(views, landmarks, 0.2)
+    expected = [
+        (row, number) for number in range(len(landmarks.centers))
+        for row in np.nonzero((views.classes == landmarks.classes[number]) & (ious_with(
+            views, np.arange(len(views.classes)), landmarks.centers[number],
+            landmarks.bases[number]) > 0.2))[0]]
+    assert list(zip(found.boxes.tolist(), found.landmarks.tolist(), strict=True)) == sorted(
+        expected)
+    assert len(expected) > 1000
+
+
+def test_no_landmarks_and_no_boxes(seen):
+    views = make_views(seen.detections, MappingOptions())
+    none = landmarks_of_map(make_floor(1).landmark_map, ())
+    assert none.classes.tolist() == [-1]
+    assert len(find_overlaps(views, none, 0.2).boxes) == 0
+    assert len(find_overlaps(views.between(0, 0), none, 0.2).boxes) == 0
+
+
+def test_the_benchmark_runs(tmp_path, capsys):
+    options = Namespace(objects=50, frames=400, seed=0, embeddings=8, queries=4,
+                        pose_noise=(0.001, 0.01), out=tmp_path)
+    benchmark.simulate(options)
+    assert {'finding landmarks', 'fitting landmarks'} <= benchmark.build(
+        tmp_path, MappingOptions()).keys()
+    assert 'missed' in benchmark.compare(options)
+    assert benchmark.evaluate(tmp_path, workers=1).startswith('4 queries, ')
