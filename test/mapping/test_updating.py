@@ -296,6 +296,7 @@ def test_two_objects_that_exchanged_places(alike):
     assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
     assert report.missing == report.new == ()
     if not alike:
+        assert all('an object of another look' in one.evidence for one in report.moved)
         np.testing.assert_allclose(updated.landmark_map.centers[first], things.centers[second],
                                    atol=0.03)
     assert updated.embeddings.landmark_ids == updated.landmark_map.landmark_ids

@@ -44,7 +44,9 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
     def moved(row: int) -> str:
         number = fates.objects[row]
         way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
-        return (f'moved by {way:.2f} m: old place {in_place(row)}; new place seen in '
+        left = ('an object of another look is in its old place' if judged.is_there[row]
+                else f'old place {in_place(row)}')
+        return (f'moved by {way:.2f} m: {left}; new place seen in '
                 f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
 
     return {
