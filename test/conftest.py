@@ -4,6 +4,7 @@
 
 import importlib.util
 import os
+import shutil
 import signal
 import socket
 from pathlib import Path
@@ -73,9 +74,10 @@ def pytest_collection_modifyitems(config, items):
 
 
 def missing_module(item: pytest.Item) -> str | None:
-    """Return the first module of the test's ``needs`` markers that is not installed."""
+    """Return the first of the test's ``needs``, modules or programs, that is not installed."""
     needed = [name for marker in item.iter_markers('needs') for name in marker.args]
-    return next((name for name in needed if importlib.util.find_spec(name) is None), None)
+    return next((name for name in needed if importlib.util.find_spec(name) is None
+                 and shutil.which(name) is None), None)
 
 
 def place(item: pytest.Item) -> int:

@@ -42,7 +42,7 @@ LAYERS = (
     ('ros.outputs', 'ros.replay'),
     ('ros',),
     ('nodes',),
-    ('demo',),
+    ('demo', 'studio'),
     ('cli',),
 )
 RANKS = {f'{ROOT}.{prefix}': rank for rank, prefixes in enumerate(LAYERS) for prefix in prefixes}

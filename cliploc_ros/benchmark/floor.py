@@ -8,11 +8,11 @@ Each step runs in a process of its own, so that its peak memory is its own.
 """
 
 import argparse
-import contextlib
 import json
 import multiprocessing
 import os
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -78,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     print(f'{options.objects} objects, {options.frames} frames; simulated', flush=True)
     show('simulate', measure(simulate, options))
-    built = measure(build, options.out)
+    built = measure(build, options.out, MappingOptions(estimate_pose_errors=True))
     show('build_map', built)
     for stage, seconds in built.result.items():
         print(f'    {stage:22} {seconds:8.1f} s of processor time')
@@ -145,7 +145,7 @@ def _embeddings(rows: int, size: int) -> NDArray[np.float16]:
     return found
 
 
-def build(folder: Path) -> dict[str, float]:
+def build(folder: Path, options: MappingOptions) -> dict[str, float]:
     """Build the map as build_map does; return the processor time [s] of each stage."""
     begin, stage = time.process_time(), 'reading'
     stages: dict[str, float] = {}
@@ -158,7 +158,7 @@ def build(folder: Path) -> dict[str, float]:
 
     detections = load_observations(folder / 'observations.npz')
     tell('starting', 0.0)
-    built = build_map(detections, MappingOptions(estimate_pose_errors=True), tell)
+    built = build_map(detections, options, tell)
     tell('writing', 1.0)
     write_map(folder / 'map.yaml', built.landmark_map, built.report.lines()[:2])
     (folder / 'report.json').write_text(json.dumps(built.report.as_dict()))
@@ -209,9 +209,7 @@ def _write_queries(options: argparse.Namespace, floor: Floor, built: LandmarkMap
 
 def evaluate(folder: Path, workers: int) -> str:
     """Run evaluate; return its results in a line."""
-    from cliploc_ros.cli.evaluate import main as run
-
-    _run(run, folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map',
+    _run('evaluate', folder / 'evaluate.log', '--queries', folder / 'queries.npz', '--map',
          folder / 'map.yaml', '--methods', 'auto', '--trials', 1, '--no-figures', '--workers',
          workers, '--out', folder)
     results = json.loads((folder / 'results.json').read_text())
@@ -224,15 +222,14 @@ def evaluate(folder: Path, workers: int) -> str:
 
 def check(folder: Path) -> None:
     """Run check_map."""
-    from cliploc_ros.cli.check_map import main as run
-
-    _run(run, folder / 'check_map.log', folder / 'map.yaml', '--observations',
+    _run('check_map', folder / 'check_map.log', folder / 'map.yaml', '--observations',
          folder / 'observations.npz', '--out', folder / 'check')
 
 
-def _run(command: Callable[[Sequence[str]], int], log: Path, *arguments: object) -> None:
-    with log.open('w') as file, contextlib.redirect_stdout(file):
-        command([str(argument) for argument in arguments])
+def _run(executable: str, log: Path, *arguments: object) -> None:
+    with log.open('w') as file:  # check_map ends with 1 if the map misses a threshold
+        subprocess.call([sys.executable, '-m', f'cliploc_ros.cli.{executable}',
+                         *map(str, arguments)], stdout=file)
 
 
 if __name__ == '__main__':

@@ -3,6 +3,7 @@
 """Options that say how to label a map, and what comes of them."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from cliploc_ros.errors import ModelError
 if TYPE_CHECKING:
     from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
     from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.mapping.labelling import Phrases
     from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
     from cliploc_ros.vocabulary.vocabulary import Vocabulary
@@ -63,13 +65,7 @@ class Labeller:
         CliplocError
             From loading the text tower.
         """
-        from cliploc_ros.mapping.labelling import (
-            Phrases,
-            classes_of,
-            embed_landmarks,
-            label_landmarks,
-        )
-        from cliploc_ros.models.phrase_embeddings import embed_phrases
+        from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
 
         if not _has_embeddings(detections):
             return landmark_map, None
@@ -78,10 +74,20 @@ class Labeller:
             return landmark_map, embeddings
         names = sorted({name for row in range(len(landmark_map))
                         for name in classes_of(landmark_map, row)})
-        texts = {name: self.vocabulary.phrases(name) for name in names}
-        rows = embed_phrases(self.weights, self.clip, texts)
-        phrases = {name: Phrases(texts[name], rows[name]) for name in names}
-        return label_landmarks(landmark_map, embeddings, phrases), embeddings
+        labelled = label_landmarks(landmark_map, embeddings, self._phrases(self.weights, names))
+        return labelled, embeddings
+
+    def _phrases(self, weights: 'ClipWeights', names: Sequence[str]) -> 'dict[str, list[Phrases]]':
+        """Return the phrases of some classes; the user's change more often than the shipped."""
+        from cliploc_ros.mapping.labelling import Phrases
+        from cliploc_ros.models.phrase_embeddings import embed_phrases
+        from cliploc_ros.vocabulary.vocabulary import shipped_phrases
+
+        shipped = {name: shipped_phrases(name) for name in names}
+        added = {name: texts for name, texts in self.vocabulary.added.items() if name in names}
+        parts = [(texts, embed_phrases(weights, self.clip, texts)) for texts in (shipped, added)]
+        return {name: [Phrases(texts[name], rows[name]) for texts, rows in parts if name in texts]
+                for name in names}
 
 
 def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -> Labeller:

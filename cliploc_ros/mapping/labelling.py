@@ -33,7 +33,7 @@ _LEAST_MEDOID_GAIN = 0.005
 
 
 class Phrases(NamedTuple):
-    """Phrases of a class: P texts and their embeddings (P, d), unit rows."""
+    """Some phrases: P texts and their embeddings (P, d), unit rows."""
 
     texts: tuple[str, ...]
     embeddings: NDArray[np.float32]
@@ -75,7 +75,7 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
 
 
 def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
-                    phrases: Mapping[str, Phrases]) -> LandmarkMap:
+                    phrases: Mapping[str, Sequence[Phrases]]) -> LandmarkMap:
     """Return the map with the phrases that fit each landmark best, and their weights.
 
     Parameters
@@ -83,7 +83,7 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     landmark_map : LandmarkMap
     embeddings : LandmarkEmbeddings
         In any order. A landmark without one keeps its label.
-    phrases : mapping of str to Phrases
+    phrases : mapping of str to sequence of Phrases
         Of each class that a landmark has.
     """
     embeddings = embeddings.in_order(landmark_map.landmark_ids)
@@ -91,7 +91,8 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     details = list(landmark_map.details or [LandmarkDetails()] * len(labels))
     for row in np.nonzero(embeddings.is_known)[0]:
         fitting = _best_phrases(embeddings.means[row].astype(np.float32),
-                                [phrases[name] for name in classes_of(landmark_map, int(row))])
+                                [part for name in classes_of(landmark_map, int(row))
+                                 for part in phrases[name]])
         labels[row] = fitting[0][0]
         details[row] = replace(details[row], labels=fitting)
     return replace(landmark_map, labels=tuple(labels), details=tuple(details))
@@ -104,11 +105,11 @@ def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _best_phrases(mean: NDArray[np.float32], of_classes: Sequence[Phrases]
+def _best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
                   ) -> tuple[tuple[str, float], ...]:
     """Return the best phrases with their weights, the best one first."""
     similarities = {
-        text: float(similarity) for texts, rows in of_classes
+        text: float(similarity) for texts, rows in phrases
         for text, similarity in zip(texts, rows @ mean, strict=True)}
     best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
     weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]

@@ -32,9 +32,10 @@ from cliploc_ros.mapping.views import Views
 _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
 _MIN_FRAMES, _MIN_LANDMARKS, _MIN_BOXES = 20, 3, 3
 # Smaller errors than these stay. A guess: motion capture and clock of TUM fr3 are estimated to be
-# off by 4 mm and 0.2 degrees.
+# off by 6 mm and 0.2 degrees.
 _HARMLESS = PoseErrors(0.01, 0.3)
-_START = PoseErrors(0.02, 0.5, 3.0)
+# A wide start lets poses follow their boxes; from a narrow one, far boxes count as outliers.
+_START = PoseErrors(0.1, 2.0, 0.3)
 _ROUNDS, _REFINEMENTS, _EVALUATIONS = 3, 6, 40
 # Bounds of sigma [m] [deg], time constant [s] and scale of the edges' deviations.
 _LOWEST = np.log([0.001, 0.02, 0.05, 0.3])

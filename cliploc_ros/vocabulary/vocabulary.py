@@ -35,7 +35,7 @@ class Vocabulary:
 
         A class that is not in the vocabulary is described by the general grammar.
         """
-        return tuple(dict.fromkeys(self.added.get(class_name, ()) + _shipped_phrases(class_name)))
+        return tuple(dict.fromkeys(self.added.get(class_name, ()) + shipped_phrases(class_name)))
 
 
 def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
@@ -65,7 +65,8 @@ def shipped_classes() -> tuple[str, ...]:
     return tuple(_shipped('coco.yaml'))
 
 
-def _shipped_phrases(name: str) -> tuple[str, ...]:
+def shipped_phrases(name: str) -> tuple[str, ...]:
+    """Return the phrases of a class without those of a user."""
     return _phrases_of(name, _shipped('coco.yaml').get(name, {}), f"class '{name}'")
 
 

@@ -21,7 +21,7 @@ CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'cli
         '--device', 'cpu')
 # a short walk sees objects from one side
 SHORT = ('--min-baseline', '0.5')
-IMAGES = 12
+IMAGES = 10
 COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
 
 

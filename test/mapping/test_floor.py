@@ -63,8 +63,9 @@ def test_no_landmarks_and_no_boxes(seen):
 
 def test_the_benchmark_runs(tmp_path, capsys):
     options = Namespace(objects=50, frames=400, seed=0, embeddings=8, queries=4,
-                        pose_noise=(0.01, 0.1), out=tmp_path)
+                        pose_noise=(0.001, 0.01), out=tmp_path)
     benchmark.simulate(options)
-    assert {'finding landmarks', 'fitting landmarks'} <= benchmark.build(tmp_path).keys()
+    assert {'finding landmarks', 'fitting landmarks'} <= benchmark.build(
+        tmp_path, MappingOptions()).keys()
     assert 'missed' in benchmark.compare(options)
     assert benchmark.evaluate(tmp_path, workers=1).startswith('4 queries, ')

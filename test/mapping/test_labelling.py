@@ -45,11 +45,11 @@ def test_crops_of_a_built_map_name_their_phrase():
     rng = np.random.default_rng(1)
     table = make_table()
     seen = see(table, walk_around(40))
-    phrases = {name: make_phrases(name, 300, rng) for name in set(table.class_ids)}
+    phrases = {name: [make_phrases(name, 300, rng)] for name in set(table.class_ids)}
     built = build_map(seen)
     true_rows = np.argmin(np.linalg.norm(
         built.landmark_map.centers[:, None] - table.centers, axis=2), axis=1)
-    meant = np.array([phrases[name].embeddings[7 * row]
+    meant = np.array([phrases[name][0].embeddings[7 * row]
                       for row, name in enumerate(table.class_ids)])
     crops = unit(rng.normal(size=(len(seen.classes), SIZE)))
     known = built.shown >= 0
@@ -76,7 +76,7 @@ def test_weights_are_those_of_clip():
     embeddings = replace(
         embed_landmarks(['a'], with_crops(see(make_table(1), walk_around(1)), crop[None]),
                         np.array([0])), landmark_ids=('thing_0',))
-    phrases = {'book': Phrases(('zero', 'one', 'two'), axes[:3])}
+    phrases = {'book': [Phrases(('zero', 'one'), axes[:2]), Phrases(('two',), axes[[2]])]}
     (first, second, third) = label_landmarks(make_table(1), embeddings, phrases).details[0].labels
     assert (first[0], second[0], third[0]) == ('zero', 'one', 'two')
     assert first[1] / second[1] == pytest.approx(np.exp(100 * (crop[0] - crop[1])), rel=0.1)
@@ -130,8 +130,8 @@ def test_a_landmark_of_two_classes_takes_phrases_of_both():
     embeddings = replace(
         embed_landmarks(['thing_0'], with_crops(see(table, walk_around(1)), axes[[1]]),
                         np.array([0])))
-    phrases = {'book': Phrases(('a book', 'a thing'), axes[[0, 2]]),
-               'cup': Phrases(('a cup', 'a thing'), axes[[1, 2]])}
+    phrases = {'book': [Phrases(('a book', 'a thing'), axes[[0, 2]])],
+               'cup': [Phrases(('a cup', 'a thing'), axes[[1, 2]])]}
     assert label_landmarks(table, embeddings, phrases).labels == ('a book',)
     both = replace(table, details=(LandmarkDetails(class_weights=(('book', 0.7), ('cup', 0.3))),))
     labelled = label_landmarks(both, embeddings, phrases)

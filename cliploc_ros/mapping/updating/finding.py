@@ -82,7 +82,7 @@ def find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool
 
 
 def without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArray[np.int64],
-                   options: UpdateOptions) -> Finds:
+                   majority: float, options: UpdateOptions) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
     Of two landmarks that lie in one another, the boxes are those of one object: parts of it, or
@@ -96,6 +96,8 @@ def without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArra
         Those with boxes are in their place.
     old_shown : ndarray (n,) of int
         The old landmark that each box shows, -1 for none.
+    majority : float
+        An old landmark is in its place if it has a box, and so many for each of the new one's.
     options : UpdateOptions
     """
     rows_of_old = group_boxes(old_shown, len(old.centers))
@@ -103,13 +105,24 @@ def without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArra
     copies = set()
     for new, row, distance in close_pairs(finds.landmarks, old, options.mapping.merge_distance):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
-        if len(rows_of_old[row]) and (
+        if len(rows_of_old[row]) >= max(1.0, majority * len(rows_of_new[new])) and (
                 (is_one_class and distance < options.least_move_shapes)
                 or seen_apart(views, rows_of_old[row], rows_of_new[new])
                 <= options.mapping.max_seen_apart):
             copies.add(new)
     return finds.select(np.array([new for new in range(len(finds.details)) if new not in copies],
                                  dtype=np.int64))
+
+
+def is_taken(finds: Finds, old: Landmarks, old_shown: NDArray[np.int64], max_distance: float
+             ) -> NDArray[np.bool_]:
+    """Tell which old landmarks (L,) have a new one with more boxes in their place."""
+    rows_of_old = group_boxes(old_shown, len(old.centers))
+    rows_of_new = group_boxes(finds.shown, len(finds.details))
+    taken = np.zeros(len(old.centers), dtype=np.bool_)
+    for new, row, _ in close_pairs(finds.landmarks, old, max_distance):
+        taken[row] |= len(rows_of_new[new]) > len(rows_of_old[row])
+    return taken
 
 
 def close_pairs(new: Landmarks, old: Landmarks, max_distance: float

@@ -8,19 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
-from cliploc_ros.mapping.evidence import best_ious, gather_evidence
+from cliploc_ros.mapping.association import find_overlaps
+from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import join_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.updating.alignment import has_moved
-from cliploc_ros.mapping.updating.finding import Finds, close_pairs, find_new, without_copies
+from cliploc_ros.mapping.updating.finding import (
+    Finds,
+    close_pairs,
+    find_new,
+    is_taken,
+    without_copies,
+)
 from cliploc_ros.mapping.updating.known import Known, Refits, find_known, refit
 from cliploc_ros.mapping.updating.options import UpdateOptions
 from cliploc_ros.mapping.updating.presence import probability_there, usual_ratios
 from cliploc_ros.mapping.updating.sight import Sight, look_for
 from cliploc_ros.mapping.views import Views
 
-# New objects hide old places, and objects that are gone no longer do.
-_ROUNDS = 2
 # Overlaps with which a box is near a landmark, and on it whatever its class. Guesses.
 _NEAR_IOU, _SAME_IOU = 0.02, 0.5
 
@@ -67,25 +72,35 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Upda
     refits = refit(views, known.landmarks, shown, mapping.min_viewpoints)
     displaced = has_moved(known, refits, options)
     sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_), options)
-    is_gone = displaced | _is_absent(known, sight, options)
+    is_gone = displaced | _is_absent(known, sight, options.gone_below, options)
     finds = find_new(detections, views, _free(views, known, refits, shown, is_gone), mapping)
     finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
-    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), options)
+    # a new object may be in the place of an old one of which a wrong box remains
+    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 1.0, options)
     _, sight = _look(views, known, finds, shown, is_gone, options)
-    usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
-    often = sight.seen_ratio[count:] >= options.min_new_share * (np.median(usual) if len(usual)
-                                                                 else 1.0)
-    finds = finds.select(np.nonzero(often)[0])
-    both = shown
-    for _ in range(_ROUNDS):
-        both, sight = _look(views, known, finds, shown, is_gone, options)
-        is_gone = displaced | _is_absent(known, sight.select(slice(count)), options)
+    finds = finds.select(np.nonzero(_is_usual(sight, count, options))[0])
+    # new objects hide old places
+    _, sight = _look(views, known, finds, shown, is_gone, options)
+    limits = np.where(is_taken(finds, known.landmarks, shown, mapping.merge_distance),
+                      options.gone_below_if_taken, options.gone_below)
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits, options)
+    finds = without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 0.0, options)
+    # objects that are gone hide nothing
+    both, sight = _look(views, known, finds, shown, is_gone, options)
+    is_gone |= _is_absent(known, sight.select(slice(count)), limits, options)
     own_sight = sight.select(slice(count))
     there = probability_there(own_sight, usual_ratios(known, own_sight, options), options)
     fits = gather_evidence(views, refits.landmarks, _held(shown, is_gone)).median_iou
     is_there = (~is_gone & (fits >= mapping.min_median_iou)
                 & (refits.is_known | (there > options.there_above)))
     return Judged(both, refits, finds, sight, is_gone, is_there)
+
+
+def _is_usual(sight: Sight, count: int, options: UpdateOptions) -> NDArray[np.bool_]:
+    """Tell which finds are seen about as often as the old landmarks, which come first."""
+    usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    least = options.min_new_share * (float(np.median(usual)) if len(usual) else 1.0)
+    return np.asarray(sight.seen_ratio[count:] >= least)
 
 
 def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
@@ -103,14 +118,19 @@ def _free(views: Views, known: Known, refits: Refits, shown: NDArray[np.int64],
     """Tell which boxes (n,) may show new objects.
 
     A box near a landmark that has no better one is no proof of a new object; nor is a box on a
-    landmark in its place, which may be another name for it.
+    landmark that has at least as many of its own: it may be another name for it.
     """
     own = _held(shown, is_gone)
     near = _held(find_known(views, known, _NEAR_IOU), is_gone)
-    in_place = refits.landmarks.select(np.unique(own[own >= 0]))
-    nameless = best_ious(views._replace(classes=np.zeros_like(views.classes)),
-                         in_place._replace(classes=np.zeros_like(in_place.classes)))
-    return np.asarray((own < 0) & (near < 0) & (nameless < _SAME_IOU))
+    nameless = find_overlaps(
+        views._replace(classes=np.zeros_like(views.classes)),
+        refits.landmarks._replace(classes=np.zeros_like(refits.landmarks.classes)), _SAME_IOU)
+    others = own[nameless.boxes] < 0
+    on, count = nameless.landmarks[others], len(is_gone)
+    is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
+    free = (own < 0) & (near < 0)
+    free[nameless.boxes[others][is_named[on]]] = False
+    return free
 
 
 def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -118,14 +138,15 @@ def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.in
     return np.where((shown >= 0) & ~is_gone[shown], shown, -1)
 
 
-def _is_absent(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[np.bool_]:
-    """Tell which objects (L,) are not in their place.
+def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float,
+               options: UpdateOptions) -> NDArray[np.bool_]:
+    """Tell which objects (L,) are in their place with less than some probabilities.
 
     A detector that never found a class in this recording may not know it, or not at these sizes.
     """
     is_told = (known.landmarks.classes >= 0) & (sight.expected >= options.least_views)
     there = probability_there(sight, usual_ratios(known, sight, options), options)
-    return np.asarray(is_told & (there < options.gone_below))
+    return np.asarray(is_told & (there < limits))
 
 
 def _with_displaced(finds: Finds, refits: Refits, shown: NDArray[np.int64],

@@ -34,6 +34,8 @@ class UpdateOptions:
         Share of the views in which a wrong box appears in an empty place.
     gone_below, there_above : float
         An object is gone, or there, if the probability of being there is so small, or large.
+    gone_below_if_taken : float
+        The same where another object was found in its place.
     least_views : int
         A place must be in view from so many viewpoints before its object can be missing.
     beside_deg : float
@@ -61,6 +63,7 @@ class UpdateOptions:
     prior_views: float = 4.0
     chance_ratio: float = 0.03
     gone_below: float = 0.05
+    gone_below_if_taken: float = 0.5
     there_above: float = 0.95
     least_views: int = 5
     beside_deg: float = 20.0

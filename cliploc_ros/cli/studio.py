@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``studio``: create, correct and test a map in the browser."""
+
+import argparse
+import itertools
+import sys
+import threading
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.errors import OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.studio.studio import Studio
+
+_LOOPBACK = '127.0.0.1'
+EPILOG = """\
+examples:
+  studio office.yaml --observations office.npz --images office_bag
+  studio office.yaml --images tum_folder_with_ground_truth
+  studio                     an empty map, to be saved as map.yaml
+
+Edits are kept beside the map as they are made: a studio that was killed restores them.
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the studio; return the exit code."""
+    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    options = make_parser().parse_args(plain_args)
+    interrupt_on_sigterm()
+    return run_command(lambda: serve(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Create and correct a map in the browser. Needs no sourced ROS.')
+    parser.add_argument('map', type=Path, nargs='?', metavar='MAP',
+                        help='a map file; one that does not exist yet starts empty (map.yaml, '
+                        'or the first free of map-2.yaml, map-3.yaml, ...)')
+    parser.add_argument('--observations', type=Path, metavar='NPZ',
+                        help='boxes and poses of a recording of the place')
+    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
+                        help='a rosbag2 recording or a TUM folder with the images of the views')
+    parser.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
+    parser.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
+                        help='(%(default)s)')
+    parser.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+    parser.add_argument('--port', type=_port, default=8080, metavar='N',
+                        help='the next free one from this on (%(default)s)')
+    parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
+                        help='listen at this address too; the URL then holds a token '
+                        '(%(default)s: this machine only)')
+    parser.add_argument('--no-browser', action='store_true', help='print the URL only')
+    return parser
+
+
+def serve(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C; return the exit code."""
+    # Late, so that --help is fast.
+    try:
+        from cliploc_ros.studio.server import serve_studio
+    except ModuleNotFoundError as error:
+        raise OptionsError(f'{error.name} is not installed; pip install viser==1.1.1') from error
+
+    studio = open_studio(options)
+    try:
+        with serve_studio(studio, options.host, options.port) as served:
+            print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
+                  f'{studio.views} views')
+            for note in studio.document.notes:
+                print(f'note: {note}')
+            print(f'studio: {served.url}', flush=True)
+            if not options.no_browser:
+                webbrowser.open(served.url)
+            threading.Event().wait()
+    finally:
+        studio.document.close()
+    return 0
+
+
+def open_studio(options: argparse.Namespace) -> 'Studio':
+    """Return the studio that the command line asks for."""
+    from cliploc_ros.datasets.bag_frames import BagTopics
+    from cliploc_ros.datasets.observations import load_observations
+    from cliploc_ros.studio.document import Document
+    from cliploc_ros.studio.images import open_images, views_of_folder
+    from cliploc_ros.studio.recording import Recording
+    from cliploc_ros.studio.studio import Studio
+
+    images = detections = None
+    if options.images is not None:
+        images = open_images(options.images,
+                             BagTopics(options.image, options.camera_info, options.rectified))
+    if options.observations is not None:
+        detections = load_observations(options.observations)
+    elif options.images is not None:
+        detections = views_of_folder(options.images)
+    recording = None if detections is None else Recording(detections)
+    return Studio(Document(options.map or _free_path()), recording, images)
+
+
+def _free_path() -> Path:
+    """Return where a new map goes: the first name that no map has."""
+    names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
+    return next(path for path in map(Path, names) if not path.exists())
+
+
+def _port(text: str) -> int:
+    value = int(text)
+    if not 0 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 65535')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,315 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The document: a map that is edited, with undo, a selection, a journal, and saving.
+
+All threads share one document. Each method holds its lock; a caller that needs several steps at
+once holds it, too.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from threading import RLock
+from typing import Any
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.studio.changes import Change, EditError, Landmarks, from_json, to_json
+from cliploc_ros.studio.journal import Journal
+from cliploc_ros.studio.landmark import Landmark, map_of
+from cliploc_ros.studio.map_source import (
+    NO_FILE,
+    ChangedOnDiskError,
+    digest_on_disk,
+    read_source,
+)
+
+_MAX_HISTORY = 10_000
+
+
+class Document:
+    """A map that is edited.
+
+    Parameters
+    ----------
+    path : Path
+        Of the map file; it may not exist yet.
+
+    Raises
+    ------
+    CliplocError
+        The file is no map, another studio edits it, or its folder is not writable.
+    """
+
+    def __init__(self, path: Path):
+        self.lock = RLock()
+        self.revision = 0
+        self.notes: tuple[str, ...] = ()
+        self.selection: tuple[str, ...] = ()
+        self._listeners: list[Callable[[], None]] = []
+        self._done: list[Change] = []
+        self._undone: list[Change] = []
+        self._gesture: object = None
+        self._source = read_source(path)
+        self._landmarks: Landmarks = self._source.landmarks
+        self._saved: Landmarks = self._landmarks
+        self._journal = Journal(self.path.with_name(f'.{self.path.name}.studio'))
+        try:
+            self._replay(self._journal.read())
+        except BaseException:
+            self._journal.close()
+            raise
+        self._note_unknown_fields()
+
+    # ---- what it holds --------------------------------------------------------------------------
+
+    @property
+    def path(self) -> Path:
+        """Return the map file."""
+        return self._source.path
+
+    @property
+    def frame_id(self) -> str:
+        """Return the coordinate frame of the map."""
+        return self._source.frame_id
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Return the landmarks by id. An edit makes a new mapping and leaves this one alone."""
+        return self._landmarks
+
+    @property
+    def selected(self) -> tuple[str, Landmark] | None:
+        """Return id and landmark of a selection of exactly one."""
+        with self.lock:
+            if len(self.selection) != 1:
+                return None
+            return self.selection[0], self._landmarks[self.selection[0]]
+
+    @property
+    def is_saved(self) -> bool:
+        """Return whether the file holds all edits."""
+        return _fields(self._saved) == _fields(self._landmarks)
+
+    @property
+    def to_undo(self) -> str | None:
+        """Return what the next undo undoes."""
+        return self._done[-1].what if self._done else None
+
+    @property
+    def to_redo(self) -> str | None:
+        """Return what the next redo does again."""
+        return self._undone[-1].what if self._undone else None
+
+    def to_map(self) -> LandmarkMap:
+        """Return the map as the relocalizer knows it.
+
+        Raises
+        ------
+        MapError
+            It has no landmarks.
+        """
+        return map_of(self._landmarks, self.frame_id, self.path.name)
+
+    # ---- edits ----------------------------------------------------------------------------------
+
+    def apply(self, change: Change, gesture: object = None) -> None:
+        """Make a change.
+
+        Parameters
+        ----------
+        change : Change
+        gesture : object, optional
+            Successive changes of one gesture, as of a drag, are undone together.
+
+        Raises
+        ------
+        CliplocError
+            The landmarks are not those the change starts from, or the journal cannot be written.
+        """
+        with self.lock:
+            if not change.after:
+                return
+            joins = gesture is not None and gesture == self._gesture and bool(self._done)
+            self._do('join' if joins else 'edit', change)
+            self._gesture = gesture
+
+    def undo(self) -> bool:
+        """Undo the last edit; return whether there was one."""
+        with self.lock:
+            if self._done:
+                self._do('undo', self._done[-1].reversed())
+                return True
+            return False
+
+    def redo(self) -> bool:
+        """Do again what was undone last; return whether there was anything."""
+        with self.lock:
+            if self._undone:
+                self._do('redo', self._undone[-1])
+                return True
+            return False
+
+    def select(self, landmark_ids: Iterable[str]) -> None:
+        """Select landmarks; unknown ids are left out."""
+        with self.lock:
+            self.selection = tuple(dict.fromkeys(
+                key for key in landmark_ids if key in self._landmarks))
+            self._tell()
+
+    def _do(self, kind: str, change: Change) -> None:
+        landmarks: Landmarks = change.apply(self._landmarks)
+        self._journal.append({'do': kind, **to_json(change)})
+        self._take(kind, change, landmarks)
+        self._tell()
+
+    def _take(self, kind: str, change: Change, landmarks: Landmarks) -> None:
+        """Take over a change that was applied, and write history."""
+        self._landmarks = landmarks
+        self._gesture = None
+        if kind == 'join' and self._done:
+            self._done[-1] = self._done[-1].then(change)
+        elif kind == 'undo':
+            self._undone.append(change.reversed())
+            del self._done[-1:]
+        else:
+            self._done.append(change)
+            del self._done[:-_MAX_HISTORY]
+            if kind == 'redo':
+                del self._undone[-1:]
+        if kind in ('edit', 'join'):
+            self._undone.clear()
+        self.selection = tuple(key for key in self.selection if key in landmarks)
+
+    # ---- listeners ------------------------------------------------------------------------------
+
+    def subscribe(self, listener: Callable[[], None]) -> None:
+        """Call a function after each change of map, selection or file, with the lock held."""
+        self._listeners.append(listener)
+
+    def _tell(self) -> None:
+        self.revision += 1
+        for listener in self._listeners:
+            listener()
+
+    # ---- file and journal -----------------------------------------------------------------------
+
+    def save(self, over: str = NO_FILE) -> None:
+        """Write the map file in one step.
+
+        Parameters
+        ----------
+        over : str
+            The digest of a foreign content that may be overwritten, see ChangedOnDiskError.
+
+        Raises
+        ------
+        ChangedOnDiskError
+            Another program changed the file.
+        CliplocError
+            The map is empty, or the file cannot be written; it is as it was.
+        """
+        with self.lock:
+            if not self._landmarks:
+                raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
+                                'or delete the file')
+            self.to_map()
+            found = digest_on_disk(self.path)
+            if found not in (NO_FILE, self._source.digest, over):
+                raise ChangedOnDiskError(self.path, found)
+            new = self._source.with_landmarks(self._landmarks)
+            self._journal.append({'writing': new.digest})
+            self._source = new.write()
+            self._saved = self._landmarks
+            self._gesture = None
+            self._journal.restart([self._header()])
+            self._tell()
+
+    def reload(self) -> None:
+        """Take the map from the file; this is an edit that undo takes back.
+
+        Raises
+        ------
+        CliplocError
+            The file is no map.
+        """
+        with self.lock:
+            self._source = read_source(self.path)
+            found: Landmarks = {key: Landmark(one.fields, key in self._landmarks
+                                   and self._landmarks[key].is_locked)
+                     for key, one in self._source.landmarks.items()}
+            change = Change('reload the file', self._landmarks,
+                            {**dict.fromkeys(self._landmarks), **found})
+            change = Change(change.what, {key: self._landmarks.get(key) for key in change.after},
+                            change.after)
+            self._take('edit', change, found)
+            self._saved = found
+            self._journal.restart([self._header()])
+            self._note_unknown_fields()
+            self._tell()
+
+    def close(self) -> None:
+        """Release the journal, which stays if it holds edits or locks."""
+        with self.lock:
+            is_needed = not self.is_saved or self._locked()
+            self._journal.close() if is_needed else self._journal.remove()
+
+    def _header(self) -> dict[str, Any]:
+        return {'base': self._source.digest, 'locked': self._locked()}
+
+    def _locked(self) -> list[str]:
+        return [key for key, one in self._landmarks.items() if one.is_locked]
+
+    def _replay(self, entries: list[dict[str, Any]]) -> None:
+        """Do again what the journal holds, from the content that the file has."""
+        digest = self._source.digest
+        starts = [row for row, entry in enumerate(entries)
+                  if digest in (entry.get('base'), entry.get('writing'))]
+        edits = [entry for entry in entries if 'do' in entry]
+        if not starts and edits:
+            aside = self._journal.set_aside()
+            self.notes += (f'{len(edits)} edits of an earlier session do not fit the file, which '
+                           f'another program changed; they lie in {aside.name}',)
+        if not starts:
+            self._journal.restart([self._header()])
+            return
+        self._restore_locks(entries[:starts[-1] + 1])
+        count = self._replay_edits([entry for entry in entries[starts[-1] + 1:] if 'do' in entry])
+        if count:
+            self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
+
+    def _restore_locks(self, entries: list[dict[str, Any]]) -> None:
+        # locks before a content that was written come from the header and the edits up to it
+        locked: dict[str, bool] = {}
+        for entry in entries:
+            if isinstance(ids := entry.get('locked'), list):
+                locked |= dict.fromkeys(map(str, ids), True)
+            if isinstance(after := entry.get('after'), dict):
+                locked |= {key: isinstance(one, dict) and one.get('locked') is True
+                           for key, one in after.items()}
+        self._landmarks = {key: Landmark(one.fields, locked.get(key, False))
+                           for key, one in self._landmarks.items()}
+        self._saved = self._landmarks
+
+    def _replay_edits(self, edits: list[dict[str, Any]]) -> int:
+        for row, entry in enumerate(edits):
+            try:
+                change = from_json(entry)
+                self._take(str(entry['do']), change, change.apply(self._landmarks))
+            except (ValueError, CliplocError) as error:
+                aside = self._journal.set_aside()
+                self._journal.restart([self._header(), *edits[:row]])
+                self.notes += (f'the last {len(edits) - row} edits of an earlier session cannot '
+                               f'be restored ({error}); they lie in {aside.name}',)
+                return row
+        return len(edits)
+
+    def _note_unknown_fields(self) -> None:
+        unknown = {name: key for key, one in self._landmarks.items()
+                   for name in one.unknown_fields}
+        for name, landmark_id in list(unknown.items())[:5]:
+            self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
+                           'relocalizer refuses a map with unknown fields',)
+
+
+def _fields(landmarks: Landmarks) -> Mapping[str, Mapping[str, Any]]:
+    return {key: one.fields for key, one in landmarks.items()}

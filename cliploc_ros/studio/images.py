@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The images of a recording, one at a time, by the time of a view."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.frames import Frames, ImageFile, folder_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.poses import TrajectoryPoses
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.units import NS_PER_S
+
+# A view and its image have the same stamp; files hold it to a microsecond or so.
+_MAX_DELAY_NS = 20_000_000
+_IMAGES_KEPT = 32
+
+
+class _AnyTime(NamedTuple):
+    """Poses that are not needed: the views bring their own."""
+
+    span_ns: tuple[int, int] | None = (0, 2**62)
+
+    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
+        return None
+
+
+class Images:
+    """The images of a folder or a recording.
+
+    Parameters
+    ----------
+    frames : Frames
+    """
+
+    def __init__(self, frames: Frames):
+        self._frames = frames
+        stamps: list[int] = []
+
+        def note(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+            stamps.append(stamp_ns)
+            return False
+
+        for _ in frames.read_raw(note):
+            pass
+        self._stamps_ns = np.array(stamps, dtype=np.int64)
+        self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(self._read_place)
+
+    def near(self, stamp_s: float) -> NDArray[np.uint8] | None:
+        """Return the undistorted image (h, w, 3) of a time [s], red first; None without one."""
+        if not len(self._stamps_ns):
+            return None
+        offsets = np.abs(self._stamps_ns - round(stamp_s * NS_PER_S))
+        place = int(np.argmin(offsets))
+        return self._read(place) if offsets[place] <= _MAX_DELAY_NS else None
+
+    def _read_place(self, wanted: int) -> NDArray[np.uint8]:
+        for raw in self._frames.read_raw(lambda place, stamp_ns, pose: place == wanted):
+            frame = raw.decode()
+            return _undistorted(frame.image_rgb, frame.camera)
+        raise DatasetError(f'{self._frames.source}: image {wanted} is gone; start again')
+
+
+def _undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    if not any(camera.distortion):
+        return image
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    points = np.asarray((pixels.reshape(-1, 2) - (camera.cx, camera.cy))
+                        / (camera.fx, camera.fy), dtype=np.float64)
+    places = camera.project_normalized(points).astype(np.float32)
+    places = places.reshape(camera.height, camera.width, 2)
+    return np.asarray(cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
+                      dtype=np.uint8)
+
+
+def open_images(path: Path, topics: BagTopics) -> Images:
+    """Open the images of a TUM folder or of a rosbag2 recording.
+
+    Raises
+    ------
+    DatasetError
+        It is neither, or its images cannot be read.
+    """
+    if not path.exists():
+        raise DatasetError(f'{path}: no such folder or recording')
+    if (path / 'rgb.txt').exists():
+        sequence = read_tum(path)
+        files = [ImageFile(stamp, image) for stamp, image in
+                 zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
+        return Images(folder_frames(path, files, _AnyTime(), find_camera(None, path)[0]))
+    return Images(bag_frames(path, topics, lambda reader, camera_frame: _AnyTime()))
+
+
+def views_of_folder(path: Path) -> PosedDetections:
+    """Return the poses of a TUM folder with ground truth as views without boxes.
+
+    Raises
+    ------
+    DatasetError
+        It is no such folder.
+    """
+    if not (path / 'rgb.txt').exists():
+        raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
+    sequence, camera = read_tum(path), find_camera(None, path)[0]
+    poses = TrajectoryPoses(sequence.trajectory)
+    tum_frames(sequence, camera)  # refuses a folder without poses
+    posed = [(stamp, pose) for stamp in sequence.stamps_ns
+             if (pose := poses.pose_at(stamp)) is not None]
+    if not posed:
+        raise DatasetError(f'{path}: no image has a pose')
+    none = np.empty(0, dtype=np.int64)
+    return PosedDetections(
+        camera=camera, map_from_camera=np.array([pose for _, pose in posed]),
+        stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
+        frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
+        class_names=(), classes=none, scores=np.empty(0))

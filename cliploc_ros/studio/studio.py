@@ -1,0 +1,336 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a person does in the studio, without the page: views, drawn boxes, and the actions.
+
+Every action returns a line that says what it did. What it refuses is a CliplocError.
+"""
+
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.checking.relocalization import sample_frames
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
+from cliploc_ros.studio.changes import EditError
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import Images
+from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio.picture import Outline, Pixel, box_at, draw, landmark_at, project
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.trials import Answer, relocalize
+
+Rgb = tuple[int, int, int]
+# Views of the whole recording that the relocalizer is asked in.
+_MAX_TRIALS = 100
+# Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
+_PALETTE: tuple[Rgb, ...] = (
+    (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75),
+    (0, 190, 190), (120, 190, 32), (70, 110, 255), (255, 110, 130))
+
+
+class Row(NamedTuple):
+    """A line of the table of landmarks."""
+
+    landmark_id: str
+    text: str
+    severity: float
+
+
+class Studio:
+    """The document and what surrounds it.
+
+    Parameters
+    ----------
+    document : Document
+    recording : Recording, optional
+        Views with boxes and poses.
+    images : Images, optional
+        The images of these views.
+    """
+
+    def __init__(self, document: Document, recording: Recording | None = None,
+                 images: Images | None = None):
+        self.document = document
+        self.recording = recording
+        self.view = 0
+        self.drawn: dict[int, tuple[float, float, float, float]] = {}
+        self.accepted: set[str] = set()
+        self._images = images
+        self._checks: dict[str, LandmarkCheck] = {}
+        #: The relocalizer's answers that are shown; an edit leaves them as they are.
+        self.answers: tuple[Answer, ...] = ()
+        self._counts: dict[str, int] = {}
+
+    # ---- views ----------------------------------------------------------------------------------
+
+    @property
+    def views(self) -> int:
+        """Return the number of views."""
+        return 0 if self.recording is None else len(self.recording.detections)
+
+    @property
+    def map_from_camera(self) -> NDArray[np.float64]:
+        """Return the pose (4, 4) of the selected view."""
+        pose: NDArray[np.float64] = self._recording().detections.map_from_camera[self.view]
+        return pose
+
+    def show_view(self, view: int) -> None:
+        """Select a view; a number beyond the last one selects the last one."""
+        self.view = max(0, min(int(view), self.views - 1))
+
+    def best_view(self) -> str:
+        """Select the view that shows the selected landmark largest, wholly in the image."""
+        landmark_id, landmark = self._one_selected()
+        detections = self._recording().detections
+        best, largest = None, 0.0
+        for view, pose in enumerate(detections.map_from_camera):
+            for one in project({landmark_id: landmark}, detections.camera, pose):
+                half = np.sqrt(one.ellipse[[2, 4]])
+                low, high = one.ellipse[:2] - half, one.ellipse[:2] + half
+                size = (detections.camera.width, detections.camera.height)
+                if low.min() >= 0.0 and (high <= size).all() and half.prod() > largest:
+                    best, largest = view, float(half.prod())
+        if best is None:
+            raise EditError(f'{landmark_id}: no view shows all of it')
+        self.view = best
+        return f'view {best} shows {landmark_id} largest'
+
+    def boxes_in_view(self) -> NDArray[np.float64]:
+        """Return the detector's boxes (n, 4) in the selected view [px]."""
+        detections = self._recording().detections
+        first, last = detections.frame_offsets[self.view:self.view + 2]
+        return detections.bboxes_xyxy[first:last]
+
+    def outlines(self) -> list[Outline]:
+        """Return the landmarks' outlines in the selected view, the nearest first."""
+        return project(self.document.landmarks, self._recording().detections.camera,
+                       self.map_from_camera)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return the selected view with boxes and outlines (h, w, 3), red first."""
+        detections = self._recording().detections
+        stamp_s = float(detections.stamps_s[self.view])
+        return draw(detections.camera, None if self._images is None else
+                    self._images.near(stamp_s), self.boxes_in_view(), self.drawn.get(self.view),
+                    self.outlines(),
+                    {key: color_of(one.class_id) for key, one in self.document.landmarks.items()},
+                    self.document.selection)
+
+    def _recording(self) -> Recording:
+        if self.recording is None:
+            raise EditError('there are no views: start the studio with --observations, or with '
+                            '--images and a TUM folder that has poses')
+        return self.recording
+
+    # ---- selection ------------------------------------------------------------------------------
+
+    def select_at(self, pixel: Pixel) -> str:
+        """Select the landmark whose outline in the view is around a pixel."""
+        found = landmark_at(self.outlines(), pixel)
+        self.document.select([] if found is None else [found])
+        return f'selected {found}' if found else 'nothing there'
+
+    def toggle(self, landmark_id: str) -> None:
+        """Add a landmark to the selection, or take it out."""
+        selection = self.document.selection
+        self.document.select([key for key in selection if key != landmark_id]
+                             if landmark_id in selection else [*selection, landmark_id])
+
+    def _selected(self) -> tuple[str, ...]:
+        if not self.document.selection:
+            raise EditError('select a landmark first')
+        return self.document.selection
+
+    def _one_selected(self) -> tuple[str, Landmark]:
+        if self.document.selected is None:
+            raise EditError('select exactly one landmark first')
+        return self.document.selected
+
+    def undo(self) -> None:
+        """Undo the last edit, if there is one."""
+        self.document.undo()
+
+    def redo(self) -> None:
+        """Do again what was undone last, if anything was."""
+        self.document.redo()
+
+    # ---- edits of the selection -----------------------------------------------------------------
+
+    def delete(self) -> str:
+        """Delete the selection."""
+        ids = self._selected()
+        self.document.apply(edits.delete(self.document.landmarks, ids))
+        return f'deleted {", ".join(ids)}'
+
+    def toggle_lock(self) -> str:
+        """Lock the selection; unlock it if all of it is locked."""
+        ids, landmarks = self._selected(), self.document.landmarks
+        if all(landmarks[key].is_locked for key in ids):
+            self.document.apply(edits.unlock(landmarks, ids))
+            return f'unlocked {", ".join(ids)}'
+        self.document.apply(edits.lock(landmarks, ids))
+        return f'locked {", ".join(ids)}'
+
+    def split(self) -> str:
+        """Split the selected landmark along its longest axis, and select both halves."""
+        landmark_id, _ = self._one_selected()
+        change = edits.split(self.document.landmarks, landmark_id)
+        self.document.apply(change)
+        self.document.select(change.after)
+        return f'split {landmark_id} into {" and ".join(change.after)}'
+
+    def merge(self) -> str:
+        """Merge the selection; its boxes decide the shape, or else the volumes."""
+        ids, landmarks = self._selected(), self.document.landmarks
+        change = edits.merge(landmarks, ids)
+        how = 'by volume'
+        if self.recording is not None:
+            merged = change.after[ids[0]]
+            assert merged is not None
+            try:
+                fit = self.recording.fit_together(landmarks, ids, merged.center, merged.basis)
+                change, how = edits.merge(landmarks, ids, (fit.center, fit.basis)), 'by boxes'
+            except EditError:
+                pass  # too few boxes
+        self.document.apply(change)
+        self.document.select([ids[0]])
+        return f'merged {", ".join(ids)} {how}'
+
+    def refit(self) -> str:
+        """Fit the selection to its boxes."""
+        return self._refit(self._selected())
+
+    def refit_all(self) -> str:
+        """Fit all unlocked landmarks to their boxes."""
+        return self._refit([key for key, one in self.document.landmarks.items()
+                            if not one.is_locked])
+
+    def _refit(self, landmark_ids: Sequence[str]) -> str:
+        landmarks = self.document.landmarks
+        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
+            raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
+        refit = self._recording().refit(landmarks, landmark_ids)
+        reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
+                   if reason is not None}
+        fitted = [key for key in landmark_ids if key not in reasons]
+        self.document.apply(edits.take_fits(landmarks, fitted, refit.landmark_map))
+        left_out = ''.join(f'; {key} {reason}' for key, reason in list(reasons.items())[:3])
+        return f'refitted {len(fitted)} of {len(landmark_ids)} landmarks{left_out}'
+
+    # ---- a landmark from boxes ------------------------------------------------------------------
+
+    def draw_box(self, corner: Pixel, other: Pixel) -> str:
+        """Draw a box in the selected view between two opposite corners (2,) [px]."""
+        camera = self._recording().detections.camera
+        size = np.array([camera.width, camera.height], dtype=np.float64)
+        low, high = (np.clip(select(np.asarray(corner), np.asarray(other)), 0.0, size)
+                     for select in (np.minimum, np.maximum))
+        if (high - low).min() < 4.0:
+            raise EditError('the box is smaller than 4 pixels; drag from corner to corner')
+        self.drawn[self.view] = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        return f'{len(self.drawn)} boxes drawn'
+
+    def take_box(self, pixel: Pixel) -> str:
+        """Take the detector's smallest box around a pixel (2,) as a drawn one."""
+        boxes = self.boxes_in_view()
+        row = box_at(boxes, pixel)
+        if row is None:
+            raise EditError('no box of the detector there; drag to draw one')
+        left, top, right, bottom = (float(value) for value in boxes[row])
+        self.drawn[self.view] = (left, top, right, bottom)
+        return f'{len(self.drawn)} boxes drawn'
+
+    def clear_boxes(self) -> str:
+        """Forget all drawn boxes."""
+        self.drawn.clear()
+        return 'no boxes drawn'
+
+    def create(self, label: str, class_id: str) -> str:
+        """Create a landmark from the drawn boxes, and select it."""
+        detections = self._recording().detections
+        fit = fit_boxes(detections.camera, [DrawnBox(detections.map_from_camera[view], box)
+                                            for view, box in sorted(self.drawn.items())])
+        change = edits.create(self.document.landmarks, label, class_id, fit.center, fit.basis)
+        self.document.apply(change)
+        self.document.select(change.after)
+        self.drawn.clear()
+        (landmark_id,) = change.after
+        return f'created {landmark_id}' + (f'; {fit.warning}' if fit.warning else '')
+
+    # ---- the table ------------------------------------------------------------------------------
+
+    def check(self) -> str:
+        """Judge all landmarks by the recording; the table then has the worst first."""
+        found = self._recording().check(self.document.landmarks)
+        self._checks = {one.landmark_id: one for one in found}
+        serious = sum(one.severity >= 1.0 for one in found)
+        return f'checked {len(found)} landmarks: {serious} with a serious fault'
+
+    def faults(self, landmark_id: str) -> tuple[str, ...]:
+        """Return what the last check found wrong with a landmark."""
+        return self._checks[landmark_id].faults if landmark_id in self._checks else ()
+
+    def rows(self, search: str = '') -> list[Row]:
+        """Return the table of landmarks whose id, label or class has a text, the worst first."""
+        wanted = search.casefold().split()
+        rows = []
+        for key, one in self.document.landmarks.items():
+            text = f'{key} · {one.label} · {one.class_id}'
+            if not wanted or all(word in text.casefold() for word in wanted):
+                is_open = key in self._checks and key not in self.accepted
+                severity = self._checks[key].severity if is_open else 0.0
+                rows.append(Row(key, ('🔒 ' if one.is_locked else '') + text, severity))
+        return sorted(rows, key=lambda row: -row.severity)
+
+    def accept(self) -> str:
+        """Accept the selection as it is, whatever the check says, and go on."""
+        self.accepted.update(self._selected())
+        return f'accepted {", ".join(self._selected())}; {self.select_next()}'
+
+    def select_next(self) -> str:
+        """Select the next landmark of the table."""
+        ids = [row.landmark_id for row in self.rows()]
+        if not ids:
+            raise EditError('there are no landmarks')
+        here = ids.index(self.document.selection[0]) if self.document.selection else -1
+        self.document.select([ids[(here + 1) % len(ids)]])
+        return f'selected {self.document.selection[0]}'
+
+    # ---- the relocalizer ------------------------------------------------------------------------
+
+    def relocalize_here(self) -> str:
+        """Ask the relocalizer in the selected view."""
+        self.answers = tuple(relocalize(self.document.landmarks, self._recording(), [self.view]))
+        return self.answers[0].text(self.document.to_map())
+
+    def relocalize_all(self) -> str:
+        """Ask in views along the trajectory, and compare with the time before."""
+        recording = self._recording()
+        views = sample_frames(self.views, _MAX_TRIALS).tolist()
+        self.answers = tuple(relocalize(self.document.landmarks, recording, views))
+        before = self._counts
+        self._counts = {verdict: sum(one.verdict == verdict for one in self.answers)
+                        for verdict in ('accepted', 'refused', 'wrong')}
+        counts = ', '.join(f'{count} {verdict}' + (f' (was {before[verdict]})' if before else '')
+                           for verdict, count in self._counts.items())
+        return f'{len(views)} views: {counts}; similarities are simulated'
+
+    def phrases(self) -> tuple[str, ...]:
+        """Return up to five phrases for the selected landmark: its own, then its class's."""
+        if self.document.selected is None:
+            return ()
+        _, one = self.document.selected
+        own = sorted(one.details.labels or (), key=lambda pair: -pair[1])
+        alike = [other.label for other in self.document.landmarks.values()
+                 if other.class_id == one.class_id and other.label != one.label]
+        return tuple(dict.fromkeys([text for text, _ in own] + alike))[:5]
+
+
+def color_of(class_id: str) -> Rgb:
+    """Return the colour of a class; equal in every session."""
+    return _PALETTE[zlib.crc32(class_id.encode()) % len(_PALETTE)]

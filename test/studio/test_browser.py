@@ -1,0 +1,277 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The studio in a real browser, which does what a person does."""
+
+import os
+import re
+import shutil
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import open_images, views_of_folder
+from cliploc_ros.studio.picture import project
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+pytestmark = pytest.mark.needs('viser', 'playwright', 'chromium')
+
+ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+# WebGL without a GPU. The sandbox needs privileges that root in a container lacks.
+OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
+           '--enable-unsafe-swiftshader')
+# Software rendering on a busy machine takes seconds a frame.
+TIMEOUT_S = 120.0
+
+
+def wait_for(condition, what):
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline, f'timed out: {what}'
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which('chromium'),
+                                              args=list(OPTIONS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / 'map.yaml'
+    shutil.copy(ASSETS / 'map.yaml', path)
+    return path
+
+
+@pytest.fixture
+def studio(path):
+    from cliploc_ros.studio.server import serve_studio
+
+    folder = ASSETS / 'sequence'
+    studio = Studio(Document(path), Recording(views_of_folder(folder)),
+                    open_images(folder, None))
+    with serve_studio(studio, '127.0.0.1', 0) as (studio.url, studio.server):
+        yield studio
+    studio.document.close()
+
+
+class Person:
+    """Who looks at the page."""
+
+    def __init__(self, chromium, url):
+        self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
+        self.page.set_default_timeout(TIMEOUT_S * 1000)
+        self.foreign = []
+        self.page.on('request', self.note)
+        self.page.goto(url)
+        self.page.get_by_text('landmarks in map').wait_for()
+
+    def note(self, request):
+        if not re.match(r'(http|ws)://127\.0\.0\.1:|data:|blob:', request.url):
+            self.foreign.append(request.url)
+
+    def click(self, name):
+        self.page.get_by_role('button', name=name).first.click()
+
+    def field(self, label, number=0):
+        """Return an input of the row with a label."""
+        row = self.page.get_by_text(label, exact=True).locator('xpath=../../..')
+        return row.locator('input:not([type=hidden])').nth(number)
+
+    def type(self, label, text, number=0):
+        field = self.field(label, number)
+        field.fill(text)
+        field.press('Enter')
+
+    def find(self, text):
+        self.field('Find').fill(text)
+
+    def picture(self, name):
+        """Keep a picture of the page where the environment names a folder for it."""
+        if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
+            self.page.screenshot(path=Path(folder) / f'{name}.png', timeout=TIMEOUT_S * 1000)
+
+
+@pytest.fixture
+def person(chromium, studio):
+    person = Person(chromium, studio.url)
+    yield person
+    person.page.close()
+    assert person.foreign == [], 'no request leaves the machine'
+
+
+def test_select_type_relabel_undo_save_reload(person, studio, path):
+    """The file holds exactly what a person typed, and every other line as it was."""
+    document, before = studio.document, path.read_text()
+    person.find('mug_2')
+    person.click(re.compile('^mug_2 '))
+    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    person.type('Position [m]', '5.5')
+    wait_for(lambda: document.landmarks['mug_2'].center[0] == 5.5, 'the position')
+    person.type('Label', 'a <b>green</b> mug & "brown" dots')
+    wait_for(lambda: '"brown"' in document.landmarks['mug_2'].label, 'the label')
+    person.type('Class', 'cup')
+    wait_for(lambda: document.landmarks['mug_2'].class_id == 'cup', 'the class')
+    person.picture('edited')
+    person.click(re.compile('^Undo'))
+    wait_for(lambda: document.landmarks['mug_2'].class_id == 'mug', 'undo')
+    assert path.read_text() == before
+    person.click('Save')
+    wait_for(lambda: document.is_saved, 'saving')
+    person.page.reload()
+    person.page.get_by_text('landmarks in map').wait_for()
+    person.page.wait_for_function("() => [...document.querySelectorAll('input')].some("
+                                  "input => input.value.includes('<b>green</b>'))")
+    lost = [line.strip() for line in before.splitlines()
+            if line not in path.read_text().splitlines()]
+    won = [line.strip() for line in path.read_text().splitlines()
+           if line not in before.splitlines()]
+    assert lost == ['label: a green mug with brown dots', 'center: [5.28825, 0.32457, 0.81462]']
+    assert won == ['label: "a <b>green</b> mug & \\"brown\\" dots"',
+                   'center: [5.5, 0.32457, 0.81462]']
+    assert LandmarkMap.from_file(path).labels[1] == 'a <b>green</b> mug & "brown" dots'
+
+
+def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
+    """A new object from three drawn boxes, a duplicate merged; another browser sees it all."""
+    document, truth = studio.document, studio.document.landmarks['mug_2']
+    second = Person(chromium, studio.url)
+    camera = studio.recording.detections.camera
+    poses = studio.recording.detections.map_from_camera
+    seen = [(view, outline[0].ellipse) for view, pose in enumerate(poses)
+            if (outline := project({'mug_2': truth}, camera, pose))]
+    directions = np.array([truth.center - poses[view][:3, 3] for view, _ in seen])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    far = np.unravel_index(np.argmin(directions @ directions.T), (len(seen), len(seen)))
+    person.find('mug_2')
+    person.click(re.compile('^mug_2 '))
+    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    person.click('Delete')
+    wait_for(lambda: 'mug_2' not in document.landmarks, 'deleting')
+    for view, ellipse in [seen[row] for row in (far[0], sum(far) // 2, far[1])]:
+        half = np.sqrt(ellipse[[2, 4]])
+        person.type('View', str(view))
+        wait_for(lambda view=view: studio.view == view, 'the view')
+        for label, corner in (('Left, top [px]', ellipse[:2] - half),
+                              ('Right, bottom [px]', ellipse[:2] + half)):
+            person.type(label, f'{corner[0]:.1f}')
+            person.type(label, f'{corner[1]:.1f}', 1)
+        person.click('Draw this box')
+        wait_for(lambda view=view: view in studio.drawn, 'the box')
+    person.type('New label', 'a green mug')
+    person.type('New class', 'mug')
+    person.picture('boxes')
+    person.click(re.compile('^Create landmark from 3'))
+    wait_for(lambda: document.selection == ('mug_2',), 'the new landmark')
+    made = document.landmarks['mug_2']
+    assert np.linalg.norm(made.center - truth.center) < 0.05
+    assert np.allclose(np.sort(made.semi_axes), np.sort(truth.semi_axes), rtol=0.5)
+    second.page.get_by_text('60 landmarks in map, 1 selected').wait_for()
+    person.click('Split')
+    wait_for(lambda: len(document.selection) == 2, 'both halves')
+    second.click('Merge')
+    wait_for(lambda: document.selection == ('mug_2',), 'merging')
+    second.click('Save')
+    wait_for(lambda: document.is_saved, 'saving')
+    person.page.get_by_text(f'{path.name}: saved').wait_for()
+    assert set(LandmarkMap.from_file(path).landmark_ids) == set(
+        LandmarkMap.from_file(ASSETS / 'map.yaml').landmark_ids)
+    second.page.close()
+
+
+def on_screen(person, server, point):
+    """Return the pixel of the page at which a point (3,) of the map is."""
+    camera = next(iter(server.get_clients().values())).camera
+    canvas = person.page.locator('canvas').first.bounding_box()
+    right, down, forward = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix().T
+    offset = np.asarray(point) - camera.position
+    focal = canvas['height'] / 2 / np.tan(camera.fov / 2) / (offset @ forward)
+    return (canvas['x'] + canvas['width'] / 2 + focal * (offset @ right),
+            canvas['y'] + canvas['height'] / 2 + focal * (offset @ down))
+
+
+def drag(person, start, end):
+    person.page.mouse.move(*start)
+    person.page.mouse.down()
+    person.page.mouse.move(*(0.5 * np.add(start, end)), steps=4)
+    person.page.mouse.move(*end, steps=4)
+
+
+def test_a_box_is_dragged_on_the_image(person, studio):
+    server = studio.server
+    camera = next(iter(server.get_clients().values())).camera
+    person.page.get_by_role('button', name='Look through this view').click()
+    pose = studio.map_from_camera
+    wait_for(lambda: np.allclose(camera.position, pose[:3, 3], atol=1e-3), 'looking through')
+    person.field('Draw boxes').check()
+    intrinsics = studio.recording.detections.camera
+    pixels = np.array([[300.0, 200.0], [360.0, 290.0]])
+    rays = np.column_stack([(pixels - (intrinsics.cx, intrinsics.cy))
+                            / (intrinsics.fx, intrinsics.fy), np.ones(2)])
+    corners = [on_screen(person, server, pose[:3, :3] @ ray + pose[:3, 3]) for ray in rays]
+    drag(person, *corners)
+    person.page.mouse.up()
+    wait_for(lambda: 0 in studio.drawn, 'the box')
+    assert np.allclose(studio.drawn[0], pixels.ravel(), atol=8.0)
+    person.picture('drawn')
+
+
+def test_the_gizmo_is_dragged(person, studio):
+    """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
+    document, server = studio.document, studio.server
+    person.find('mug_2')
+    person.click(re.compile('^mug_2 '))
+    before = document.landmarks['mug_2']
+    camera = next(iter(server.get_clients().values())).camera
+    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'looking at it')
+    near = before.center + np.array([-0.9, -0.9, 0.7])
+    camera.position, camera.look_at = near, before.center
+    # the camera reports where it is: another report shows that the browser moved it
+    person.page.mouse.wheel(0, 1)
+    wait_for(lambda: np.linalg.norm(camera.position - near) < 0.2, 'coming near')
+    person.picture('gizmo')
+    up = np.array([0.0, 0.0, 1.0])
+    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.3, 0.5))
+    drag(person, grip, goal)
+    wait_for(lambda: document.landmarks['mug_2'].center[2] > before.center[2] + 0.1, 'the drag')
+    person.page.mouse.up()
+    person.picture('dragged')
+    moved = document.landmarks['mug_2'].center - before.center
+    assert abs(moved[2] - 0.2) < 0.08 and np.abs(moved[:2]).max() < 1e-3
+    person.click(re.compile('^Undo'))
+    wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
+    assert document.to_undo is None
+
+
+def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
+    person.click('Export as one page')
+    exported = path.with_suffix('.html')
+    wait_for(exported.is_file, 'the export')
+    page = chromium.new_page(viewport={'width': 600, 'height': 400})
+    foreign = []
+    page.on('request', lambda request: foreign.append(request.url) if request.url.startswith(
+        ('http', 'ws')) else None)
+    page.goto(exported.as_uri())
+
+    def shows_colours():
+        image = cv2.imdecode(np.frombuffer(page.screenshot(timeout=TIMEOUT_S * 1000), np.uint8),
+                             cv2.IMREAD_COLOR).astype(int)
+        return ((image.max(axis=2) - image.min(axis=2)) > 60).mean() > 0.005
+
+    wait_for(shows_colours, 'the ellipsoids')
+    if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
+        page.screenshot(path=Path(folder) / 'exported.png', timeout=TIMEOUT_S * 1000)
+    assert foreign == []
+    page.close()

@@ -1,0 +1,378 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The document of the map studio: edits, undo, saving and the journal; no browser."""
+
+import json
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from studio_map import TEXT
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.parameter_file import read_parameter_file
+from cliploc_ros.errors import CliplocError, DatasetError, MapError
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.changes import EditError
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.map_source import ChangedOnDiskError
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / 'office.yaml'
+    path.write_text(TEXT)
+    return path
+
+
+def changed_lines(path, text=TEXT):
+    """Return the lines that the file has lost and won, without their indentation."""
+    old, new = text.splitlines(), path.read_text().splitlines()
+    return ([line.strip() for line in old if line not in new],
+            [line.strip() for line in new if line not in old])
+
+
+def test_an_edit_changes_its_line_only(path):
+    document = Document(path)
+    document.apply(edits.move(document.landmarks, 'cup_1', [1.25, 2, 0.5]))
+    document.save()
+    assert changed_lines(path) == (['center: [1.0, 2.0, 0.5]   # from the plan'],
+                                   ['center: [1.25, 2.0, 0.5]   # from the plan'])
+    assert LandmarkMap.from_file(path).centers[0].tolist() == [1.25, 2.0, 0.5]
+
+
+def test_saving_without_an_edit_changes_no_character(path):
+    document = Document(path)
+    document.save()
+    assert path.read_text() == TEXT
+
+
+def test_all_kinds_of_lines(path):
+    """A list over several lines, a folded text, a new field, and one that goes."""
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['book_1', 'plant_1'], 'yes: "no" # <b>'))
+    document.apply(edits.move(document.landmarks, 'book_1', [0, 0, 1e-6]))
+    document.apply(edits.reclass(document.landmarks, ['book_1'], 'off'))
+    document.save()
+    found = LandmarkMap.from_file(path)
+    assert found.labels == ('a red cup', 'yes: "no" # <b>', 'yes: "no" # <b>')
+    assert found.class_ids == ('cup', 'off', 'plant')
+    assert found.centers[1].tolist() == [0.0, 0.0, 1e-6]
+    assert found.details == ()
+    text = path.read_text()
+    assert '# the red one' in text and "# Ann's" in text and '# Hz' in text
+    assert read_parameter_file(path)['other_node'] == {'ros__parameters': {'rate': 5.0}}
+
+
+def test_a_comment_goes_with_its_landmark(path):
+    document = Document(path)
+    document.apply(edits.delete(document.landmarks, ['book_1']))
+    document.save()
+    text = path.read_text()
+    assert '# shelf' not in text and '# the red one' in text
+    assert LandmarkMap.from_file(path).landmark_ids == ('cup_1', 'plant_1')
+
+
+def test_new_landmarks_follow_the_last_one(path):
+    document = Document(path)
+    change = edits.create(document.landmarks, 'a lamp', 'floor lamp', np.ones(3), np.eye(3))
+    document.apply(change)
+    document.apply(edits.split(document.landmarks, 'plant_1'))
+    document.save()
+    assert list(change.after) == ['floor_lamp_1']
+    assert LandmarkMap.from_file(path).landmark_ids == (
+        'cup_1', 'book_1', 'plant_1', 'floor_lamp_1', 'plant_2')
+    lost, _ = changed_lines(path)
+    assert lost == ['center: [3.0, 2.0, 0.5]', 'semi_axes: [0.1, 0.15, 0.3]'] or all(
+        'map_file' not in line for line in lost)
+    assert "map_file: ''  # the relocalizer's own" in path.read_text()
+
+
+def test_unknown_fields_stay_and_the_relocalizer_refuses_them(path):
+    text = TEXT.replace('class_id: cup', 'class_id: cup\n          colour: {name: red, rgb: [1]}')
+    path.write_text(text)
+    document = Document(path)
+    assert any("'colour'" in note and 'refuses' in note for note in document.notes)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'a cup'))
+    document.save()
+    assert 'colour: {name: red, rgb: [1]}' in path.read_text()
+    with pytest.raises(MapError, match='unknown field: colour'):
+        LandmarkMap.from_file(path)
+
+
+@pytest.mark.parametrize('text', [
+    '/**: {ros__parameters: {map: {frame_id: m, landmarks: {a: {label: x, class_id: c, center: '
+    '[0, 0, 0], semi_axes: [1, 1, 1], orientation: [0, 0, 0, 1], note: "é"}}}}}',
+    json.dumps({'/**': {'ros__parameters': {'map': {'frame_id': 'm', 'landmarks': {
+        'a': {'label': 'x', 'class_id': 'c', 'center': [0, 0, 0], 'semi_axes': [1, 1, 1],
+              'orientation': [0, 0, 0, 1], 'note': 'é'}}}}}}, indent=1)])
+def test_maps_in_braces(tmp_path, text):
+    path = tmp_path / 'map.yaml'
+    path.write_text(text)
+    document = Document(path)
+    document.apply(edits.create(document.landmarks, 'two', 'c', np.ones(3), np.eye(3)))
+    document.apply(edits.delete(document.landmarks, ['a']))
+    document.apply(edits.create(document.landmarks, 'three', 'c', np.ones(3), np.eye(3)))
+    document.undo()
+    document.undo()
+    document.save()
+    tree = read_parameter_file(path)['/**']['ros__parameters']['map']['landmarks']
+    assert list(tree) == ['a', 'c_1'] and tree['a']['note'] == 'é'
+
+
+def test_windows_line_ends(tmp_path):
+    path = tmp_path / 'map.yaml'
+    path.write_bytes(TEXT.replace('\n', '\r\n').encode())
+    document = Document(path)
+    document.apply(edits.split(document.landmarks, 'cup_1'))
+    document.save()
+    content = path.read_bytes()
+    assert content.count(b'\r\n') == content.count(b'\n')
+    assert b"# Ann's\r\n" in content
+    assert len(LandmarkMap.from_file(path)) == 4
+
+
+def test_every_edit_is_undone_and_done_again(path):
+    document = Document(path)
+    states = [document.landmarks]
+    for edit in (lambda all: edits.move(all, 'cup_1', [9, 9, 9]),
+                 lambda all: edits.rotate(all, 'cup_1', [0, 0, 2, 2]),
+                 lambda all: edits.place(all, 'cup_1', np.ones(3), np.array([0, 0, 0, 1.0])),
+                 lambda all: edits.set_axes(all, 'cup_1', [1, 2, 3]),
+                 lambda all: edits.relabel(all, list(all), 'same'),
+                 lambda all: edits.reclass(all, ['cup_1'], 'mug'),
+                 lambda all: edits.split(all, 'book_1'),
+                 lambda all: edits.merge(all, ['book_1', 'book_2', 'cup_1']),
+                 lambda all: edits.lock(all, ['plant_1']),
+                 lambda all: edits.unlock(all, ['plant_1']),
+                 lambda all: edits.delete(all, ['plant_1', 'book_1'])):
+        document.apply(edit(document.landmarks))
+        assert document.landmarks != states[-1]
+        states.append(document.landmarks)
+    for state in states[-2::-1]:
+        assert document.undo()
+        assert document.landmarks == state
+    assert not document.undo() and document.is_saved
+    for state in states[1:]:
+        assert document.redo()
+        assert document.landmarks == state
+    assert not document.redo()
+
+
+def test_a_drag_is_one_edit(path):
+    document = Document(path)
+    for x in range(5):
+        document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag 1')
+    document.apply(edits.move(document.landmarks, 'cup_1', [7, 0, 0]), gesture='drag 2')
+    document.undo()
+    assert document.landmarks['cup_1'].center.tolist() == [4, 0, 0]
+    document.undo()
+    assert document.landmarks['cup_1'].center.tolist() == [1, 2, 0.5]
+    assert not document.undo()
+
+
+@pytest.mark.parametrize(('edit', 'message'), [
+    (lambda all: edits.move(all, 'cup_1', [float('nan'), 0, 0]), 'not finite'),
+    (lambda all: edits.move(all, 'cup_1', [1e9, 0, 0]), 'beyond'),
+    (lambda all: edits.rotate(all, 'cup_1', [0, 0, 0, 0]), 'no direction'),
+    (lambda all: edits.set_axes(all, 'cup_1', [0.1, 0.1, 0]), 'at least 0.001 m'),
+    (lambda all: edits.set_axes(all, 'cup_1', [0.1, 0.1, float('nan')]), 'at least|not finite'),
+    (lambda all: edits.relabel(all, ['cup_1'], '  '), 'non-empty'),
+    (lambda all: edits.relabel(all, ['cup_1'], 'x' * 100_000), 'longer than 1000'),
+    (lambda all: edits.delete(all, ['sofa']), "no landmark 'sofa'"),
+    (lambda all: edits.merge(all, ['cup_1', 'cup_1']), 'two landmarks or more'),
+])
+def test_what_no_map_may_hold_is_refused(path, edit, message):
+    document = Document(path)
+    with pytest.raises(CliplocError, match=message):
+        document.apply(edit(document.landmarks))
+    assert document.is_saved and document.to_undo is None
+
+
+def test_a_locked_landmark_is_not_edited(path):
+    document = Document(path)
+    document.apply(edits.lock(document.landmarks, ['cup_1']))
+    for edit in (lambda all: edits.move(all, 'cup_1', [0, 0, 0]),
+                 lambda all: edits.delete(all, ['cup_1']),
+                 lambda all: edits.merge(all, ['book_1', 'cup_1'])):
+        with pytest.raises(EditError, match="'cup_1' is locked"):
+            edit(document.landmarks)
+    assert document.is_saved, 'a lock is not in the map file'
+    document.save()
+    document.close()
+    assert Document(path).landmarks['cup_1'].is_locked, 'but the journal keeps it'
+
+
+def test_a_moved_landmark_has_no_measured_uncertainty(path):
+    document = Document(path)
+    document.apply(edits.move(document.landmarks, 'book_1', [0, 0, 0]))
+    assert 'position_sigma' not in document.landmarks['book_1'].fields
+    document.undo()
+    document.save()
+    assert path.read_text() == TEXT
+
+
+def test_merging_halves_gives_back_the_whole(path):
+    """The halves of a split lie in the whole; their union's moments are near its moments."""
+    document = Document(path)
+    whole = document.landmarks['plant_1']
+    document.apply(edits.split(document.landmarks, 'plant_1'))
+    first, second = (document.landmarks[key] for key in ('plant_1', 'plant_2'))
+    assert np.allclose(0.5 * (first.center + second.center), whole.center)
+    assert np.isclose(first.volume + second.volume, whole.volume, rtol=1e-4)
+    document.apply(edits.merge(document.landmarks, ['plant_1', 'plant_2']))
+    merged = document.landmarks['plant_1']
+    assert np.allclose(merged.center, whole.center, atol=1e-5)
+    # S_zz = .15^2 + 5 * .15^2, hand-computed; x and y stay
+    squares = np.sort(np.linalg.eigvalsh(merged.basis @ merged.basis.T))
+    assert np.allclose(squares, [0.1**2, 0.15**2, 6 * 0.15**2], rtol=1e-4)
+
+
+def test_equal_landmarks_merge_to_themselves(path):
+    document = Document(path)
+    quat = Rotation.from_euler('xyz', [0.3, 0.2, 0.1]).as_quat()
+    document.apply(edits.rotate(document.landmarks, 'plant_1', quat))
+    one = document.landmarks['plant_1']
+    change = edits.create(document.landmarks, 'copy', 'plant', one.center, one.basis)
+    document.apply(change)
+    document.apply(edits.merge(document.landmarks, ['plant_1', *change.after]))
+    merged = document.landmarks['plant_1']
+    assert np.allclose(merged.basis @ merged.basis.T, one.basis @ one.basis.T, atol=1e-6)
+
+
+# ---- the file on the disk
+
+def test_a_file_that_changed_on_disk_is_not_overwritten(path):
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    theirs = TEXT.replace('a red cup', 'theirs')
+    path.write_text(theirs)
+    with pytest.raises(ChangedOnDiskError, match='another program') as refused:
+        document.save()
+    assert path.read_text() == theirs
+    path.write_text(theirs.replace('theirs', 'theirs again'))
+    with pytest.raises(ChangedOnDiskError) as refused_again:
+        document.save(over=refused.value.found)
+    document.save(over=refused_again.value.found)
+    assert LandmarkMap.from_file(path).labels[0] == 'mine'
+
+
+def test_reloading_is_an_edit(path):
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    document.apply(edits.delete(document.landmarks, ['book_1']))
+    path.write_text(TEXT.replace('a red cup', 'theirs'))
+    document.reload()
+    assert document.is_saved
+    assert document.landmarks['cup_1'].label == 'theirs'
+    assert set(document.landmarks) == {'cup_1', 'book_1', 'plant_1'}
+    document.undo()
+    assert document.landmarks['cup_1'].label == 'mine' and 'book_1' not in document.landmarks
+
+
+def test_an_empty_map_is_not_saved(path):
+    document = Document(path)
+    document.apply(edits.delete(document.landmarks, list(document.landmarks)))
+    with pytest.raises(EditError, match='without landmarks'):
+        document.save()
+    assert path.read_text() == TEXT
+
+
+def test_a_new_map_starts_empty(tmp_path):
+    path = tmp_path / 'new.yaml'
+    document = Document(path)
+    assert not document.landmarks and not path.exists()
+    document.apply(edits.create(document.landmarks, 'no', 'on', np.zeros(3), 0.1 * np.eye(3)))
+    document.save()
+    found = LandmarkMap.from_file(path)
+    assert (found.landmark_ids, found.labels, found.class_ids) == (('on_1',), ('no',), ('on',))
+    document.close()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_two_studios_do_not_edit_one_map(path):
+    first = Document(path)
+    with pytest.raises(DatasetError, match='another studio'):
+        Document(path)
+    first.close()
+    Document(path).close()
+
+
+@pytest.mark.parametrize('text', ['', '{', 'a: [1, 2', '/**: {ros__parameters: {map: 3}}',
+                                  '/**: {ros__parameters: {map: {frame_id: m, landmarks: [1]}}}',
+                                  '/**: {ros__parameters: {map: {frame_id: m, landmarks: {a: }}}}',
+                                  TEXT.replace('[1.0, 2.0, 0.5]', '[1.0, .nan, 0.5]'),
+                                  TEXT.replace("'a red cup'", 'x' * 100_000),
+                                  TEXT.replace('class_id: cup', 'class_id: {}')])
+def test_hostile_maps_end_in_a_message(path, text):
+    path.write_text(text)
+    with pytest.raises(MapError, match=r'office\.yaml'):
+        Document(path)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def act(document, action, number):
+    """Do one thing of a random session; return the document, which may be another one."""
+    ids, landmarks = list(document.landmarks), document.landmarks
+    if action in ('undo', 'redo', 'save'):
+        getattr(document, action)()
+    elif action == 'reopen':
+        document.close()
+        document = Document(document.path)
+        assert document.landmarks == landmarks
+    elif ids:
+        one = ids[number % len(ids)]
+        document.apply({
+            'move': lambda: edits.move(landmarks, one, [number, 1 / 3, -number]),
+            'split': lambda: edits.split(landmarks, one),
+            'delete': lambda: edits.delete(landmarks, [one]),
+            'label': lambda: edits.relabel(landmarks, [one], f"label '{number}': #é\\n"),
+            'merge': lambda: edits.merge(landmarks, ids[:2]),
+        }[action]())
+    return document
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(st.sampled_from(['move', 'split', 'delete', 'undo', 'redo', 'save',
+                                           'label', 'merge', 'reopen']),
+                          st.integers(0, 50)), max_size=12))
+def test_any_session_ends_as_its_file_says(tmp_path_factory, session):
+    path = tmp_path_factory.mktemp('any') / 'office.yaml'
+    path.write_text(TEXT)
+    document = Document(path)
+    for action, number in session:
+        with suppress(EditError):
+            document = act(document, action, number)
+    if document.landmarks:
+        document.save()
+        tree = read_parameter_file(path)['/**']['ros__parameters']['map']['landmarks']
+        assert tree == {key: dict(one.fields) for key, one in document.landmarks.items()}
+    document.close()
+
+
+def test_five_thousand_landmarks(tmp_path):
+    """Prints how long a large map takes to open, to edit and to save."""
+    path = tmp_path / 'large.yaml'
+    lines = TEXT[:TEXT.index('        # the red one')]
+    lines += ''.join(f'        id_{n}:\n          label: "object {n}"\n          class_id: cup\n'
+                     f'          center: [{n}.0, 0.5, 0.25]  # measured\n'
+                     '          semi_axes: [0.1, 0.1, 0.1]\n'
+                     '          orientation: [0.0, 0.0, 0.0, 1.0]\n' for n in range(5000))
+    path.write_text(lines)
+    times = [time.process_time()]
+    document = Document(path)
+    times.append(time.process_time())
+    document.apply(edits.move(document.landmarks, 'id_7', [0, 0, 0]))
+    times.append(time.process_time())
+    document.apply(edits.delete(document.landmarks, ['id_8']))
+    document.save()
+    times.append(time.process_time())
+    print('5,000 landmarks, processor time: '
+          + ', '.join(f'{name} {seconds:.3f} s' for name, seconds in
+                      zip(('open', 'edit', 'save'), np.diff(times), strict=True)))
+    assert path.read_text().count('# measured') == 4999
+    document.close()

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks from boxes in two or three views, on real boxes of the shared office."""
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.evidence import group_boxes, ious_with
+from cliploc_ros.mapping.landmarks import landmarks_of_map
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.projection import project_box
+from cliploc_ros.mapping.views import camera_centers, make_views
+from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
+from cliploc_ros.studio.changes import EditError
+
+TRIALS_PER_LANDMARK = 6
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    folder = shared_data / 'tum_fr3_office'
+    detections = load_observations(folder / 'observations.npz')
+    views = make_views(detections, MappingOptions())
+    landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
+    landmarks = landmarks_of_map(landmark_map, detections.class_names)
+    return detections, views, landmarks, associate(views, landmarks, 0.2)
+
+
+def draw_triple(directions, rng):
+    """Return three rows whose directions are 25 to 90 degrees apart, or None."""
+    for _ in range(200):
+        rows = rng.choice(len(directions), 3, replace=False)
+        cosines = (directions[rows] @ directions[rows].T)[np.triu_indices(3, 1)]
+        angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        if angles.min() >= 25 and angles.max() <= 90:
+            return rows
+    return None
+
+
+def draw_boxes(office, script, rng):
+    """Yield three boxes of one landmark and the rows of its other views.
+
+    The script tells which rows may be drawn, and what is drawn in a row.
+    """
+    detections, views, landmarks, shown = office
+    for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
+        rows = rows[~views.is_open[rows].any(axis=1)]
+        if len(rows) < 30:
+            continue
+        offsets = landmarks.centers[number] - camera_centers(views, views.frames[rows])
+        directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+        center, basis = landmarks.centers[number], landmarks.bases[number]
+        drawable = np.nonzero(ious_with(views, rows, center, basis) >= script['min_iou'])[0]
+        for _ in range(TRIALS_PER_LANDMARK):
+            triple = draw_triple(directions[drawable], rng) if len(drawable) > 2 else None
+            if triple is None:
+                break
+            drawn = rows[drawable[triple]]
+            yield [DrawnBox(detections.map_from_camera[views.frames[row]],
+                            script['draw'](row, center, basis)) for row in drawn], np.setdiff1d(
+                                rows, drawn)
+
+
+def iou_in_other_views(office, script):
+    detections, views = office[:2]
+    medians = []
+    for boxes, others in draw_boxes(office, script, np.random.default_rng(0)):
+        fit = fit_boxes(detections.camera, boxes)
+        assert fit.warning == ''
+        medians.append(np.median(ious_with(views, others, fit.center, fit.basis)))
+    return np.array(medians)
+
+
+@pytest.mark.parametrize(('name', 'least'), [
+    ('any box of the detector', 0.70),
+    ('its boxes that fit the landmark (IoU .8)', 0.73),
+    ('simulated: a person is off by 3 % of the box on each edge', 0.75)])
+def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, least):
+    """The figure is taken on the detector's own boxes, and these have .79 with the map itself."""
+    detections, views = office[:2]
+    rng = np.random.default_rng(1)
+
+    def as_detected(row, center, basis):
+        return tuple(detections.bboxes_xyxy[row])
+
+    def as_person(row, center, basis):
+        frame, box, camera = views.frames[row], np.empty(4), detections.camera
+        assert project_box(views.rotations[frame], views.translations[frame], center, basis, box)
+        edges = box * np.tile([camera.fx, camera.fy], 2) + np.tile([camera.cx, camera.cy], 2)
+        extents = np.tile(edges[2:] - edges[:2], 2)
+        return tuple(edges + rng.normal(0.0, 0.03, 4) * extents)
+
+    medians = iou_in_other_views(office, {
+        'min_iou': 0.8 if 'fit' in name else 0.2,
+        'draw': as_person if 'simulated' in name else as_detected})
+    print(f'three boxes, {name}: {len(medians)} landmarks, median IoU in other views '
+          f'{np.median(medians):.3f}, quartiles {np.quantile(medians, [.25, .75]).round(3)}')
+    assert len(medians) > 60
+    assert np.median(medians) >= least
+
+
+def test_views_that_look_alike_are_warned_of(office):
+    detections, views, landmarks, shown = office
+    rows = group_boxes(shown, len(landmarks.centers))[0]
+    boxes = [DrawnBox(detections.map_from_camera[views.frames[row]],
+                      tuple(detections.bboxes_xyxy[row])) for row in rows[:3]]
+    assert 'degrees apart' in fit_boxes(detections.camera, boxes).warning
+
+
+def test_what_is_no_object_is_refused():
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    here, there = np.eye(4), np.eye(4)
+    there[0, 3] = 1.0
+    box = DrawnBox(here, (300.0, 220.0, 340.0, 260.0))
+    with pytest.raises(EditError, match='1 boxes drawn'):
+        fit_boxes(camera, [box])
+    with pytest.raises(EditError, match='smaller than 4 pixels'):
+        fit_boxes(camera, [box, DrawnBox(there, (10.0, 10.0, 12.0, 50.0))])
+    with pytest.raises(EditError, match='along one line'):
+        fit_boxes(camera, [box, box])
+    with pytest.raises(EditError, match='behind a camera'):
+        fit_boxes(camera, [box, DrawnBox(there, (500.0, 220.0, 540.0, 260.0))])

@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The studio's actions and its gate, without a browser."""
+
+import resource
+import shutil
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.changes import EditError
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import open_images, views_of_folder
+from cliploc_ros.studio.picture import landmark_at
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+
+
+@pytest.fixture
+def studio(tmp_path):
+    """The demo's map with its walk: images and poses, no boxes."""
+    path = tmp_path / 'map.yaml'
+    shutil.copy(ASSETS / 'map.yaml', path)
+    folder = ASSETS / 'sequence'
+    studio = Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+    yield studio
+    studio.document.close()
+
+
+@pytest.fixture
+def office(tmp_path, shared_data):
+    """The shared office with its boxes; no images."""
+    folder = shared_data / 'tum_fr3_office'
+    path = tmp_path / 'map.yaml'
+    shutil.copy(folder / 'map.yaml', path)
+    detections = load_observations(folder / 'observations.npz')
+    studio = Studio(Document(path), Recording(detections.select_frames(range(0, 2583, 80))))
+    yield studio
+    studio.document.close()
+
+
+def test_the_picture_shows_the_image_with_its_landmarks(studio):
+    studio.show_view(3)
+    plain = studio._images.near(float(studio.recording.detections.stamps_s[3]))
+    outlines = studio.outlines()
+    assert outlines and studio.picture().shape == plain.shape
+    assert (studio.picture() != plain).any() and (studio.picture() == plain).mean() > 0.8
+    one = outlines[0]
+    assert landmark_at([one], one.ellipse[:2]) == one.landmark_id
+    assert landmark_at([one], one.ellipse[:2] + 1.1 * np.sqrt(one.ellipse[[2, 4]])) is None
+    studio.select_at(one.ellipse[:2])
+    assert studio.document.selection
+    studio.select_at((-50.0, -50.0))
+    assert not studio.document.selection
+
+
+def test_the_best_view_shows_the_landmark(studio):
+    studio.document.select(['mug_1'])
+    studio.best_view()
+    assert 'mug_1' in [one.landmark_id for one in studio.outlines()]
+
+
+def test_moved_landmarks_come_back_by_refitting(office):
+    document = office.document
+    office.refit_all()
+    fitted = document.landmarks
+    moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
+    document.apply(edits.lock(fitted, ['book_1']))
+    for key in moved:
+        one = document.landmarks[key]
+        document.apply(edits.move(document.landmarks, key, one.center + 0.3 * one.semi_axes))
+    document.select(moved)
+    office.refit()
+    for key in moved:
+        assert np.linalg.norm(document.landmarks[key].center - fitted[key].center) < 0.01
+    assert document.landmarks['book_1'].fields == fitted['book_1'].fields
+    document.undo()
+    assert document.landmarks[moved[0]].center.tolist() != fitted[moved[0]].center.tolist()
+
+
+def test_merging_with_boxes_fits_the_boxes_of_both(office):
+    document = office.document
+    office.refit_all()
+    whole = document.landmarks['tv_1']
+    document.select(['tv_1'])
+    office.split()
+    assert len(document.selection) == 2
+    assert office.merge().endswith('by boxes')
+    merged = document.landmarks['tv_1']
+    assert document.selection == ('tv_1',)
+    assert np.linalg.norm(merged.center - whole.center) < 0.25 * whole.semi_axes.max()
+
+
+def test_the_table_has_the_worst_first(office):
+    document = office.document
+    document.apply(edits.move(document.landmarks, 'tv_1', [9.0, 9.0, 9.0]))
+    assert 'serious' in office.check()
+    rows = office.rows()
+    assert rows[0].severity >= rows[-1].severity and len(rows) == len(document.landmarks)
+    assert next(row for row in rows if row.landmark_id == 'tv_1').severity > 0.0
+    assert office.faults('tv_1')
+    document.select([rows[0].landmark_id])
+    office.accept()
+    assert office.rows()[-1].severity == 0.0
+    assert rows[0].landmark_id not in [row.landmark_id for row in office.rows()[:1]]
+    assert [row.landmark_id for row in office.rows('TV_1')] == ['tv_1']
+
+
+def test_without_a_recording_the_studio_says_what_is_missing(tmp_path):
+    studio = Studio(Document(tmp_path / 'map.yaml'))
+    for action in (studio.refit_all, studio.check, studio.picture, studio.boxes_in_view):
+        with pytest.raises(EditError, match='--observations'):
+            action()
+    for action in (studio.delete, studio.merge, studio.split, studio.toggle_lock):
+        with pytest.raises(EditError, match='select'):
+            action()
+    assert studio.rows() == [] and studio.phrases() == ()
+    studio.document.close()
+
+
+def test_a_box_of_the_detector_is_taken(office):
+    view = int(np.argmax(np.diff(office.recording.detections.frame_offsets)))
+    office.show_view(view)
+    box = office.boxes_in_view()[0]
+    office.take_box((box[:2] + box[2:]) / 2)
+    assert office.drawn[view] in [tuple(one) for one in office.boxes_in_view()]
+    with pytest.raises(EditError, match='no box'):
+        office.take_box((-1.0, -1.0))
+
+
+def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
+    document = office.document
+    before = office.relocalize_all()
+    accepted = sum(one.verdict == 'accepted' for one in office.answers)
+    assert 'simulated' in before and '(was' not in before and accepted > 10
+    accepted_view = next(one.view for one in office.answers if one.verdict == 'accepted')
+    office.show_view(accepted_view)
+    assert f'view {accepted_view}: accepted' in office.relocalize_here()
+    assert len(office.answers) == 1 and office.answers[0].error_m < 1.0
+    document.select(list(document.landmarks)[::2])
+    office.delete()
+    after = office.relocalize_all()
+    assert f'(was {accepted})' in after
+    assert sum(one.verdict == 'accepted' for one in office.answers) < accepted
+    print(f'as given: {before}; every other landmark deleted: {after}')
+
+
+@pytest.mark.parametrize('folder', ['missing', '.'])
+def test_images_that_are_none(tmp_path, folder):
+    from cliploc_ros.datasets.bag_frames import BagTopics
+
+    with pytest.raises(CliplocError):
+        open_images(tmp_path / folder, BagTopics())
+
+
+@pytest.mark.needs('viser')
+def test_a_large_map_with_many_views(tmp_path):
+    """Prints the processor time of the server's side: 5,000 landmarks, 1,000 views."""
+    from cliploc_ros.studio.server import serve_studio
+
+    rng = np.random.default_rng(0)
+    path = tmp_path / 'map.yaml'
+    count = 5000
+    write_map(path, LandmarkMap(
+        'map', tuple(f'id_{number}' for number in range(count)), ('a cup',) * count,
+        ('cup',) * count, rng.uniform(-30, 30, (count, 3)) * (1, 1, 0.05),
+        np.full((count, 3), 0.1), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    one = views_of_folder(ASSETS / 'sequence')
+    views = one.select_frames(np.arange(1000) % len(one))
+    times = [time.process_time()]
+    studio = Studio(Document(path), Recording(views))
+    with serve_studio(studio, '127.0.0.1', 0):
+        times.append(time.process_time())
+        for step in range(5):
+            here = studio.document.landmarks['id_7'].center
+            studio.document.apply(edits.move(studio.document.landmarks, 'id_7', here + 0.01),
+                                  gesture='drag')
+            assert studio.picture().any(), step
+        times.append(time.process_time())
+    opened_s, dragged_s = np.diff(times)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f'{count} landmarks, 1000 views: open {opened_s:.2f} s, one step of a drag with its '
+          f'picture {dragged_s / 5 * 1000:.0f} ms; peak memory of the whole test process '
+          f'{peak_mb:.0f} MB')
+    studio.document.close()
+
+
+# ---- who may open the page
+
+def answer(url, **headers):
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers),
+                                    timeout=30) as reply:
+            return reply.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def opens(host, origin, path='/'):
+    """Return whether a WebSocket of a page from an origin opens."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    try:
+        with connect(f'ws://{host}{path}', origin=origin, subprotocols=['viser-v1.1.1']):
+            return True
+    except InvalidStatus as error:
+        assert error.response.status_code == 403
+        return False
+
+
+@pytest.mark.needs('viser')
+def test_the_page_is_for_this_machine_only(tmp_path):
+    from cliploc_ros.studio.server import serve_studio
+
+    document = Document(tmp_path / 'map.yaml')
+    with serve_studio(Studio(document), '127.0.0.1', 0) as (url, _):
+        assert answer(url) == 200
+        assert answer(url, Host='evil.example') == 403, 'a name that points here'
+        host = url.removeprefix('http://').rstrip('/')
+        assert opens(host, None) is False
+        assert opens(host, 'http://evil.example') is False, 'a foreign page'
+        assert opens(host, f'http://{host}') is True
+    document.close()
+
+
+@pytest.mark.needs('viser')
+def test_beyond_this_machine_the_url_has_a_token(tmp_path):
+    from cliploc_ros.studio.server import serve_studio
+
+    document = Document(tmp_path / 'map.yaml')
+    with serve_studio(Studio(document), '0.0.0.0', 0) as (url, _):
+        url = url.replace('0.0.0.0', '127.0.0.1')
+        base, token = url.rstrip('/').rsplit('/', 1)
+        assert len(token) >= 32 and answer(url) == 200
+        assert answer(base) == answer(f'{base}/{token[:-1]}/') == 403
+        host = base.removeprefix('http://')
+        assert opens(host, base) is False and opens(host, base, f'/{token}') is True
+    document.close()

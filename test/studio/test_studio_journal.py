@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The journal of the map studio: what is left of a session that was killed."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from disks import small_disk
+from studio_map import TEXT
+
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / 'office.yaml'
+    path.write_text(TEXT)
+    return path
+
+
+EDITOR = """
+import sys, numpy as np
+from pathlib import Path
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+document = Document(Path(sys.argv[1]))
+document.apply(edits.lock(document.landmarks, ['book_1']))
+document.apply(edits.delete(document.landmarks, ['plant_1']))
+document.save()
+document.apply(edits.relabel(document.landmarks, ['cup_1'], 'undone'))
+document.undo()
+x = 0
+while True:
+    x += 1
+    document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag')
+    print(x, flush=True)
+"""
+
+
+def test_a_killed_studio_loses_nothing(path):
+    editor = subprocess.Popen([sys.executable, '-c', EDITOR, path], stdout=subprocess.PIPE,
+                              text=True, cwd=Path(__file__).parents[2])
+    for line in editor.stdout:
+        if int(line) >= 100:
+            editor.send_signal(signal.SIGKILL)
+            break
+    last = int([line, *editor.stdout.readlines()][-1])
+    editor.wait()
+    document = Document(path)
+    assert document.landmarks['cup_1'].center[0] >= last
+    assert document.landmarks['book_1'].is_locked and 'plant_1' not in document.landmarks
+    assert any('restored' in note for note in document.notes)
+    document.undo()
+    assert document.is_saved, 'the drag is one edit'
+    document.close()
+
+
+def journal_of(path):
+    return path.with_name(f'.{path.name}.studio')
+
+
+def test_replay_between_announcing_and_writing(path):
+    """A studio that was killed while it saved: either content has the right edits."""
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'first'))
+    document._journal.append({'writing': document._source.with_landmarks(
+        document.landmarks).digest})
+    written = document._source.with_landmarks(document.landmarks).text
+    document._journal.close()
+    again = Document(path)
+    assert again.landmarks['cup_1'].label == 'first' and not again.is_saved
+    again._journal.close()
+    path.write_text(written)
+    again = Document(path)
+    assert again.landmarks['cup_1'].label == 'first' and again.is_saved
+
+
+def test_edits_of_another_content_are_set_aside(path):
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    document.close()
+    path.write_text(TEXT.replace('a red cup', 'theirs'))
+    document = Document(path)
+    assert document.landmarks['cup_1'].label == 'theirs'
+    (note,) = document.notes
+    aside = path.with_name(re.search(r'lie in (\S+)', note)[1])
+    assert '"mine"' in aside.read_text()
+
+
+@pytest.mark.parametrize('tail', [b'{"do": "edit", "what": "cu', b'\xff\xfe\n', b'[]\n', b'{}\n',
+                                  b'{"do": "edit"}\n', b'{"do": "undo", "what": 3}\n',
+                                  b'[' * 100_000 + b'\n',
+                                  b'{"do": "edit", "what": "x", "before": {"a": null}, '
+                                  b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n'])
+def test_a_broken_journal_loses_its_end_only(path, tail):
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    document.close()
+    with journal_of(path).open('ab') as file:
+        file.write(tail)
+    document = Document(path)
+    assert document.landmarks['cup_1'].label == 'mine'
+    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine, too'))
+    document.close()
+    assert Document(path).landmarks['cup_1'].label == 'mine, too'
+
+
+FILLER = """
+import sys, os
+from pathlib import Path
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+path = Path(sys.argv[1])
+path.write_text(os.environ['MAP'])
+document = Document(path)
+document.apply(edits.relabel(document.landmarks, ['cup_1'], 'kept'))
+(path.parent / 'filler').write_bytes(bytes(65536 - 24576))
+for _ in range(2):
+    try:
+        document.save()
+        print('saved')
+    except CliplocError as error:
+        print(error)
+        assert path.read_text() == os.environ['MAP']
+        (path.parent / 'filler').unlink()
+try:
+    (path.parent / 'filler').write_bytes(bytes(65536))
+except OSError:
+    pass
+for number in range(1000):
+    try:
+        document.apply(edits.relabel(document.landmarks, ['cup_1'], f'label {number}'))
+    except CliplocError as error:
+        print(error)
+        break
+label = document.landmarks['cup_1'].label
+document.close()
+assert Document(path).landmarks['cup_1'].label == label, 'what was shown is kept'
+"""
+
+
+def test_a_full_disk(tmp_path):
+    """An edit that cannot be kept is refused, a save that fails leaves the file."""
+    done = subprocess.run(
+        [*small_disk(tmp_path), sys.executable, '-c', FILLER, tmp_path / 'office.yaml'],
+        env={**os.environ, 'MAP': TEXT + '#' * 16_000}, cwd=Path(__file__).parents[2],
+        capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    saving, saved, editing = done.stdout.splitlines()
+    assert 'cannot be written: No space left on device; nothing was changed' in saving
+    assert saved == 'saved'
+    assert 'the edit cannot be kept: No space left on device; make room' in editing
