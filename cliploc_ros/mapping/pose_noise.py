@@ -30,6 +30,8 @@ from cliploc_ros.mapping.views import Views
 
 # The estimate uses so many frames and landmarks at most: more of them add time, hardly precision.
 _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
+# They are from the middle of a long recording: frames far apart show no landmark in common.
+_MAX_SPAN = 3000
 _MIN_FRAMES, _MIN_LANDMARKS, _MIN_BOXES = 20, 3, 3
 # Smaller errors than these stay. A guess: motion capture and clock of TUM fr3 are estimated to be
 # off by 6 mm and 0.2 degrees.
@@ -152,10 +154,12 @@ class _Linearized(NamedTuple):
 
 
 def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return one frame of each viewpoint, evenly chosen, and the rows of their boxes."""
+    """Return one frame of each of some viewpoints, evenly chosen, and the rows of their boxes."""
     _, firsts = np.unique(views.viewpoints, return_index=True)
     middles = (firsts + np.append(firsts[1:], len(views.rotations))) // 2
-    places = np.linspace(0, len(middles) - 1, _MAX_FRAMES).astype(np.int64)
+    left_out = max(0, len(middles) - _MAX_SPAN)
+    places = np.linspace(left_out // 2, len(middles) - 1 - (left_out - left_out // 2),
+                         _MAX_FRAMES).astype(np.int64)
     frames = middles[np.unique(places)]
     return frames, np.nonzero(np.isin(views.frames, frames))[0]
 
