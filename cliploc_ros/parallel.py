@@ -139,7 +139,7 @@ class _Workers(Protocol):
 
 
 class _Stream:
-    """Tasks on their way through workers, so many of them at once.
+    """Tasks on their way through workers, a bounded number at once.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ from cliploc_ros.mapping.views import number_viewpoints
 _LABELS = 6
 # CLIP is trained to give the right one of many texts a probability of softmax(100 cosine).
 _CLIP_SCALE = 100.0
-# A landmark is described by at most so many of its crops, evenly chosen. Bounds the memory.
+# The crops of a landmark that its description uses at most, evenly chosen: bounds the memory.
 _MOST_CROPS = 512
 # A further medoid brings each crop nearer to one by this cosine on average. A guess.
 _LEAST_MEDOID_GAIN = 0.005
