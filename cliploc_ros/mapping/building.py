@@ -20,11 +20,11 @@ from cliploc_ros.mapping.depth_seeds import (
     depth_scale,
     options_with_depth,
 )
-from cliploc_ros.mapping.evidence import Evidence, gather_evidence, group_boxes
-from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.evidence import Evidence, gather_evidence
+from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.joint import pose_errors, refine_jointly
-from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks, no_landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, join_landmarks, no_landmarks
 from cliploc_ros.mapping.merging import merge_classes, merge_duplicates
 from cliploc_ros.mapping.mount import MountCorrection, refine_mount
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
@@ -185,7 +185,7 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
     landmarks, left_out = landmarks.select(kept), landmarks.select(~kept)
     # boxes of what is left out may belong to what stays
     shown = associate(views, landmarks, options.association_iou)
-    landmarks = _refit(views, landmarks, shown)
+    landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
     return _Draft(landmarks, associate(views, landmarks, options.association_iou), left_out,
                   [reason for reason in reasons if reason is not None],
                   evidence.select(~kept))
@@ -243,20 +243,11 @@ def _settle(views: Views, landmarks: Landmarks, options: MappingOptions) -> Land
     for _ in range(options.settling_rounds):
         shown = associate(views, landmarks, options.association_iou)
         landmarks, shown = merge_duplicates(views, landmarks, shown, options)
+        boxes = group_boxes(shown, len(landmarks.centers))
         seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
-                for rows in group_boxes(shown, len(landmarks.centers))]
-        landmarks = _refit(views, landmarks, shown).select(np.array(seen, dtype=np.bool_))
+                for rows in boxes]
+        landmarks = fit_landmarks(views, landmarks, boxes).select(np.array(seen, dtype=np.bool_))
     return landmarks
-
-
-def _refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landmarks:
-    """Return the landmarks fitted to the boxes that show them."""
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    for number, rows in enumerate(group_boxes(shown, len(centers))):
-        if len(rows):
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
-            centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, landmarks.classes)
 
 
 def _nothing_found(draft: _Draft) -> str:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.evidence import group_boxes
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views, with_depths

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.projection import box_iou, project_box
 from cliploc_ros.mapping.views import Views, camera_centers
 
@@ -75,13 +75,6 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
     columns = np.array(per_landmark, dtype=np.float64).reshape(-1, 7).T
     counts = columns[:3].astype(np.int64)
     return Evidence(*counts, *columns[3:])
-
-
-def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    """Return the boxes of each of a number of landmarks, in ascending order."""
-    order = np.argsort(shown, kind='stable')
-    bounds = np.searchsorted(shown[order], np.arange(count + 1))
-    return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
 
 
 def _evidence_of(views: Views, cameras: NDArray[np.float64], center: NDArray[np.float64],

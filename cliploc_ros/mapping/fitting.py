@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit one ellipsoid to the edges of its boxes by robust least squares.
+"""Fit ellipsoids, each to the edges of its boxes, by robust least squares.
 
 Each edge that does not lie at the image border gives a residual: projected edge minus detected
 edge, in standard deviations. An edge at the border only bounds the object: it counts where the
@@ -9,6 +9,7 @@ the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the
 their mean, since boxes from similar directions leave the thickness open.
 """
 
+from collections.abc import Sequence
 from math import log, sqrt
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
+from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import (
     LANDMARK_SIZE,
     POSE_SIZE,
@@ -53,6 +55,26 @@ class Fit(NamedTuple):
     basis: NDArray[np.float64]
     cost: float
     information: NDArray[np.float64]
+
+
+def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np.int64]]
+                  ) -> Landmarks:
+    """Return landmarks, each fitted to its boxes; one without boxes stays as it is.
+
+    Parameters
+    ----------
+    views : Views
+    landmarks : Landmarks
+        L of them.
+    boxes : sequence of ndarray of int
+        The rows of the boxes of each of the L landmarks.
+    """
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    for number, rows in enumerate(boxes):
+        if len(rows):
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            centers[number], bases[number] = fit.center, fit.basis
+    return Landmarks(centers, bases, landmarks.classes)
 
 
 def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],

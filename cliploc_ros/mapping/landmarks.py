@@ -51,3 +51,10 @@ def join_landmarks(*parts: Landmarks) -> Landmarks:
     """Return the landmarks of all parts."""
     columns = zip(no_landmarks(), *parts, strict=True)
     return Landmarks(*(np.concatenate(column) for column in columns))
+
+
+def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    """Return the boxes of each of a number of landmarks, in ascending order."""
+    order = np.argsort(shown, kind='stable')
+    bounds = np.searchsorted(shown[order], np.arange(count + 1))
+    return [order[bounds[number]:bounds[number + 1]] for number in range(count)]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cliploc_ros.mapping.evidence import group_boxes, ious_with
+from cliploc_ros.mapping.evidence import ious_with
 from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.projection import box_iou
 from cliploc_ros.mapping.views import Views

@@ -17,15 +17,10 @@ from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import (
-    Evidence,
-    count_expected,
-    gather_evidence,
-    group_boxes,
-)
-from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence
+from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.input_checks import check_input
-from cliploc_ros.mapping.landmarks import Landmarks, landmarks_of_map
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.merging import merge_pairs, pairs_of_one_class
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
@@ -182,12 +177,9 @@ def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_],
 def _fit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], chosen: NDArray[np.bool_]
          ) -> Landmarks:
     """Return the landmarks, the chosen ones fitted to the boxes that show them."""
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    for number, rows in enumerate(group_boxes(shown, len(centers))):
-        if chosen[number] and len(rows):
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
-            centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, landmarks.classes)
+    boxes = group_boxes(shown, len(landmarks.centers))
+    return fit_landmarks(views, landmarks, [rows if is_chosen else rows[:0] for rows, is_chosen
+                                            in zip(boxes, chosen, strict=True)])
 
 
 def _replace_rows(landmarks: Landmarks, others: Landmarks, rows: NDArray[np.bool_]) -> Landmarks:

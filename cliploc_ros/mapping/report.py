@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.mapping.evidence import Evidence, best_ious, group_boxes, ious_with
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.evidence import Evidence, best_ious, ious_with
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views
 

@@ -15,9 +15,9 @@ from cliploc_ros.mapping.checking.landmark_faults import (
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.mapping.evidence import group_boxes
 from cliploc_ros.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks as Ellipsoids
+from cliploc_ros.mapping.landmarks import group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.refit import RefitMap, refit_map

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.mapping.checking.landmark_faults import Witness
 from cliploc_ros.mapping.checking.options import CheckOptions
-from cliploc_ros.mapping.evidence import best_ious, group_boxes
-from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.evidence import best_ious
+from cliploc_ros.mapping.fitting import fit_landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.views import Views
 
 # As in cliploc_ros.mapping.report.
@@ -100,18 +100,18 @@ def _is_near(stamps_s: NDArray[np.float64], judged: NDArray[np.int64], gap_s: fl
 def _refit(views: Views, witness: Witness, training: NDArray[np.bool_], options: CheckOptions
            ) -> tuple[NDArray[np.int64], Landmarks]:
     landmarks, evidence = witness.landmarks, witness.evidence
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    kept = np.ones(len(centers), dtype=np.bool_)
-    for number, rows in enumerate(group_boxes(witness.shown, len(centers))):
+    kept = np.ones(len(landmarks.centers), dtype=np.bool_)
+    boxes = group_boxes(witness.shown, len(kept))
+    for number, rows in enumerate(boxes):
+        boxes[number] = rows[:0]
         if evidence.median_iou[number] < options.mapping.min_median_iou:
             continue
         rows = rows[training[views.frames[rows]]]
         seen_from = np.unique(views.viewpoints[views.frames[rows]])
         kept[number] = len(seen_from) >= options.mapping.min_viewpoints
         if kept[number]:
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
-            centers[number], bases[number] = fit.center, fit.basis
-    return np.nonzero(kept)[0], Landmarks(centers, bases, landmarks.classes).select(kept)
+            boxes[number] = rows
+    return np.nonzero(kept)[0], fit_landmarks(views, landmarks, boxes).select(kept)
 
 
 def judge_boxes(views: Views, landmarks: Landmarks, frames: NDArray[np.int64] | None = None

@@ -19,8 +19,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.mapping.checking.landmark_faults import Witness
-from cliploc_ros.mapping.evidence import best_ious, group_boxes
-from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.evidence import best_ious
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.projection import project_box

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence, group_boxes
-from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks, landmarks_of_map
+from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence
+from cliploc_ros.mapping.fitting import fit_landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.merging import normalized_distance
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
@@ -135,16 +135,8 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     for row in np.nonzero(evidence.support == 0)[0]:
         expected[row] = count_expected(views, cameras, landmarks.centers[row],
                                        landmarks.bases[row], reach)
-    return Witness(landmarks, shown, evidence, expected, _fitted(views, landmarks, shown))
-
-
-def _fitted(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Landmarks:
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    for number, rows in enumerate(group_boxes(shown, len(centers))):
-        if len(rows):
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
-            centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, landmarks.classes)
+    fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
+    return Witness(landmarks, shown, evidence, expected, fitted)
 
 
 def _median_reach(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.building import NothingFoundError, build_map
-from cliploc_ros.mapping.evidence import group_boxes
 from cliploc_ros.mapping.landmarks import (
     Landmarks,
+    group_boxes,
     join_landmarks,
     landmarks_of_map,
     no_landmarks,

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import group_boxes
 from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks, landmarks_of_map
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.updating.options import UpdateOptions
 from cliploc_ros.mapping.views import Views
 
