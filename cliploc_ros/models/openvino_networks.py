@@ -1,0 +1,271 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Networks that OpenVINO runs on a CPU: converted once, kept on disk, checked at each start."""
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+import threading
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.devices import free_memory, import_openvino
+from cliploc_ros.models.download import first_line
+from cliploc_ros.models.files import fingerprint_file, resolve_cache_dir
+
+if TYPE_CHECKING:
+    import torch
+
+_FORMAT = 1
+# ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
+_MOST_NETWORKS = 8
+_STALE_S = 24 * 3600.0
+_XML, _WEIGHTS, _PROBE, _ABOUT = 'network.xml', 'network.bin', 'probe.npz', 'about.json'
+# Of the largest output. Measured: 1e-5 for CLIP and YOLO in fp32.
+_TOLERANCE = 1e-3
+
+logger = logging.getLogger(__name__)
+
+
+class ConversionError(ModelError):
+    """OpenVINO cannot run a network, or gives other results than PyTorch."""
+
+
+class Conversion(NamedTuple):
+    """A network that was converted.
+
+    Parameters
+    ----------
+    network : openvino.Model
+    probe : ndarray float32
+        An input of another shape than the one that the network was traced with.
+    expected : ndarray float32
+        What PyTorch makes of the probe.
+    about : dict
+        What else the user of the network needs, as JSON.
+    """
+
+    network: Any
+    probe: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    about: dict[str, Any]
+
+
+class Network:
+    """A compiled network with one input and one output that is used.
+
+    Parameters
+    ----------
+    network : openvino.Model
+    about : dict
+        See Conversion.
+    """
+
+    def __init__(self, network: Any, about: dict[str, Any]) -> None:
+        import torch
+
+        openvino = import_openvino()
+        self.about = about
+        # On some CPUs fp32 would silently become bf16. Threads that are pinned to cores wait there
+        # for other processes; as many as PyTorch uses keep to its limits.
+        self._compiled = openvino.Core().compile_model(network, 'CPU', {
+            'INFERENCE_PRECISION_HINT': 'f32', 'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1,
+            'INFERENCE_NUM_THREADS': torch.get_num_threads(), 'ENABLE_CPU_PINNING': False})
+        self._lock = threading.Lock()
+
+    def __call__(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the first output for some inputs."""
+        with self._lock:  # a compiled network runs one input at a time
+            return np.asarray(self._compiled(inputs)[0])
+
+
+def load_network(cache_dir: str, name: str, identity: Sequence[str],
+                 convert: Callable[[], Conversion]) -> Network:
+    """Return a network from the cache, or convert it, which takes seconds to minutes.
+
+    The name of a folder in the cache is the hash of everything that the network depends on. A
+    start runs a stored input and compares the output with PyTorch's, so that a damaged file, and
+    a CPU that calculates otherwise, are noticed. Folders are written under another name and
+    renamed: any number of processes may share the cache.
+
+    Parameters
+    ----------
+    cache_dir : str
+        See resolve_cache_dir.
+    name : str
+        For people.
+    identity : sequence of str
+        What the network depends on, besides OpenVINO's version.
+    convert : callable
+        Converts the network.
+
+    Raises
+    ------
+    ConversionError
+        When OpenVINO cannot run the network as PyTorch does.
+    ModelError
+        From convert.
+    """
+    identity = [str(_FORMAT), import_openvino().__version__, *identity]
+    parent = resolve_cache_dir(cache_dir) / 'openvino'
+    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
+    folder = parent / f'{Path(name).name}-{digest[:32]}'
+    if folder.exists():
+        try:
+            network = _open(folder, identity)
+        except Exception as error:  # OpenVINO has no exceptions of its own
+            logger.warning('%s cannot be used (%s): converting %s again', folder,
+                           first_line(error), name)
+        else:
+            with contextlib.suppress(OSError):  # a read-only cache works too
+                os.utime(folder)
+            return network
+    return _convert(folder, name, identity, convert)
+
+
+def _convert(folder: Path, name: str, identity: Sequence[str],
+             convert: Callable[[], Conversion]) -> Network:
+    """Convert a network, and write it so that its weights are mapped from the file."""
+    started = time.monotonic()
+    logger.info('converting %s for OpenVINO: once, into %s', name, folder)
+    conversion = _converted(name, convert)
+    try:
+        network = _stored(folder, identity, conversion)
+    except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
+        network = _in_memory(name, conversion)
+        logger.warning('the converted network is not cached and the next start is slow again: '
+                       'cannot write %s (%s); make room, or choose a writable cache_dir', folder,
+                       first_line(error))
+    del conversion
+    free_memory()
+    logger.info('%s is converted after %.0f s', name, time.monotonic() - started)
+    return network
+
+
+def _converted(name: str, convert: Callable[[], Conversion]) -> Conversion:
+    try:
+        return convert()
+    except ModelError:
+        raise
+    except Exception as error:  # tracing and converting raise exceptions of all kinds
+        raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
+
+
+def _in_memory(name: str, conversion: Conversion) -> Network:
+    try:
+        network = Network(conversion.network, conversion.about)
+        _check(network, conversion.probe, conversion.expected)
+    except Exception as error:
+        raise ConversionError(f'OpenVINO does not run {name} as PyTorch does: '
+                              f'{first_line(error)}') from error
+    return network
+
+
+def _stored(folder: Path, identity: Sequence[str], conversion: Conversion) -> Network:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _prune(folder.parent)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
+                                     ignore_cleanup_errors=True) as desk:
+        whole = Path(desk) / folder.name
+        _write(whole, identity, conversion)
+        network = _open(whole, identity)
+        if folder.exists():  # damaged, or of another process
+            folder.rename(Path(desk) / 'old')
+        whole.rename(folder)
+    return network
+
+
+def _write(folder: Path, identity: Sequence[str], conversion: Conversion) -> None:
+    folder.mkdir()
+    import_openvino().save_model(conversion.network, folder / _XML, compress_to_fp16=False)
+    np.savez(folder / _PROBE, probe=conversion.probe, expected=conversion.expected)
+    prints = {name: fingerprint_file(folder / name) for name in (_XML, _WEIGHTS, _PROBE)}
+    (folder / _ABOUT).write_text(json.dumps(
+        {'identity': list(identity), 'files': prints, 'about': conversion.about}))
+    for file in folder.iterdir():
+        with file.open('rb+') as opened:
+            os.fsync(opened.fileno())
+
+
+def _open(folder: Path, identity: Sequence[str]) -> Network:
+    """Return the network in a folder; raise ValueError and others where it is not sound."""
+    stored = json.loads((folder / _ABOUT).read_text())
+    if stored['identity'] != list(identity):
+        raise ValueError('it belongs to another network')
+    for name in (_XML, _WEIGHTS, _PROBE):
+        if fingerprint_file(folder / name) != stored['files'][name]:
+            raise ValueError(f'{name} is damaged')
+    try:
+        with np.load(folder / _PROBE, allow_pickle=False) as arrays:
+            probe, expected = arrays['probe'], arrays['expected']
+    except zipfile.BadZipFile as error:
+        raise ValueError(f'{_PROBE} is damaged') from error
+    network = Network(import_openvino().Core().read_model(folder / _XML), stored['about'])
+    _check(network, probe, expected)
+    return network
+
+
+def _check(network: Network, probe: NDArray[np.float32], expected: NDArray[np.float32]) -> None:
+    """Raise ValueError unless a network gives PyTorch's output."""
+    found = network(probe)
+    if found.shape != expected.shape:
+        raise ValueError(f'its output has the shape {found.shape}, not {expected.shape}')
+    error = float(np.abs(found - expected).max() / np.abs(expected).max())
+    if not error <= _TOLERANCE:  # true of NaN
+        raise ValueError(f'its output is off by {error:.2g} of the largest, not by '
+                         f'{_TOLERANCE:g} at most')
+
+
+def _prune(parent: Path) -> None:
+    """Remove the least recently used networks, and those of writers that were killed."""
+    def modified(folder: Path) -> float:
+        try:
+            return folder.stat().st_mtime
+        except OSError:  # another process has removed it
+            return 0.0
+
+    kept = sorted((folder for folder in parent.iterdir() if not folder.name.startswith('.')),
+                  key=modified, reverse=True)
+    stale = [folder for folder in parent.glob('.*.tmp')
+             if modified(folder) < time.time() - _STALE_S]
+    for folder in kept[_MOST_NETWORKS - 1:] + stale:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def convert_module(module: 'torch.nn.Module', example: 'torch.Tensor',
+                   shape: Sequence[int]) -> Any:
+    """Return an openvino.Model of a PyTorch module on a CPU.
+
+    Parameters
+    ----------
+    module : torch.nn.Module
+        In evaluation mode.
+    example : Tensor
+        An input to trace the module with.
+    shape : sequence of int
+        Of the inputs to come; -1 for what may vary.
+    """
+    import torch
+
+    fast = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)  # OpenVINO has no such operation
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter('ignore')  # of constants in the trace; the probe tests them
+            traced = torch.jit.trace(module, example, strict=False, check_trace=False)
+            return import_openvino().convert_model(traced, example_input=example,
+                                                   input=[list(shape)])
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast)
