@@ -183,7 +183,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
 def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     from cliploc_ros.evaluation.recording import recorded_queries
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_detector import YoloOptions
+    from cliploc_ros.models.yolo_weights import YoloOptions
     from cliploc_ros.recording.keyframes import EVERY_FRAME
     from cliploc_ros.recording.recorder import RecordingOptions
 

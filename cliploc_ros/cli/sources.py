@@ -100,7 +100,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     """
     from cliploc_ros.datasets.observations import load_recorded
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_detector import YoloOptions
+    from cliploc_ros.models.yolo_weights import YoloOptions
     from cliploc_ros.recording.keyframes import KeyframeOptions
     from cliploc_ros.recording.recorder import RecordingOptions, record_once
 

@@ -3,6 +3,7 @@
 """Networks that OpenVINO runs on a CPU: converted once, kept on disk, checked at each start."""
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import logging
@@ -35,6 +36,7 @@ _STALE_S = 24 * 3600.0
 _XML, _WEIGHTS, _PROBE, _ABOUT = 'network.xml', 'network.bin', 'probe.npz', 'about.json'
 # Of the largest output. Measured: 1e-5 for CLIP and YOLO in fp32.
 _TOLERANCE = 1e-3
+_MADV_DONTNEED = 4
 
 logger = logging.getLogger(__name__)
 
@@ -214,7 +216,27 @@ def _open(folder: Path, identity: Sequence[str]) -> Network:
         raise ValueError(f'{_PROBE} is damaged') from error
     network = Network(import_openvino().Core().read_model(folder / _XML), stored['about'])
     _check(network, probe, expected)
+    release_pages(folder / _WEIGHTS)
     return network
+
+
+def release_pages(file: Path) -> None:
+    """Release the memory of a mapped file; the system reads again what is used again.
+
+    The CPU's kernels have copies of the weights in layouts of their own, and read the file only
+    while they are compiled.
+    """
+    madvise = getattr(ctypes.CDLL(None), 'madvise', None)
+    if madvise is None:
+        return
+    # OpenVINO maps the file before its folder gets its name: look for the file itself.
+    inode = str(file.stat().st_ino)
+    with contextlib.suppress(OSError):  # only Linux has it
+        for line in Path('/proc/self/maps').read_text().splitlines():
+            fields = line.split(maxsplit=5)
+            if fields[4] == inode and fields[-1].endswith(file.name):
+                start, end = (int(bound, 16) for bound in fields[0].split('-'))
+                madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
 
 
 def _check(network: Network, probe: NDArray[np.float32], expected: NDArray[np.float32]) -> None:

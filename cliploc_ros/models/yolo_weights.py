@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""YOLO through ultralytics, without its network requests, installations and files in the home.
+"""Weights of YOLO, and ultralytics without network requests, installations and files in the home.
 
-This is the only module that imports ultralytics (AGPL-3.0). It sets environment variables before
-the import, so nothing else may import ultralytics first.
+Ultralytics (AGPL-3.0) is imported by `import_ultralytics` first. It sets environment variables
+before the import.
 """
 
 import atexit
@@ -19,15 +19,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.devices import check_precision, resolve_device, resolve_precision
+from cliploc_ros.models.devices import check_inference, check_precision
 from cliploc_ros.models.download import download, first_line
 from cliploc_ros.models.files import check_weights_file, resolve_cache_dir
-from cliploc_ros.models.images import check_image_rgb
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +34,8 @@ class YoloOptions:
     Parameters
     ----------
     model : str
-        Path of a ``.pt`` file, or the name of a published one, which is then downloaded once.
+        Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
+        ``.pt`` file, which is then downloaded once.
     conf : float
         Least confidence of a detection, 0 to 1.
     iou : float
@@ -53,7 +49,9 @@ class YoloOptions:
     precision : str
         'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'.
     cache_dir : str
-        Folder for downloads; '' is the user's cache.
+        Folder for downloads and converted networks; '' is the user's cache.
+    inference : str
+        'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'.
 
     Raises
     ------
@@ -69,88 +67,18 @@ class YoloOptions:
     device: str = 'auto'
     precision: str = 'auto'
     cache_dir: str = ''
+    inference: str = 'auto'
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_precision(self.precision)
+        check_inference(self.inference)
         for name in ('conf', 'iou'):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
         for name in ('imgsz', 'max_det'):
             if getattr(self, name) < 1:
                 raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
-
-
-class YoloDetector:
-    """An `ObjectDetector`: a detection model of ultralytics.
-
-    Ultralytics' checkpoints are pickles, which can run code. This class reads them in ultralytics'
-    restricted mode (``weights_only=True`` and a list of known classes), which refuses code. An
-    ultralytics without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only
-    a file that the options name by its path is loaded, with a warning to load trusted files only.
-
-    Parameters
-    ----------
-    options : YoloOptions
-        Which YOLO, and how to run it.
-
-    Raises
-    ------
-    ModelError
-        When the weights are missing or damaged, or are no detection model.
-    OptionsError
-        When the device is missing.
-    """
-
-    def __init__(self, options: YoloOptions) -> None:
-        import torch
-
-        device = resolve_device(options.device)
-        file = _resolve_file(options)
-        threads = torch.get_num_threads()
-        self._model = _load(file)
-        self._stride = int(self._model.model.stride.max())
-        self._device = device
-        self.configure(options)
-        # The first pass sets up the predictor: do it before the first image.
-        self.detect(np.zeros((self._stride, self._stride, 3), dtype=np.uint8))
-        # Ultralytics leaves one core free on a CPU, for the whole process.
-        torch.set_num_threads(threads)
-
-    def configure(self, options: YoloOptions) -> None:
-        """Change the options, except for model and device."""
-        self._settings = {
-            'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
-            'imgsz': -(-options.imgsz // self._stride) * self._stride,
-            'device': str(self._device), 'verbose': False}
-        if resolve_precision(options.precision, self._device) == 'fp16':
-            self._settings |= _half_precision()
-
-    @property
-    def device(self) -> str:
-        """Return where the network runs."""
-        return str(self._device)
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """Return the names of all classes that the model knows."""
-        return tuple(self._model.names.values())
-
-    def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
-        """Return the objects in an image (h, w, 3) uint8, the most confident first.
-
-        Raises
-        ------
-        ImageError
-            For an image of another shape or type, or without pixels.
-        """
-        check_image_rgb(image_rgb)
-        image_bgr = np.ascontiguousarray(image_rgb[..., ::-1])
-        boxes = self._model.predict(image_bgr, **self._settings)[0].boxes.cpu().numpy()
-        return Detections(
-            bboxes_xyxy=boxes.xyxy.astype(np.float64).reshape(-1, 4),
-            class_ids=tuple(self._model.names[int(index)] for index in boxes.cls),
-            scores=boxes.conf.astype(np.float64))
 
 
 @cache
@@ -193,9 +121,17 @@ def _is_restricted(ultralytics: Any) -> bool:
             and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
 
 
-def _resolve_file(options: YoloOptions) -> Path:
-    """Return the file of weights that the options name; download it if necessary."""
+def resolve_yolo_weights(options: YoloOptions) -> Path:
+    """Return the file or folder that the options name; download the file if necessary.
+
+    Raises
+    ------
+    ModelError
+        When it is missing, damaged or unknown, or the download fails.
+    """
     file = Path(options.model).expanduser().absolute()
+    if is_export(file):
+        return file
     if file.exists() or Path(options.model).name != options.model:
         check_weights_file(file)
         return file
@@ -229,15 +165,24 @@ def _nearest(name: str, known: Iterable[str]) -> str:
     return f': did you mean {", ".join(near)}?' if near else ''
 
 
-def _half_precision() -> dict[str, Any]:
-    from ultralytics.utils import DEFAULT_CFG_DICT
-
-    # The name changed within 8.4, and the old one warns with every image.
-    return {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
+def is_export(path: Path) -> bool:
+    """Return whether a path is a folder with an OpenVINO export."""
+    return path.is_dir() and any(path.glob('*.xml'))
 
 
-def _load(file: Path) -> Any:
-    """Return ultralytics' model of a file of weights."""
+def load_yolo(file: Path) -> Any:
+    """Return ultralytics' detection model of a ``.pt`` file.
+
+    Such a file is a pickle, which can run code. This function reads it in ultralytics' restricted
+    mode (``weights_only=True`` and a list of known classes), which refuses code. An ultralytics
+    without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only a file that
+    the options name by its path is loaded, with a warning to load trusted files only.
+
+    Raises
+    ------
+    ModelError
+        For a file that is damaged or no detection model.
+    """
     ultralytics = import_ultralytics()
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
         # Ultralytics rewrites some paths (quotes, yolov5) and requires the suffix.

@@ -12,7 +12,8 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.image_source import ImageSource, TimedImage
