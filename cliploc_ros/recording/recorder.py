@@ -228,7 +228,7 @@ def _camera(seen: SeenFrame) -> Camera:
 def _settings(options: YoloOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change what a network says."""
     return {name: value for name, value in asdict(options).items()
-            if name not in ('cache_dir', 'max_batch')}
+            if name not in ('cache_dir', 'max_batch', 'inference')}
 
 
 def _state(path: Path) -> tuple[int, int] | None:
