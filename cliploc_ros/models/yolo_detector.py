@@ -21,6 +21,7 @@ from cliploc_ros.models.yolo_weights import (
     is_export,
     load_yolo,
     resolve_yolo_weights,
+    stride_of,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class TorchYolo:
         self._settings = {'device': str(device), 'verbose': False}
         if precision == 'fp16':
             self._settings |= _half_precision()
-        self.stride = int(self._model.model.stride.max())
+        self.stride = stride_of(self._model.model)
         self.names: dict[int, str] = self._model.names
 
     def find(self, image_bgr: NDArray[np.uint8], **settings: float) -> NDArray[np.float32]:

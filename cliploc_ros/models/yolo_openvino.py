@@ -20,7 +20,12 @@ from cliploc_ros.models.openvino_networks import (
     load_network,
     release_pages,
 )
-from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics, load_yolo
+from cliploc_ros.models.yolo_weights import (
+    YoloOptions,
+    import_ultralytics,
+    load_yolo,
+    stride_of,
+)
 
 # Of an export, in metadata.yaml, with their types.
 _FIELDS = {'names': dict, 'stride': int, 'task': str}
@@ -128,7 +133,7 @@ def load_converted(file: Path, options: YoloOptions) -> OpenVinoYolo:
     import torch
 
     identity = [fingerprint_file(file), import_ultralytics().__version__, torch.__version__]
-    return OpenVinoYolo(load_network(options.cache_dir, file.stem, identity,
+    return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity,
                                      lambda: _convert(file)))
 
 
@@ -137,7 +142,7 @@ def _convert(file: Path) -> Conversion:
 
     loaded = load_yolo(file)
     model = loaded.model.float().eval().fuse(verbose=False)
-    stride = int(model.stride.max())
+    stride = stride_of(model)
     for module in model.modules():
         if hasattr(module, 'export'):  # the head: it then has one output, for images of any size
             module.export, module.dynamic, module.format = True, True, 'openvino'

@@ -24,6 +24,8 @@ from cliploc_ros.models.devices import check_inference, check_precision
 from cliploc_ros.models.download import download, first_line
 from cliploc_ros.models.files import check_weights_file, resolve_cache_dir
 
+_LEAST_STRIDE = 32
+
 logger = logging.getLogger(__name__)
 
 
@@ -163,6 +165,11 @@ def resolve_yolo_weights(options: YoloOptions) -> Path:
 def _nearest(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, known, n=4, cutoff=0.5)
     return f': did you mean {", ".join(near)}?' if near else ''
+
+
+def stride_of(model: Any) -> int:
+    """Return what height and width of an input must be multiples of, as ultralytics has it."""
+    return max(int(model.stride.max()), _LEAST_STRIDE)
 
 
 def is_export(path: Path) -> bool:
