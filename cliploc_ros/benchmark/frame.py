@@ -170,7 +170,8 @@ def _serve(engine: str, yolo: str, clip: str, folder: str, *, crops: int, device
     started = time.perf_counter()
     detector = YoloDetector(YoloOptions(yolo, device=device, inference=engine, cache_dir=folder))
     model, pretrained, file = json.loads(clip)
-    options = ClipOptions(model, pretrained, file, device=device, inference=engine, cache_dir=folder)
+    options = ClipOptions(model, pretrained, file, device=device, inference=engine,
+                          cache_dir=folder)
     encoder = ClipEncoder(resolve_clip_weights(options), options)
     stages: dict[str, Callable[[], Any]] = {
         'detection': lambda: detector.detect(image_rgb),
