@@ -38,7 +38,8 @@ class ClipOptions:
     device : str
         'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
     precision : str
-        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'; of the image tower.
+        'auto' (fp16 on a GPU; fp32 on a CPU, or bf16 where OpenVINO finds it in the CPU), 'fp16'
+        or 'fp32'; of the image tower.
     max_batch : int
         Greatest number of crops in one forward pass; bounds the memory.
     cache_dir : str

@@ -67,8 +67,6 @@ def resolve_precision(precision: str, device: 'torch.device') -> str:
 def resolve_inference(inference: str, device: 'torch.device', precision: str) -> str:
     """Return 'pytorch' or 'openvino'; 'auto' means OpenVINO on a CPU, where it is installed.
 
-    OpenVINO runs in fp32: only then do its results equal PyTorch's.
-
     Parameters
     ----------
     inference : str

@@ -13,6 +13,8 @@ from cliploc_ros.models.clip_towers import load_image_tower, load_preprocess
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
 from cliploc_ros.models.devices import resolve_inference, resolve_precision
 from cliploc_ros.models.openvino_networks import (
+    FASTEST,
+    FP32,
     Conversion,
     ConversionError,
     Network,
@@ -55,7 +57,7 @@ class TorchTower:
 
 
 class OpenVinoTower:
-    """An image tower in OpenVINO: fp32 on the CPU, batches of any size.
+    """An image tower in OpenVINO on a CPU, for batches of any size.
 
     Parameters
     ----------
@@ -92,7 +94,8 @@ def load_tower(weights: ClipWeights, options: ClipOptions, device: 'torch.device
     if resolve_inference(options.inference, device, precision) == 'openvino':
         try:
             network = load_network(options.cache_dir, weights.model, _identity(weights),
-                                   lambda: _convert(weights, device))
+                                   lambda: _convert(weights, device),
+                                   FP32 if options.precision == 'fp32' else FASTEST)
             return OpenVinoTower(network, load_preprocess(weights))
         except ConversionError as error:
             if options.inference == 'openvino':
