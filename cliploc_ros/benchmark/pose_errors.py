@@ -29,7 +29,6 @@ from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErro
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
 LEVELS = ((0.02, 0.5), (0.05, 1.0), (0.1, 2.0))
-ODOMETRY = OdometryErrors()
 KINDS = ('independent', 'correlated', 'drifting')
 CORRELATION_S = 3.0
 # A random walk reaches its level after so long; as a process that holds on to nothing it is one
@@ -47,7 +46,7 @@ def disturb(detections: PosedDetections, errors: NDArray[np.float64]) -> PosedDe
 
 
 def with_odometry(detections: PosedDetections, truth: PosedDetections,
-                  rng: np.random.Generator, noise: OdometryErrors = ODOMETRY) -> PosedDetections:
+                  rng: np.random.Generator, noise: OdometryErrors) -> PosedDetections:
     """Return the detections with odometry: true motions with a random error of each step."""
     before, after = truth.map_from_camera[:-1], truth.map_from_camera[1:]
     steps = np.linalg.inv(before) @ after
@@ -131,15 +130,16 @@ def _nearest(centers: NDArray[np.float64], found: LandmarkMap, truth: LandmarkMa
 
 
 def compare(detections: PosedDetections, kind: str, level: tuple[float, float], seed: int,
-            truth: LandmarkMap) -> None:
+            truth: LandmarkMap, odometry: OdometryErrors) -> None:
     """Print a row of the table for plain, given and estimated errors, each with odometry too."""
     prior = prior_of(kind, *level)
     drawn = draw_errors(kind, detections.stamps_s, PoseErrors(*level, CORRELATION_S),
                         np.random.default_rng(seed))
     disturbed, plain = disturb(detections, drawn), None
-    linked = with_odometry(disturbed, detections, np.random.default_rng([seed, 1]))
-    given, estimated = (MappingOptions(pose_errors=prior),
-                        MappingOptions(estimate_pose_errors=True))
+    linked = with_odometry(disturbed, detections, np.random.default_rng([seed, 1]),
+                            odometry)
+    given = MappingOptions(pose_errors=prior, odometry_errors=odometry)
+    estimated = MappingOptions(estimate_pose_errors=True, odometry_errors=odometry)
     for name, seen, options in (
             ('plain', disturbed, MappingOptions()),
             ('given', disturbed, given), ('given+odometry', linked, given),
@@ -172,7 +172,11 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=KINDS)
     parser.add_argument('--levels', type=int, nargs='+', choices=range(len(LEVELS)),
                         default=range(len(LEVELS)), help='rows of 2 cm, 5 cm, 10 cm')
+    parser.add_argument('--odometry-noise', type=float, nargs=2, metavar=('METRES', 'DEGREES'),
+                        default=(OdometryErrors.sigma_m, OdometryErrors.sigma_deg),
+                        help='after a metre, on each axis (%(default)s)')
     options = parser.parse_args(args)
+    odometry = OdometryErrors(*options.odometry_noise)
     recorded = load_observations(options.observations)
     detections = recorded.select_frames(range(0, len(recorded), options.every))
     truth = build_map(detections).landmark_map
@@ -181,7 +185,7 @@ def main(args: Sequence[str] | None = None) -> int:
     for kind in options.kinds:
         for level in options.levels:
             for seed in options.seeds:
-                compare(detections, kind, LEVELS[level], seed, truth)
+                compare(detections, kind, LEVELS[level], seed, truth, odometry)
     return 0
 
 

@@ -110,11 +110,8 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                                    f'{" or ".join(types)}')
             if topic.message_count == 0:
                 raise DatasetError(f'{bag}: {name} has no messages')
-        image = _first(reader, topics.image)
         depth_type = reader.topic(topics.depth).msgtype if topics.depth else ''
-        poses = read_poses(reader, str(image.header.frame_id))
-        first_ns = stamp_ns(image)
-        check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, str(bag))
+        poses = _poses_of_images(reader, topics.image, read_poses, str(bag))
         info = next(reader.messages([topics.camera_info])).data
         count = reader.topic(topics.image).message_count
     decode = partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified)
@@ -131,8 +128,25 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     return Frames(bag, count, read_raw)
 
 
-def _first(reader: BagReader, name: str) -> Any:
-    return reader.deserialize(next(reader.messages([name])))
+def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
+    """Return the poses of a recording's camera by odometry.
+
+    Raises
+    ------
+    DatasetError
+        The topic or tf is missing or broken, or of another time than the images.
+    """
+    with BagReader(bag) as reader:
+        return _poses_of_images(reader, image_topic, read_odometry, f'{bag}: odometry')
+
+
+def _poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses, where: str
+                     ) -> Poses:
+    image = reader.deserialize(next(reader.messages([image_topic])))
+    poses = read_poses(reader, str(image.header.frame_id))
+    first_ns = stamp_ns(image)
+    check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, where)
+    return poses
 
 
 _Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']

@@ -124,7 +124,12 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
         None where odometry as a whole contradicts the poses, or joins no frames.
     str
     """
-    known = _Known.of(given, odom_from_camera)
+    with np.errstate(over='ignore', invalid='ignore'):  # NaN contradicts the poses, too
+        return _link(_Known.of(given, odom_from_camera), errors, noise)
+
+
+def _link(known: '_Known', errors: PoseErrors, noise: OdometryErrors) -> tuple[Steps | None, str]:
+    """Return what link_frames returns."""
     before = np.nonzero(np.diff(known.frames) == 1)[0]
     if len(before) == 0:
         return None, 'odometry is left out: no two successive frames have it'
@@ -134,9 +139,10 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
     kept = pairs.excess <= _CONTRADICTION
     if not kept.any():
         return None, 'odometry is left out: it contradicts the poses between all frames'
-    note = f'odometry joins {np.count_nonzero(kept)} of {len(given.rotations) - 1} pairs of frames'
+    pairs_of_frames = len(known.given.rotations) - 1
+    note = f'odometry joins {np.count_nonzero(kept)} of {pairs_of_frames} pairs of frames'
     if not kept.all():
-        first_s = given.stamps_s[known.frames[before[~kept][0]]]
+        first_s = known.stamps_s[before[~kept][0]]
         note += (f'; it jumps {np.count_nonzero(~kept)} times, first at {first_s:.2f} s, which is '
                  'left out')
     return Steps(known.frames[before[kept]], pairs.shifts[kept], pairs.turns[kept],
