@@ -131,14 +131,12 @@ def _nearest(centers: NDArray[np.float64], found: LandmarkMap, truth: LandmarkMa
 
 def compare(detections: PosedDetections, kind: str, level: tuple[float, float], seed: int,
             truth: LandmarkMap, odometry: OdometryErrors) -> None:
-    """Print a row of the table for plain, given and estimated errors, each with odometry too."""
-    prior = prior_of(kind, *level)
+    """Print rows of the table: plain, and refined without and with odometry."""
     drawn = draw_errors(kind, detections.stamps_s, PoseErrors(*level, CORRELATION_S),
                         np.random.default_rng(seed))
     disturbed, plain = disturb(detections, drawn), None
-    linked = with_odometry(disturbed, detections, np.random.default_rng([seed, 1]),
-                            odometry)
-    given = MappingOptions(pose_errors=prior, odometry_errors=odometry)
+    linked = with_odometry(disturbed, detections, np.random.default_rng([seed, 1]), odometry)
+    given = MappingOptions(pose_errors=prior_of(kind, *level), odometry_errors=odometry)
     estimated = MappingOptions(estimate_pose_errors=True, odometry_errors=odometry)
     for name, seen, options in (
             ('plain', disturbed, MappingOptions()),

@@ -27,6 +27,9 @@ _LOSS_SCALE = 3.0
 # Odometry and poses contradict each other from this length on, in standard deviations of both.
 # Three numbers are longer once in a thousand times.
 _CONTRADICTION = 4.0
+# Between successive frames, odometry jumps beyond this length. Estimated deviations of the poses
+# may be half of the true ones: a lower limit leaves out what odometry corrects most. A guess.
+_JUMP = 8.0
 # Wrong units, mounts and clocks show over windows of time, more than this share of which then
 # contradict the poses. A guess.
 _WINDOW_S, _MAX_CONTRADICTIONS = 5.0, 0.3
@@ -136,7 +139,7 @@ def _link(known: '_Known', errors: PoseErrors, noise: OdometryErrors) -> tuple[S
     if complaint := _contradiction(known, errors, noise):
         return None, complaint
     pairs = known.compare(before, before + 1, errors, noise)
-    kept = pairs.excess <= _CONTRADICTION
+    kept = pairs.excess <= _JUMP
     if not kept.any():
         return None, 'odometry is left out: it contradicts the poses between all frames'
     pairs_of_frames = len(known.given.rotations) - 1

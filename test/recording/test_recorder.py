@@ -182,7 +182,8 @@ def test_a_bag_says_the_same_and_asks_where_its_poses_are(walk, recorded, tmp_pa
     again = load_recorded(file).detections
     assert (again.odom_from_camera == again.map_from_camera).all()
     assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
-    assert main(arguments(*linked, '/ground_truth', '--pose-noise', '0.02', '0.5')) == 0
+    assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,
+                          '--odometry-noise', 0.02, 1)) == 0
     assert 'odometry joins 14 of 14 pairs of frames' in capsys.readouterr().out
     stamp = file.stat().st_mtime_ns
     assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
