@@ -139,6 +139,10 @@ def half_as_far(poses):
     poses[:, :3, 3] *= 0.5
 
 
+def a_fourth_too_far(poses):
+    poses[:, :3, 3] *= 1.25
+
+
 def standing(poses):
     poses[:] = np.eye(4)
 
@@ -155,8 +159,8 @@ def huge(poses):
     poses[:, :3, 3] *= 1e300
 
 
-@pytest.mark.parametrize('change', [millimetres, half_as_far, standing, two_seconds_late,
-                                    another_camera, huge])
+@pytest.mark.parametrize('change', [
+    millimetres, half_as_far, a_fourth_too_far, standing, two_seconds_late, another_camera, huge])
 def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
     built = build_map(moved_odometry(linked, change), OPTIONS)
     assert 'odometry is left out: it contradicts the poses in ' in note_on(built)
