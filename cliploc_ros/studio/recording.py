@@ -24,6 +24,7 @@ from cliploc_ros.mapping.refit import RefitMap, refit_map
 from cliploc_ros.mapping.views import Views, make_views
 from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.landmark import Landmark, map_of
+from cliploc_ros.studio.looks import Look, look_of_boxes
 
 # Fewer boxes leave an ellipsoid open.
 _MIN_BOXES = 3
@@ -57,6 +58,13 @@ class Recording:
             np.array([numbers.get(one.class_id, -1) for one in landmarks.values()]))
         shown = associate(self.views, ellipsoids, self.options.association_iou)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
+
+    def look_of(self, landmarks: Mapping[str, Landmark], landmark_id: str, encoder_key: str
+                ) -> Look | None:
+        """Return what an encoder saw of a landmark; None where this recording does not know it."""
+        if self.detections.embeddings is None or self.detections.encoder_key != encoder_key:
+            return None
+        return look_of_boxes(self.detections, self.boxes_of(landmarks)[landmark_id])
 
     def refit(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str]) -> RefitMap:
         """Fit some of the landmarks to their boxes.

@@ -65,6 +65,8 @@ class Studio:
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
         self._counts: dict[str, int] = {}
+        if recording is not None and recording.detections.encoder_key:
+            document.take_encoder(recording.detections.encoder_key)
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -256,10 +258,14 @@ class Studio:
         fit = fit_boxes(detections.camera, [DrawnBox(detections.map_from_camera[view], box)
                                             for view, box in sorted(self.drawn.items())])
         change = edits.create(self.document.landmarks, label, class_id, fit.center, fit.basis)
+        (landmark_id,) = change.after
+        look = self._recording().look_of(change.apply(self.document.landmarks), landmark_id,
+                                         self.document.encoder_key)
+        change = edits.create(self.document.landmarks, label, class_id, fit.center, fit.basis,
+                              look)
         self.document.apply(change)
         self.document.select(change.after)
         self.drawn.clear()
-        (landmark_id,) = change.after
         return f'created {landmark_id}' + (f'; {fit.warning}' if fit.warning else '')
 
     # ---- the table ------------------------------------------------------------------------------
