@@ -90,7 +90,7 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     labels = list(landmark_map.labels)
     details = list(landmark_map.details or [LandmarkDetails()] * len(labels))
     for row in np.nonzero(embeddings.is_known)[0]:
-        fitting = _best_phrases(embeddings.means[row].astype(np.float32),
+        fitting = best_phrases(embeddings.means[row].astype(np.float32),
                                 [part for name in classes_of(landmark_map, int(row))
                                  for part in phrases[name]])
         labels[row] = fitting[0][0]
@@ -105,7 +105,7 @@ def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
+def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
                   ) -> tuple[tuple[str, float], ...]:
     """Return the best phrases with their weights, the best one first."""
     similarities = {
