@@ -6,9 +6,11 @@ Loading CLIP takes seconds, and reading a vocabulary for the first time up to a 
 goes on meanwhile. Only the last question counts.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,8 @@ _PHRASES = 5
 # Views in which a landmark without embeddings is looked at.
 _CROPS = 3
 _MOST_KEPT = 1000
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,20 @@ class Question:
         return self.landmark_id, self.class_names, None if look is None else look.key
 
 
+class FoundPhrases(NamedTuple):
+    """The best phrases, the best one first, and what a person should know; '' for nothing."""
+
+    phrases: tuple[str, ...]
+    note: str
+
+
+def _nothing(reason: object) -> FoundPhrases:
+    return FoundPhrases((), f'CLIP offers no phrases: {reason}')
+
+
+_PENDING = FoundPhrases((), 'CLIP looks for phrases; the map offers its own until then')
+
+
 class PhraseFinder:
     """Answers questions one at a time.
 
@@ -79,13 +97,12 @@ class PhraseFinder:
 
     def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None,
                  images: Images | None):
-        #: What a person should know; '' for nothing.
-        self.note = ''
         self._clip, self._vocabulary = clip, vocabulary
         self._recording, self._images = recording, images
         self._weights: ClipWeights | None = None
         self._encoder: ClipEncoder | None = None
-        self._answers: dict[tuple[object, ...], tuple[str, ...]] = {}
+        self._answers: dict[tuple[object, ...], FoundPhrases] = {}
+        self._fault: FoundPhrases | None = None
         self._wanted: Question | None = None
         self._condition = threading.Condition()
         self._listener: Callable[[], None] = lambda: None
@@ -93,21 +110,22 @@ class PhraseFinder:
         self._is_closed = False
 
     def subscribe(self, listener: Callable[[], None]) -> None:
-        """Call a function after each answer and each new note."""
+        """Call a function after each answer."""
         self._listener = listener
 
-    def answer(self, question: Question) -> tuple[str, ...]:
-        """Return the best phrases, the best first; none as long as they are not known."""
+    def answer(self, question: Question) -> FoundPhrases:
+        """Return the answer, or that it is not known yet."""
         with self._condition:
-            found = self._answers.get(question.key)
-            if found is None and not self._is_closed:
-                if self._wanted is None or self._wanted.key != question.key:
-                    self._wanted = question
-                    self._condition.notify()
-                if self._thread is None:
-                    self._thread = threading.Thread(target=self._work, daemon=True)
-                    self._thread.start()
-            return found or ()
+            found = self._answers.get(question.key, self._fault)
+            if found is not None:
+                return found
+            if self._wanted is None or self._wanted.key != question.key:
+                self._wanted = question
+                self._condition.notify()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, daemon=True)
+                self._thread.start()
+            return _PENDING
 
     def close(self) -> None:
         """Answer nothing more."""
@@ -122,14 +140,15 @@ class PhraseFinder:
             try:
                 found = self._find(question)
             except CliplocError as error:
-                found = ()
-                self._tell(f'CLIP offers no phrases: {error}')
-                if self._weights is None:
-                    self.close()
+                found = _nothing(error)
+            except Exception as error:  # of torch, open_clip: the page shows it and goes on
+                logger.exception('CLIP finds no phrases for %s', question.landmark_id)
+                found = _nothing(f'{type(error).__name__}: {error}')
             with self._condition:
                 if len(self._answers) >= _MOST_KEPT:
                     self._answers.clear()
                 self._answers[question.key] = found
+                self._fault = found if self._weights is None else None
             self._listener()
 
     def _next(self) -> Question | None:
@@ -139,26 +158,19 @@ class PhraseFinder:
                 self._condition.wait()
             return None if self._is_closed else self._wanted
 
-    def _tell(self, note: str) -> None:
-        self.note = note
-        self._listener()
-
-    def _find(self, question: Question) -> tuple[str, ...]:
+    def _find(self, question: Question) -> FoundPhrases:
         if self._weights is None:
-            self._tell('CLIP is loading; its phrases follow')
             self._weights = resolve_clip_weights(self._clip)
         mean = self._mean(question, self._weights)
         if mean is None:
-            self._tell('CLIP offers no phrases: neither embeddings nor images show this landmark')
-            return ()
+            return _nothing('neither embeddings nor images show all of this landmark')
         names = question.class_names
         phrases = phrases_of_classes(
             self._weights, self._clip,
             [{name: shipped_phrases(name) for name in names},
              {name: texts for name, texts in self._vocabulary.added.items() if name in names}])
-        self._tell('')
         best = best_phrases(mean, [part for name in names for part in phrases[name]])
-        return tuple(text for text, _ in best[:_PHRASES])
+        return FoundPhrases(tuple(text for text, _ in best[:_PHRASES]), '')
 
     def _mean(self, question: Question, weights: ClipWeights) -> NDArray[np.float32] | None:
         """Return the mean embedding (d,) of a landmark's crops; None where nothing shows it."""

@@ -20,7 +20,7 @@ from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import Images
 from cliploc_ros.studio.landmark import Landmark
-from cliploc_ros.studio.phrases import PhraseFinder, Question
+from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
 from cliploc_ros.studio.picture import Outline, Pixel, box_at, draw, landmark_at, project
 from cliploc_ros.studio.recording import LEAST_BOXES, Recording
 from cliploc_ros.studio.trials import Answer, relocalize
@@ -327,9 +327,8 @@ class Studio:
         """Return up to five phrases for the selected landmark: CLIP's, or else the map's."""
         if self.document.selected is None:
             return ()
-        landmark_id, one = self.document.selected
-        if self.finder is not None and (found := self.finder.answer(Question(
-                landmark_id, self.document.landmarks, self.document.encoder_key))):
+        _, one = self.document.selected
+        if found := self._ask_clip().phrases:
             return found
         own = sorted(one.details.labels or (), key=lambda pair: -pair[1])
         alike = [other.label for other in self.document.landmarks.values()
@@ -339,7 +338,13 @@ class Studio:
     @property
     def phrase_note(self) -> str:
         """Return what a person should know of CLIP's phrases; '' for nothing."""
-        return '' if self.finder is None else self.finder.note
+        return self._ask_clip().note
+
+    def _ask_clip(self) -> FoundPhrases:
+        if self.finder is None or self.document.selected is None:
+            return FoundPhrases((), '')
+        return self.finder.answer(Question(self.document.selected[0], self.document.landmarks,
+                                           self.document.encoder_key))
 
 
 def color_of(class_id: str) -> Rgb:

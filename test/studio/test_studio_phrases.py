@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Phrases that the demo's CLIP chooses for landmarks, and what it saw of a new one."""
 
+import re
 import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import Person, wait_for
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.landmark_embeddings import embeddings_path, load_landmark_embeddings
@@ -60,11 +62,34 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
-    assert any('loading' in note for note in notes) and studio.phrase_note == ''
+    assert any('CLIP looks' in note for note in notes) and studio.phrase_note == ''
     studio.document.apply(edits.move(studio.document.landmarks, 'bowl_1', [1, 1, 1]))
     assert studio.phrases() == found, 'a drag asks nothing'
     studio.finder.close()
     studio.document.close()
+
+
+@pytest.mark.clock
+@pytest.mark.needs('viser', 'playwright', 'chromium')
+def test_a_person_chooses_a_phrase(chromium, path):
+    """The page goes on while CLIP loads."""
+    from cliploc_ros.studio.server import serve_studio
+
+    studio = opened(path, '--images', WALK, *CLIP)
+    document, truth = studio.document, studio.document.landmarks['bowl_1'].label
+    document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
+    with serve_studio(studio, '127.0.0.1', 0) as (url, _):
+        person = Person(chromium, url)
+        person.find('bowl_1')
+        person.click(re.compile('^bowl_1 '))
+        wait_for(lambda: truth in studio.phrases(), 'the phrases of CLIP')
+        person.field('Phrases').click()
+        person.picture('phrases')
+        person.page.get_by_role('option', name=truth).click()
+        wait_for(lambda: document.landmarks['bowl_1'].label == truth, 'the label')
+        person.page.close()
+    studio.finder.close()
+    document.close()
 
 
 def observed(tmp_path, object_id):
