@@ -38,19 +38,24 @@ class Look:
         The mean direction of its crops, of unit length.
     medoids : ndarray (m, d) float16
         Crops that stand for all of its crops, unit rows; at most five.
+    encoder_key : str
+        Of the encoder.
     """
 
     mean: NDArray[np.float16]
     medoids: NDArray[np.float16]
+    encoder_key: str
 
     @cached_property
     def key(self) -> str:
         """Return what tells one look from another."""
-        return hashlib.sha256(self.mean.tobytes() + self.medoids.tobytes()).hexdigest()[:24]
+        content = self.encoder_key.encode() + self.mean.tobytes() + self.medoids.tobytes()
+        return hashlib.sha256(content).hexdigest()[:24]
 
     def to_json(self) -> dict[str, Any]:
         """Return the look as JSON holds it."""
-        return {'look': self.key, 'mean': base64.b64encode(self.mean.tobytes()).decode(),
+        return {'look': self.key, 'encoder': self.encoder_key,
+                'mean': base64.b64encode(self.mean.tobytes()).decode(),
                 'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
 
 
@@ -59,7 +64,7 @@ def look_from_json(tree: Mapping[str, Any]) -> Look | None:
     try:
         mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
                          for name in ('mean', 'medoids'))
-        look = Look(mean, medoids.reshape(-1, len(mean)))
+        look = Look(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
     except (KeyError, TypeError, ValueError):
         return None
     return look if look.key == tree.get('look') else None
@@ -67,6 +72,8 @@ def look_from_json(tree: Mapping[str, Any]) -> Look | None:
 
 def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look | None:
     """Return the look of one landmark that several become; None where no look is known.
+
+    Looks of another encoder than the first one's do not count.
 
     Parameters
     ----------
@@ -76,6 +83,9 @@ def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look 
     """
     known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
              if look is not None]
+    known = [(look, weight) for look, weight in known
+             if (look.encoder_key, len(look.mean)) == (known[0][0].encoder_key,
+                                                       len(known[0][0].mean))]
     if len(known) < 2:
         return known[0][0] if known else None
     mean = np.sum([weight * look.mean.astype(np.float32) for look, weight in known], axis=0)
@@ -86,7 +96,7 @@ def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look 
     shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
                              for look, weight in known])
     return Look((mean / length).astype(np.float16),
-                crops[choose_medoids(crops, shares)].astype(np.float16))
+                crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
 
 
 def look_of_boxes(detections: PosedDetections, rows: NDArray[np.int64]) -> Look | None:
@@ -101,7 +111,8 @@ def look_of_boxes(detections: PosedDetections, rows: NDArray[np.int64]) -> Look 
 def _looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
     offsets = embeddings.medoid_offsets
     return {landmark_id: Look(embeddings.means[row],
-                              embeddings.medoids[offsets[row]:offsets[row + 1]])
+                              embeddings.medoids[offsets[row]:offsets[row + 1]],
+                              embeddings.encoder_key)
             for row, landmark_id in enumerate(embeddings.landmark_ids)
             if embeddings.is_known[row]}
 
@@ -128,7 +139,8 @@ class LookFile(NamedTuple):
     def write(self, looks: Mapping[str, Look | None]) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
 
-        Nothing is written where nothing changed, and nothing over what another program wrote.
+        Those of another encoder are left out. Nothing is written where nothing changed, and
+        nothing over what another program wrote.
 
         Returns
         -------
@@ -142,15 +154,18 @@ class LookFile(NamedTuple):
         MapError
             The file cannot be written; it is as it was.
         """
-        known = {key: look for key, look in looks.items() if look is not None}
+        own = [look for look in (*self.looks.values(), *looks.values())
+               if look is not None and look.encoder_key == self.encoder_key]
+        size = len(own[0].mean) if own else 0
+        known = {key: look for key, look in looks.items() if look is not None
+                 and (look.encoder_key, len(look.mean)) == (self.encoder_key, size)}
         if not self.encoder_key or self.is_of(known):
             return self, ''
         if _state_of(self.path) != self.state:
             return self, (f'{self.path.name}: another program changed this file, so the studio '
                           'leaves it as it is; build the map again, or remove the file')
-        size = len(next(iter((known or self.looks).values())).mean)
-        nothing = Look(np.zeros(size, np.float16), np.empty((0, size), np.float16))
-        rows = [look or nothing for look in looks.values()]
+        nothing = Look(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
+        rows = [known.get(key, nothing) for key in looks]
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
             self.encoder_key, tuple(looks), np.array([one.mean for one in rows]),
             np.concatenate([one.medoids for one in rows]),

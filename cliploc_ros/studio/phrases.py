@@ -42,13 +42,10 @@ class Question:
     landmark_id : str
     landmarks : mapping of str to Landmark
         Of the whole map.
-    encoder_key : str
-        Of the encoder that made the landmarks' looks; '' for none.
     """
 
     landmark_id: str
     landmarks: Mapping[str, Landmark]
-    encoder_key: str
 
     @property
     def landmark(self) -> Landmark:
@@ -175,7 +172,7 @@ class PhraseFinder:
     def _mean(self, question: Question, weights: ClipWeights) -> NDArray[np.float32] | None:
         """Return the mean embedding (d,) of a landmark's crops; None where nothing shows it."""
         look = question.landmark.look
-        if question.encoder_key != weights.key:
+        if look is not None and look.encoder_key != weights.key:
             look = None
         if look is None and self._recording is not None:
             rows = self._recording.boxes_of(question.landmarks)[question.landmark_id]

@@ -343,8 +343,7 @@ class Studio:
     def _ask_clip(self) -> FoundPhrases:
         if self.finder is None or self.document.selected is None:
             return FoundPhrases((), '')
-        return self.finder.answer(Question(self.document.selected[0], self.document.landmarks,
-                                           self.document.encoder_key))
+        return self.finder.answer(Question(self.document.selected[0], self.document.landmarks))
 
 
 def color_of(class_id: str) -> Rgb:

@@ -176,6 +176,7 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
     studio = Studio(Document(path), Recording(views), open_images(walk, None))
     with serve_studio(studio, '127.0.0.1', 0) as (url, server):
         person = Person(chromium, url)
+        person.page.set_viewport_size({'width': 800, 'height': 240})  # less to render
         for one, boxes in drawn:
             draw(person, studio, server, boxes)
             create(person, studio, server, one)
