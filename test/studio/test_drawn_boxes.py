@@ -128,13 +128,11 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
             'label': 'x', 'class_id': detections.class_names[landmarks.classes[number]],
             **shape_fields(fit.center, fit.basis)})
         unseen[str(number)] = others[~np.isin(views.frames[others], half)]
-    refitted = Recording(detections.select_frames(half)).refit(drawn, drawn).landmark_map
-    bases = np.array([edits.take_fits(drawn, [key], refitted).after.get(key, drawn[key]).basis
-                      for key in drawn])
-    before, after = (np.array([np.median(ious_with(views, unseen[key], *one)) for key, one in zip(
-        drawn, pairs, strict=True)]) for pairs in (
-            [(one.center, one.basis) for one in drawn.values()],
-            list(zip(refitted.centers, bases, strict=True))))
+    recording = Recording(detections.select_frames(half))
+    refitted = edits.take_fits(drawn, drawn, recording.refit(drawn, drawn).landmark_map)
+    before, after = ([np.median(ious_with(views, unseen[key], one.center, one.basis))
+                      for key, one in landmarks.items()]
+                     for landmarks in (drawn, refitted.apply(drawn)))
     print(f'{len(drawn)} objects from three boxes of the detector: median IoU in unseen views '
           f'{np.median(before):.3f}, after refitting {np.median(after):.3f}')
     assert len(drawn) > 20
