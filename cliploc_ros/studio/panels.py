@@ -294,10 +294,9 @@ class TablePanel:
 class ViewPanel:
     """The selected view: its picture, and boxes for a new landmark."""
 
-    def __init__(self, page: 'Page'):
+    def __init__(self, page: 'Page', panel: Any):
         self._page, self._studio = page, page.studio
         gui = page.server.gui
-        panel = gui.add_panel()
         with panel.add_tab('View'):
             self._view = Field(gui.add_slider('View', 0, max(1, self._studio.views - 1), 1, 0))
             self._picture = gui.add_image(np.zeros((3, 4, 3), dtype=np.uint8), format='jpeg')
@@ -317,7 +316,6 @@ class ViewPanel:
                 self._create = _button(page, 'Create landmark', lambda: self._studio.create(
                     self._label.value, self._class.value), color='green')
                 _button(page, 'Forget the boxes', self._studio.clear_boxes)
-        panel.dock_left()
         look.on_click(page.look_through)
         here.on_click(lambda event: page.ask(event, self._studio.relocalize_here))
         everywhere.on_click(lambda event: page.ask(event, self._studio.relocalize_all))
