@@ -21,6 +21,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from std_srvs.srv import Trigger
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
@@ -265,7 +266,7 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
     name = '/' + name.strip('/')
     context = Context()
     try:
-        rclpy.validate_topic_name.validate_topic_name(name)
+        validate_full_topic_name(name)
         rclpy.init(args=list(ros_args), context=context,
                    signal_handler_options=SignalHandlerOptions.NO)
         node = Node('map_studio', context=context, enable_rosout=False,

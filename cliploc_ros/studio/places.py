@@ -108,13 +108,15 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
     MapError
         There are no landmarks.
     """
-    begin = time.monotonic()
     tell(0.0)
     landmark_map = map_of(landmarks, 'map', 'studio')
     model, detector = _detector(landmark_map, recording)
     grid = _grid(landmark_map, recording, before)
     trials: list[Trial] = []
+    begin = time.monotonic()
     for trial in each_pose(model, landmark_map, grid.poses, _OPTIONS):
+        if not trials:
+            begin = time.monotonic()  # the first one may have compiled kernels
         trials.append(trial)
         tell(len(trials) / len(grid.poses))
         is_whole = len(trials) % _OPTIONS.headings == 0

@@ -28,12 +28,11 @@ _LIFT_M = 0.005
 _STOREY_M = 2.5
 _MAX_LOOK_ALIKES = 20
 _CIRCLE_POINTS = 48
-_LEGEND = ('<span style="color:#003E6B">■</span> every useful heading accepted '
-           '<span style="color:#56B4E9">■</span> half '
-           '<span style="color:#FBE9C6">■</span> none '
-           '<span style="color:#999999">■</span> fewer than 3 landmarks in view '
-           f'<span style="color:{MISLED}">■</span> misled, with a line to the wrong pose '
-           f'<span style="color:{LOOK_ALIKE}">■</span> places that look alike')
+_LEGEND = tuple(f'<span style="color:{color}">■</span> {text}' for color, text in (
+    ('#003E6B', 'all headings with three landmarks are accepted'), ('#56B4E9', 'half of them'),
+    ('#FBE9C6', 'none'), ('#BEBEBE', 'no heading shows three landmarks'),
+    (MISLED, 'a heading is misled; the line leads to the wrong pose'),
+    (LOOK_ALIKE, 'places that look alike')))
 
 
 class PlacesPanel:
@@ -86,7 +85,7 @@ class PlacesPanel:
             if self.search.is_stale():
                 lines.append('<b>of the map before the last edits: find again</b>')
             lines += map(html.escape, places.lines(self.search.before))
-            lines.append(_LEGEND)
+            lines += _LEGEND
         return ('<div style="padding:0.3em 1em;font-size:0.85em">'
                 f'{"<br>".join(lines)}</div>' if lines else '')
 
@@ -105,7 +104,7 @@ class PlacesPanel:
         tiles = scene.add_batched_meshes_simple(
             '/coverage/tiles', _TILE * check.spacing_m * _GAP, _TILE_FACES,
             np.tile([1.0, 0.0, 0.0, 0.0], (len(positions), 1)), positions,
-            batched_colors=tile_colors(check), opacity=0.75, side='double', lod='off',
+            batched_colors=tile_colors(check), opacity=0.9, side='double', lod='off',
             cast_shadow=False, receive_shadow=False)
         tiles.on_click(lambda event: self._page.ask(
             event, lambda: _tile_text(check, event.instance_index)))
