@@ -69,7 +69,8 @@ class LivePanel:
             return
         self._shown = state
         lines = '<br>'.join(html.escape(line[:_MAX_TEXT]) for line in self._lines(state))
-        self._status.content = f'<div style="padding:0 1em;font-size:0.85em">{lines}</div>'
+        self._status.content = ('<div style="padding:0 1em;font-size:0.85em;'
+                                f'overflow-wrap:anywhere">{lines}</div>')
         self._relocalize.disabled = self._reload.disabled = state.is_busy
         for handle in self._handles:
             handle.remove()
@@ -79,14 +80,13 @@ class LivePanel:
 
     def _lines(self, state: 'LiveState') -> list[str]:
         document = self._page.studio.document
-        if not state.is_heard:
-            lines = [f'{self._live.name}: nothing heard']
-        else:
+        lines = [f'{self._live.name}: nothing heard']
+        if state.is_heard:
             lines = [f'{self._live.name}: {state.lifecycle}',
                      f'its map: {state.map_text or "none loaded"}']
-        file = Path(state.map_file)
-        if file.is_absolute() and file.resolve() != document.path.resolve():
-            lines.append(f'it reads {file}, which is not the map of this studio')
+            file = Path(state.map_file)
+            if file.is_absolute() and file.resolve() != document.path.resolve():
+                lines.append(f'it reads {file}, which is not the map of this studio')
         if state.is_busy:
             lines.append('waiting for its answer')
         lines.append(f'last answer: {state.verdict}' if state.verdict else 'no answer yet')

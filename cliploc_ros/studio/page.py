@@ -136,6 +136,9 @@ class Page:
         except CliplocError as error:
             self._notify(client, 'Not done', str(error), 'red')
             return
+        except Exception as error:
+            self._notify(client, 'Internal error', f'{error}; the terminal has more', 'red')
+            raise
         finally:
             self._changed.set()
         if message:

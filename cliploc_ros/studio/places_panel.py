@@ -16,9 +16,9 @@ from cliploc_ros.studio.places import Places, PlacesSearch
 if TYPE_CHECKING:
     from cliploc_ros.studio.page import Page
 
-# As in the pictures of check_map: no heading accepted, half of them, all of them.
-_HEAT = np.array([[251, 233, 198], [86, 180, 233], [0, 62, 107]], dtype=np.float64)
-_UNSEEN_RGB = (190, 190, 190)
+# No heading accepted, half of them, all of them. Light washes out the paler ones of check_map.
+_HEAT = np.array([[230, 159, 0], [86, 180, 233], [0, 62, 107]], dtype=np.float64)
+_UNSEEN_RGB = (120, 120, 120)
 _TILE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 _TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 _GAP = 0.92
@@ -30,7 +30,7 @@ _MAX_LOOK_ALIKES = 20
 _CIRCLE_POINTS = 48
 _LEGEND = tuple(f'<span style="color:{color}">■</span> {text}' for color, text in (
     ('#003E6B', 'all headings with three landmarks are accepted'), ('#56B4E9', 'half of them'),
-    ('#FBE9C6', 'none'), ('#BEBEBE', 'no heading shows three landmarks'),
+    ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike')))
 
@@ -86,7 +86,7 @@ class PlacesPanel:
                 lines.append('<b>of the map before the last edits: find again</b>')
             lines += map(html.escape, places.lines(self.search.before))
             lines += _LEGEND
-        return ('<div style="padding:0.3em 1em;font-size:0.85em">'
+        return ('<div style="padding:0.3em 1em;font-size:0.85em;overflow-wrap:anywhere">'
                 f'{"<br>".join(lines)}</div>' if lines else '')
 
     def _set_visible(self) -> None:

@@ -104,5 +104,5 @@ def test_colours_of_positions():
     check = GridCheck(np.zeros((4, 3)), np.ones(4, dtype=bool), np.array([4, 0, 0, 3]),
                       np.array([0, 0, 0, 1]), np.array([[5.0] * 4, [5.0] * 4, [1.0] * 4,
                                                         [5.0] * 4]), 0.5, ())
-    assert tile_colors(check).tolist() == [[0, 62, 107], [251, 233, 198], [190, 190, 190],
+    assert tile_colors(check).tolist() == [[0, 62, 107], [230, 159, 0], [120, 120, 120],
                                            [213, 94, 0]]
