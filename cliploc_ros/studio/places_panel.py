@@ -16,8 +16,9 @@ from cliploc_ros.studio.places import Places, PlacesSearch
 if TYPE_CHECKING:
     from cliploc_ros.studio.page import Page
 
-# No heading accepted, half of them, all of them. Light washes out the paler ones of check_map.
-_HEAT = np.array([[230, 159, 0], [86, 180, 233], [0, 62, 107]], dtype=np.float64)
+# No heading is accepted; few are, all are.
+_NONE_RGB = (230, 159, 0)
+_HEAT = np.array([[160, 210, 240], [0, 62, 107]], dtype=np.float64)
 _UNSEEN_RGB = (120, 120, 120)
 _TILE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 _TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -29,7 +30,7 @@ _STOREY_M = 2.5
 _MAX_LOOK_ALIKES = 20
 _CIRCLE_POINTS = 48
 _LEGEND = tuple(f'<span style="color:{color}">■</span> {text}' for color, text in (
-    ('#003E6B', 'all headings with three landmarks are accepted'), ('#56B4E9', 'half of them'),
+    ('#003E6B', 'all headings with three landmarks are accepted'), ('#A0D2F0', 'few of them'),
     ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike')))
@@ -104,7 +105,9 @@ class PlacesPanel:
         tiles = scene.add_batched_meshes_simple(
             '/coverage/tiles', _TILE * check.spacing_m * _GAP, _TILE_FACES,
             np.tile([1.0, 0.0, 0.0, 0.0], (len(positions), 1)), positions,
-            batched_colors=tile_colors(check), opacity=0.9, side='double', lod='off',
+            # the page takes colours of instances for linear light
+            batched_colors=(255.0 * (tile_colors(check) / 255.0) ** 2.2).astype(np.uint8),
+            opacity=0.9, material='toon5', side='double', lod='off',
             cast_shadow=False, receive_shadow=False)
         tiles.on_click(lambda event: self._page.ask(
             event, lambda: _tile_text(check, event.instance_index)))
@@ -139,7 +142,8 @@ def tile_colors(check: GridCheck) -> NDArray[np.uint8]:
     """Return the colour (P, 3) of each position: how many of its useful headings are accepted."""
     useful = check.useful
     share = np.clip(check.accepted / np.maximum(useful, 1), 0.0, 1.0)
-    colors = np.column_stack([np.interp(share, [0.0, 0.5, 1.0], channel) for channel in _HEAT.T])
+    colors = np.column_stack([np.interp(share, [0.0, 1.0], channel) for channel in _HEAT.T])
+    colors[check.accepted == 0] = _NONE_RGB
     colors[(useful == 0) & (check.accepted == 0)] = _UNSEEN_RGB
     colors[check.misled > 0] = _rgb(MISLED)
     return np.asarray(colors.round(), dtype=np.uint8)

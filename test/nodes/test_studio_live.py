@@ -4,6 +4,8 @@
 
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 from contextlib import contextmanager
 
@@ -197,3 +199,27 @@ def test_the_studio_ends_while_a_request_waits(own_relocalizer):
 def test_names_that_are_none(name):
     with pytest.raises(OptionsError, match='--ros'), follow_relocalizer(name):
         pass
+
+
+@pytest.mark.needs('viser')
+def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_path):
+    own_relocalizer()
+    process = start('cli.studio', tmp_path / 'map.yaml', '--ros', '--no-browser', '--port', '0')
+    process.wait_for_output('studio: http')
+    code, seconds = process.stop(signal.SIGINT)
+    assert code == 130 and seconds < 10.0
+    assert 'Traceback' not in process.output() and 'error' not in process.output()
+
+
+@pytest.mark.needs('viser')
+def test_without_ros_the_studio_runs_and_says_what_is_missing(tmp_path):
+    """Its core imports no ROS; --ros names what to source."""
+    code = ('import sys\nsys.modules["rclpy"] = None\n'
+            'import cliploc_ros.studio.server\n'
+            'assert not [name for name in sys.modules if name.endswith("_msgs")]\n'
+            'from cliploc_ros.cli.studio import main\n'
+            f'sys.exit(main([{str(tmp_path / "map.yaml")!r}, "--ros", "--no-browser"]))')
+    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, capture_output=True,
+                          text=True, timeout=120)
+    assert done.returncode == 1 and done.stdout == ''
+    assert done.stderr.startswith('error: --ros needs ROS') and 'setup.bash' in done.stderr

@@ -3,18 +3,24 @@
 """Coverage and look-alike places of the studio, without a browser."""
 
 import re
+import shutil
 import threading
+import time
 
 import numpy as np
 import pytest
 from two_rooms import write_two_rooms
 
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
 from cliploc_ros.mapping.checking.report import GridCheck
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.places import PlacesSearch, find_places
+from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
 
 
@@ -106,3 +112,40 @@ def test_colours_of_positions():
                                                         [5.0] * 4]), 0.5, ())
     assert tile_colors(check).tolist() == [[0, 62, 107], [230, 159, 0], [120, 120, 120],
                                            [213, 94, 0]]
+
+
+def test_a_large_map_takes_no_longer_than_it_may(tmp_path):
+    """Prints the processor time: 5,000 landmarks in a hall of 60 m."""
+    rng, count = np.random.default_rng(0), 5000
+    words = rng.choice(['red', 'blue', 'green', 'small'], count)
+    classes = tuple(rng.choice(['cup', 'book', 'tv', 'plant'], count))
+    write_map(tmp_path / 'map.yaml', LandmarkMap(
+        'map', tuple(f'id_{row}' for row in range(count)),
+        tuple(f'a {word} {name}' for word, name in zip(words, classes, strict=True)), classes,
+        rng.uniform(-30.0, 30.0, (count, 3)) * (1.0, 1.0, 0.05), np.full((count, 3), 0.1),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    document = Document(tmp_path / 'map.yaml')
+    begin_s, limit_s = time.process_time(), 2.0
+    places = find_places(document.landmarks, None, None, silent, limit_s)
+    tried = len(places.check.positions)
+    print(f'\n{count} landmarks: {tried} of {len(places.grid.positions)} positions in '
+          f'{limit_s:g} s, {time.process_time() - begin_s:.1f} s of processor time with '
+          'look-alikes and all')
+    assert 0 < tried < len(places.grid.positions)
+    document.close()
+
+
+def test_the_shared_office(shared_data, tmp_path):
+    """Prints the processor time, and what the figures are."""
+    folder = shared_data / 'tum_fr3_office'
+    shutil.copy(folder / 'map.yaml', tmp_path)
+    detections = load_observations(folder / 'observations.npz')
+    recording = Recording(detections.select_frames(range(0, len(detections), 20)))
+    document = Document(tmp_path / 'map.yaml')
+    begin_s = time.process_time()
+    places = find_places(document.landmarks, recording, None, silent)
+    print(f'\nfr3: {time.process_time() - begin_s:.1f} s of processor time',
+          *places.lines(None), sep='\n')
+    assert places.detector == 'the detector is as in the recording'
+    assert (places.check.accepted > 0).mean() > 0.3
+    document.close()
