@@ -286,9 +286,9 @@ class TablePanel:
         selection = self._studio.document.selection
         if selection != self._followed:
             self._followed = selection
-            for row, one in enumerate(rows):
+            for place, one in enumerate(rows):
                 if selection and one.landmark_id == selection[-1]:
-                    self._first = row // _ROWS * _ROWS
+                    self._first = place // _ROWS * _ROWS
         if self._first >= max(1, len(rows)):
             self._first = max(0, (len(rows) - 1) // _ROWS * _ROWS)
         shown = rows[self._first:self._first + _ROWS]
