@@ -8,6 +8,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.images import Images
+    from cliploc_ros.studio.live import LiveRelocalizer
     from cliploc_ros.studio.phrases import PhraseFinder
     from cliploc_ros.studio.recording import Recording
     from cliploc_ros.studio.studio import Studio
@@ -26,6 +28,7 @@ examples:
   studio office.yaml --observations office.npz --images office_bag
   studio office.yaml --images tum_folder_with_ground_truth
   studio                     an empty map, to be saved as map.yaml
+  studio office.yaml --ros   with the answers of the relocalizer that runs
 
 Edits are kept beside the map as they are made: a studio that was killed restores them.
 """
@@ -33,8 +36,9 @@ Edits are kept beside the map as they are made: a studio that was killed restore
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the studio; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
     options = make_parser().parse_args(plain_args)
+    options.ros_args = ros_args
     interrupt_on_sigterm()
     return run_command(lambda: serve(options))
 
@@ -43,7 +47,8 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Create and correct a map in the browser. Needs no sourced ROS.')
+        description='Create and correct a map in the browser. Needs no sourced ROS, except for '
+        '--ros.')
     parser.add_argument('map', type=Path, nargs='?', metavar='MAP',
                         help='a map file; one that does not exist yet starts empty (map.yaml, '
                         'or the first free of map-2.yaml, map-3.yaml, ...)')
@@ -66,6 +71,10 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
                         help='listen at this address too; the URL then holds a token '
                         '(%(default)s: this machine only)')
+    parser.add_argument('--ros', action='store_true', help="show the running relocalizer's last "
+                        'answer in the map, and let it relocalize and reload the map')
+    parser.add_argument('--relocalizer', default='/relocalizer', metavar='NAME',
+                        help='its name, with its namespace (%(default)s)')
     parser.add_argument('--no-browser', action='store_true', help='print the URL only')
     return parser
 
@@ -80,7 +89,8 @@ def serve(options: argparse.Namespace) -> int:
 
     studio = open_studio(options)
     try:
-        with serve_studio(studio, options.host, options.port) as served:
+        with (follow(options) as live,
+              serve_studio(studio, options.host, options.port, live) as served):
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
             for note in studio.document.notes:
@@ -92,6 +102,24 @@ def serve(options: argparse.Namespace) -> int:
     finally:
         studio.document.close()
     return 0
+
+
+def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocalizer | None]':
+    """Return the running relocalizer where it is asked for.
+
+    Raises
+    ------
+    OptionsError
+        There is no ROS.
+    """
+    if not options.ros:
+        return nullcontext()
+    try:
+        from cliploc_ros.studio.live import follow_relocalizer
+    except ImportError as error:
+        raise OptionsError(f'--ros needs ROS ({error}): source it first, as with source '
+                           '/opt/ros/jazzy/setup.bash') from error
+    return follow_relocalizer(options.relocalizer, options.ros_args)
 
 
 def open_studio(options: argparse.Namespace) -> 'Studio':

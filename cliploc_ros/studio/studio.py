@@ -66,6 +66,8 @@ class Studio:
         self.accepted: set[str] = set()
         self._images = images
         self._checks: dict[str, LandmarkCheck] = {}
+        # the row of the table that was selected last by walking through it
+        self._row = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
         self._counts: dict[str, int] = {}
@@ -271,6 +273,7 @@ class Studio:
         """Judge all landmarks by the recording; the table then has the worst first."""
         found = self._recording().check(self.document.landmarks)
         self._checks = {one.landmark_id: one for one in found}
+        self._row = 0
         serious = sum(one.severity >= 1.0 for one in found)
         return f'checked {len(found)} landmarks: {serious} with a serious fault'
 
@@ -292,17 +295,25 @@ class Studio:
 
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""
-        self.accepted.update(self._selected())
-        return f'accepted {", ".join(self._selected())}; {self.select_next()}'
+        ids = self._selected()
+        following = self._following()  # acceptance sorts the table anew
+        self.accepted.update(ids)
+        return f'accepted {", ".join(ids)}; {self._select_row(following)}'
 
     def select_next(self) -> str:
-        """Select the next landmark of the table."""
-        ids = [row.landmark_id for row in self.rows()]
+        """Select the next landmark of the table; after a deletion, the one that moved up."""
+        return self._select_row(self._following())
+
+    def _following(self) -> str:
+        ids, selection = [row.landmark_id for row in self.rows()], self.document.selection
         if not ids:
             raise EditError('there are no landmarks')
-        here = ids.index(self.document.selection[0]) if self.document.selection else -1
-        self.document.select([ids[(here + 1) % len(ids)]])
-        return f'selected {self.document.selection[0]}'
+        return ids[(ids.index(selection[0]) + 1 if selection else self._row) % len(ids)]
+
+    def _select_row(self, landmark_id: str) -> str:
+        self.document.select([landmark_id])
+        self._row = [row.landmark_id for row in self.rows()].index(landmark_id)
+        return f'selected {landmark_id}'
 
     # ---- the relocalizer ------------------------------------------------------------------------
 
