@@ -26,11 +26,11 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
-from numba.core import types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.core.types import BaseTuple, Type
 
 from cliploc_ros.cache_folder import resolve_cache_dir
 
@@ -196,7 +196,8 @@ def _collect(kernel: Dispatcher, found: dict[str, object]) -> None:
 def _read_function(function: FunctionType) -> tuple[str, object, list[Dispatcher]]:
     """Return a kernel's name, what it is compiled from, and the kernels that it calls."""
     name = f'{function.__module__}.{function.__qualname__}'
-    values, callees = [], []
+    callees = []
+    values: list[tuple[object, ...]] = []
     for used in sorted(_global_names(function.__code__) & function.__globals__.keys()):
         value = function.__globals__[used]
         if isinstance(value, Dispatcher):
@@ -241,9 +242,9 @@ def _constant(value: Any, where: str) -> object:
                     'of its source does not cover it')
 
 
-def _describe(kind: types.Type) -> object:
+def _describe(kind: Type) -> object:
     """Return what identifies a type of argument; the fields of a named tuple are part of it."""
-    if isinstance(kind, types.BaseTuple):
+    if isinstance(kind, BaseTuple):
         named = getattr(kind, 'instance_class', None)
         identity = named and (named.__module__, named.__qualname__, named._fields)
         return type(kind).__name__, identity, [_describe(each) for each in kind.types]
