@@ -30,7 +30,7 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
-from numba.core.types import BaseTuple, Type
+from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
 from cliploc_ros.cache_folder import resolve_cache_dir
 
