@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cliploc_ros.core.kernel_cache import FOLDERS, KernelCache
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS, KernelCache
 
 #: A literal 0 as an argument compiles a further specialization of a kernel; this one does not.
 ZERO = np.int64(0)
@@ -38,9 +38,9 @@ def warm_up(run: Callable[[], object]) -> None:
     run : callable
         Calls every kernel that requests use.
     """
-    start, missing = time.monotonic(), FOLDERS.missing
+    start, missing = time.monotonic(), KERNEL_FOLDERS.missing
     run()
-    compiled_now = FOLDERS.missing - missing
+    compiled_now = KERNEL_FOLDERS.missing - missing
     if compiled_now:
         logger.info('compiled %d kernels in %.1f s; they are kept in %s', compiled_now,
-                    time.monotonic() - start, FOLDERS.kept_in or 'no folder')
+                    time.monotonic() - start, KERNEL_FOLDERS.kept_in or 'no folder')

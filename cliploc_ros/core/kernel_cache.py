@@ -124,7 +124,7 @@ class KernelFolders:
         return ''
 
 
-FOLDERS = KernelFolders()
+KERNEL_FOLDERS = KernelFolders()
 
 
 class KernelCache(NullCache):
@@ -147,7 +147,7 @@ class KernelCache(NullCache):
         """Return the machine code for the types of arguments, or None."""
         target_context.refresh()
         name, _ = self._file_names(sig, target_context.codegen())
-        content = FOLDERS.read(name)
+        content = KERNEL_FOLDERS.read(name)
         if content is None:
             return None
         try:
@@ -161,7 +161,7 @@ class KernelCache(NullCache):
         """Keep machine code for the types of arguments."""
         if not data.library.has_dynamic_globals:
             name, outdated = self._file_names(sig, data.codegen)
-            FOLDERS.store(name, dumps(data._reduce()), outdated)
+            KERNEL_FOLDERS.store(name, dumps(data._reduce()), outdated)
 
     def _file_names(self, sig: Any, codegen: Any) -> tuple[str, str]:
         """Return the name of the file, and a pattern of the names it had with other sources."""

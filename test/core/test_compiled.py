@@ -22,10 +22,10 @@ PROGRAM = """
 import logging
 logging.basicConfig(format='%(levelname)s %(message)s', level=logging.INFO)
 from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.kernel_cache import FOLDERS
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 warm_up(lambda: unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
-print(FOLDERS.missing, unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
+print(KERNEL_FOLDERS.missing, unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
 """
 KERNELS = 5
 # Without the rights of root, and without a home folder.
