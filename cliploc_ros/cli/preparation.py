@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
+from cliploc_ros.core.landmark_embeddings import embeddings_path
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo import ASSETS
@@ -168,12 +169,12 @@ def carrying(cache_dir: Path, used: list[Mapping[str, Value]]) -> list[str]:
                and not file.is_symlink())
     lines = [f'carry {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '
              'path there',
-             f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another one "
-             'compiles them at its first start']
-    names = {str(values.get(name) or '') for values in used for name in _FILES}
-    if any(values.get('map_file') for values in used):
-        names |= {str(embeddings_path(str(values.get('map_file') or ''))) for values in used}
-    files = sorted({Path(name).expanduser().absolute() for name in names if name})
+             f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another "
+             'one compiles them at its first start']
+    names = {str(values[name]) for values in used for name in _FILES if values.get(name)}
+    names |= {str(embeddings_path(str(values['map_file']))) for values in used
+              if values.get('map_file')}
+    files = sorted({Path(name).expanduser().absolute() for name in names})
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files
                     if file.exists()]
 

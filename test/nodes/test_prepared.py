@@ -97,12 +97,15 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network(
     assert content(carried) == before, 'a node had to compute or fetch what the folder lacked'
 
 
-@pytest.mark.parametrize(('parameter', 'named'), [
-    ('model:=yolov8n.pt', 'yolov8n.pt'),
-    ('clip_model:=ViT-B-32', "the weights 'openai' of CLIP model 'ViT-B-32'")])
-def test_missing_weights_are_named_with_the_remedy(robot, offline, tmp_path, parameter, named):
-    done = prepare('--params-file', robot, '--cache-dir', tmp_path / 'new', '--ros-args', '-p',
-                   parameter, '-p', 'clip_pretrained:=openai', within=offline)
+@pytest.mark.parametrize(('old', 'new', 'named'), [
+    (f'{ASSETS}/yolo.pt', 'yolov8n.pt', 'yolov8n.pt'),
+    (f'{ASSETS}/clip.json\n    clip_pretrained: {ASSETS}/clip.safetensors',
+     'ViT-B-32\n    clip_pretrained: openai', "the weights 'openai' of CLIP model 'ViT-B-32'")])
+def test_missing_weights_are_named_with_the_remedy(offline, tmp_path, old, new, named):
+    assert old in ROBOT
+    robot = tmp_path / 'robot.yaml'
+    robot.write_text(ROBOT.replace(old, new))
+    done = prepare('--params-file', robot, '--cache-dir', tmp_path / 'new', within=offline)
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     (error,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
     assert f'cannot download {named}' in error and 'Without a network' in error
