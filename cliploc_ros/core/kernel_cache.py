@@ -50,14 +50,14 @@ class KernelFolders:
 
     Attributes
     ----------
-    missing : int
-        How many kernels were looked for and not found.
+    found, missing : int
+        How many kernels were read, and how many were looked for in vain.
     kept_in : Path or None
         Where the last new kernel was stored; None where no folder takes them.
     """
 
     def __init__(self) -> None:
-        self.missing = 0
+        self.found = self.missing = 0
         self.kept_in: Path | None = None
         self._preferred: Path | None = None
         self._is_warned = False
@@ -71,6 +71,7 @@ class KernelFolders:
         for number, folder in enumerate(self._all()):
             content = _read(folder / name)
             if content is not None:
+                self.found += 1
                 if number and self._preferred is not None:
                     self._write(self._preferred / name, content)
                 return content

@@ -91,7 +91,7 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network(
                          'ROS_LOG_DIR': str(tmp_path)},
         capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith('True x '), done.stdout
+    assert done.stdout.startswith('True accepted: x '), done.stdout
     log = (tmp_path / 'relocalizer.log').read_text()
     assert 'labels cached' in log and 'compiling' not in log
     assert content(carried) == before, 'a node had to compute or fetch what the folder lacked'
