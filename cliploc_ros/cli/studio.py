@@ -16,7 +16,10 @@ from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_arg
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.studio.images import Images
     from cliploc_ros.studio.live import LiveRelocalizer
+    from cliploc_ros.studio.phrases import PhraseFinder
+    from cliploc_ros.studio.recording import Recording
     from cliploc_ros.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
@@ -57,6 +60,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
                         help='(%(default)s)')
     parser.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+    parser.add_argument('--clip-model', metavar='NAME|JSON',
+                        help='offer the five phrases that this CLIP finds best, as build_map')
+    parser.add_argument('--clip-pretrained', metavar='TAG|FILE', help='its weights')
+    parser.add_argument('--device', default='auto', help='of CLIP (%(default)s)')
+    parser.add_argument('--vocabulary', type=Path, metavar='FILE',
+                        help='phrases by class (YAML), besides the shipped ones')
     parser.add_argument('--port', type=_port, default=8080, metavar='N',
                         help='the next free one from this on (%(default)s)')
     parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
@@ -131,7 +140,26 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     elif options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)
-    return Studio(Document(options.map or _free_path()), recording, images)
+    finder = _phrase_finder(options, recording, images)
+    return Studio(Document(options.map or _free_path()), recording, images, finder)
+
+
+def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
+                   images: 'Images | None') -> 'PhraseFinder | None':
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.studio.phrases import PhraseFinder
+    from cliploc_ros.vocabulary.vocabulary import load_vocabulary
+
+    if (options.clip_model is None) != (options.clip_pretrained is None):
+        raise OptionsError('give both --clip-model and --clip-pretrained, or neither')
+    if options.clip_model is None:
+        if options.vocabulary is not None:
+            raise OptionsError('--vocabulary: CLIP chooses the phrases; give --clip-model and '
+                               '--clip-pretrained, too')
+        return None
+    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                       device=options.device)
+    return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording, images)
 
 
 def _free_path() -> Path:

@@ -50,6 +50,11 @@ class DetectorNode(ManagedNode):
         self._detector = YoloDetector(detector_options(self.settings.snapshot()))
         return f"detector {self.settings['model']}"
 
+    @property
+    def detector(self) -> YoloDetector | None:
+        """Return the network, None unless it is loaded."""
+        return self._detector
+
     def unload(self) -> None:
         """Drop the network."""
         self._detector = None

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 from rclpy.node import Node
 
+from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -153,6 +155,8 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     CliplocError
         Names the file, parameter or download to mend.
     """
+    if values['cache_dir']:
+        KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
     landmark_map = load_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long

@@ -60,6 +60,8 @@ class Page:
         self._shown_picture: object = None
         self._build(live)
         studio.document.subscribe(self._changed.set)
+        if studio.finder is not None:
+            studio.finder.subscribe(self._changed.set)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
         self._redrawer.start()
         self._changed.set()

@@ -204,7 +204,8 @@ class LandmarkPanel:
             return
         key, one = selected
         _set(self._name, content=_paragraph([
-            f'{key}{" (locked)" if one.is_locked else ""}', *self._studio.faults(key)]))
+            f'{key}{" (locked)" if one.is_locked else ""}', *self._studio.faults(key),
+            *filter(None, [self._studio.phrase_note])]))
         phrases = (_NO_PHRASE, *self._studio.phrases())
         if tuple(self._phrases.handle.options) != phrases:
             self._phrases.handle.options = phrases
