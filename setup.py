@@ -35,8 +35,8 @@ setup(
     install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
     extras_require={
         'models': [
-            'huggingface_hub', 'open_clip_torch', 'pillow', 'safetensors', 'torch', 'torchvision',
-            'ultralytics-opencv-headless',
+            'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
+            'torchvision', 'ultralytics-opencv-headless',
         ],
         'cluster': ['distributed'],
         'datasets': ['rosbags'],

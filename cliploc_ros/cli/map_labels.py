@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.cli.networks import clip_options
 from cliploc_ros.errors import ModelError
 
 if TYPE_CHECKING:
@@ -95,12 +96,10 @@ def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -
     OptionsError, ModelError
         The vocabulary is invalid, or given where nothing can be labelled.
     """
-    from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
     vocabulary = load_vocabulary(options.vocabulary)
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device)
+    clip = clip_options(options)
     try:
         return Labeller(vocabulary, clip, _find_weights(options, clip, detections), '')
     except ModelError as error:
@@ -120,7 +119,7 @@ def _find_weights(options: argparse.Namespace, clip: 'ClipOptions',
         raise ModelError('the observations have no CLIP embeddings that name their encoder; '
                          'record them again with CLIP')
     key = detections.encoder_key
-    hint = 'give the --clip-model and --clip-pretrained of the recording'
+    hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
     # compared first, since the weights of another model would be downloaded in vain
     if _model_name(clip.model) != key.split(':')[0]:
         raise ModelError(f"the embeddings are of CLIP model '{key.split(':')[0]}', not "

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
@@ -81,14 +82,11 @@ def _add_network_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--keyframes', type=float, nargs=2, default=(0.1, 5.0),
                        metavar=('METRES', 'DEGREES'),
                        help='look at an image this far from the last one (0.1 5; 0 0: at all)')
-    group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
+    add_network_options(group)
     group.add_argument('--conf', type=float, default=0.25,
                        help='least confidence of a detection (%(default)s)')
     group.add_argument('--no-clip', dest='clip', action='store_false',
                        help='classes and boxes only; no embeddings')
-    group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
-    group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
-    group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--record-to', type=Path, metavar='NPZ',
                        help='the observation file (next to the recording)')
     group.add_argument('--workers', type=int, default=1, metavar='N',
@@ -106,8 +104,6 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         The source, the networks or the options cannot be used.
     """
     from cliploc_ros.datasets.observations import load_recorded
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_detector import YoloOptions
     from cliploc_ros.recording.keyframes import KeyframeOptions
     from cliploc_ros.recording.recorder import RecordingOptions, record_once
 
@@ -117,9 +113,8 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         return load_recorded(options.observations)
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device) if options.clip else None
-    yolo = YoloOptions(model=options.model, conf=options.conf, device=options.device)
+    clip = clip_options(options) if options.clip else None
+    yolo = yolo_options(options, conf=options.conf)
     reading = repr([str(getattr(options, name)) for name in _READING])
     return record_once(_frames(options), RecordingOptions(
         yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,

@@ -28,7 +28,7 @@ from cliploc_ros.datasets.poses import Poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.parallel import run_tasks
 from cliploc_ros.recording.journal import Journal
 from cliploc_ros.recording.keyframes import EVERY_FRAME, KeyframeFilter, KeyframeOptions
@@ -252,7 +252,7 @@ def _camera(seen: SeenFrame) -> Camera:
 def _settings(options: YoloOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change what a network says."""
     return {name: value for name, value in asdict(options).items()
-            if name not in ('cache_dir', 'max_batch')}
+            if name not in ('cache_dir', 'max_batch', 'inference')}
 
 
 def _state(path: Path) -> tuple[int, int] | None:

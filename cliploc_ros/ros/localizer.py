@@ -19,6 +19,7 @@ from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
@@ -171,6 +172,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:
-    return ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
-                       checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
-                       cache_dir=values['cache_dir'])
+    named = ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
+                        checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
+                        cache_dir=values['cache_dir'], inference=values['inference'])
+    return with_encoder(named, values['profile'])
