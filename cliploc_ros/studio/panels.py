@@ -182,9 +182,10 @@ class LandmarkPanel:
                 self._page.act(event, apply)
 
         def apply() -> None:
-            document, value = self._studio.document, field.typed()
-            if document.selected is not None and is_complete(value):
-                key, _ = document.selected
+            document = self._studio.document
+            # an incomplete value is left alone, or else a cleared label would come back
+            if document.selected is not None and is_complete(field.handle.value):
+                value, (key, _) = field.typed(), document.selected
                 document.apply(make(document.landmarks, key, value), gesture=(id(field), key))
 
         field.handle.on_update(changed)

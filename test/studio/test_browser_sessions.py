@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from browser import Person, wait_for
+from browser import Person, value_of, wait_for
 
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.mapping.checking.detector_model import guess_detector
@@ -64,6 +64,7 @@ def test_the_worst_landmarks_by_keys(person, studio):
              'the camera to orbit it')
     label = person.field('Label')
     label.fill('')
+    wait_for(lambda: value_of(studio.server, 'Label') == '', 'the empty label')
     label.press_sequentially('a new can', delay=20)
     label.press('Delete')
     wait_for(lambda: document.landmarks[worst[2]].label == 'a new can', 'the label')
