@@ -77,8 +77,8 @@ class KernelFolders:
                 return content
         self.missing += 1
         if self.missing == 1:
-            logger.info('compiling the search for this processor, once after an installation: up '
-                        'to 20 s')
+            logger.info('compiling the search for this processor, once after an installation: '
+                        'about 20 s of processor time')
         return None
 
     def store(self, name: str, content: bytes, outdated: str) -> None:
