@@ -155,12 +155,11 @@ class Relocalizer:
         evidence = self._evidence(frames, compared, likely, covariance,
                                   looks.with_look(frames[-1].observation, poses[0]))
         reason = refusal(evidence, self._options)
-        shares = likely * evidence.found
-        shares[0] = evidence.confidence
         return Relocalization(
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 shares, compared.supports)),
+                                 likely * evidence.found * evidence.near,
+                                 compared.supports)),
             matches=matches[-1], evidence=evidence, covariance=covariance,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
