@@ -231,7 +231,8 @@ def test_no_refusal_names_a_rival_at_the_same_place(office_map, queries, observe
             elsewhere = [one.confidence for one, (metres, degrees) in zip(
                 found.hypotheses, errors, strict=True) if metres >= 1.0 or degrees >= 45.0]
             assert 0.0 < found.evidence.rival <= 1.0 - best.confidence
-            assert found.evidence.rival <= max(elsewhere) / found.evidence.found + 1e-9
+            assert found.evidence.rival <= max(elsewhere) / (
+                found.evidence.found * found.evidence.near) + 1e-9
     assert ambiguous > 3
 
 
