@@ -84,7 +84,7 @@ def compared(office_map, queries):
     similarities[1, 4] = 1.0
     scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
                        np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
-    return ComparedFrame(boxes, detections.class_ids, similarities, scene)
+    return ComparedFrame(boxes, detections.class_ids, similarities, scene, np.arange(len(boxes)))
 
 
 @pytest.fixture
