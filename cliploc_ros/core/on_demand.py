@@ -34,10 +34,21 @@ _NONE = np.empty(0, dtype=np.int64)
 _NO_LOOKS = Looks()
 
 
-def is_on_demand(options: RelocalizerOptions) -> bool:
-    """Return whether crops are compared on demand: hybrid_auto alone can do without them."""
-    return (options.crops == 'on_demand' and options.algorithm == 'auto'
-            and options.matching == 'hybrid')
+def can_do_without_crops(options: RelocalizerOptions) -> bool:
+    """Return whether a frame can be localized without some of its crops: by hybrid_auto alone."""
+    return options.algorithm == 'auto' and options.matching == 'hybrid'
+
+
+def stages_of(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
+              ) -> Iterator[Observation]:
+    """Yield an observation that has all similarities, at once or crop after crop.
+
+    Crops on demand that a search does not need are withheld from it.
+    """
+    if options.crops != 'on_demand' or not can_do_without_crops(options):
+        return iter([observation])
+    recorded = np.asarray(observation.similarities)
+    return crops_on_demand(landmark_map, observation, lambda rows: recorded[rows])
 
 
 def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
@@ -56,7 +67,7 @@ def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
     known : ndarray (m,) of int, optional
         Detections whose similarities cost nothing; the first observation has them.
     room : callable, optional
-        Returns how many crops there is time for. At most BATCH are taken; 0 ends.
+        Returns how many crops to compare next; 0 ends.
 
     Yields
     ------
@@ -67,7 +78,7 @@ def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
     yield replace(observation, similarities=compare(compared), compared=compared)
     left = informative_first(landmark_map, observation)
     left = left[~np.isin(left, known)]
-    while len(left) and (count := min(BATCH, room())) > 0:
+    while len(left) and (count := room()) > 0:
         compared, left = np.append(compared, left[:count]), left[count:]
         yield replace(observation, similarities=compare(compared), compared=compared)
 

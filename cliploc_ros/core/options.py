@@ -81,7 +81,7 @@ class RelocalizerOptions:
     refine: bool = True
     min_inliers: int = 3
     min_confidence: float = 0.99
-    crops: str = 'all'
+    crops: str = 'on_demand'
 
     def __post_init__(self) -> None:
         """Refuse values that an option does not allow."""

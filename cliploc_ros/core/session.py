@@ -51,6 +51,8 @@ class Session:
         self._looks = Looks()
         self._run = -1
         self._stamp_ns = 0
+        #: The newest frame that was localized, with the crops that it took.
+        self.observation: Observation | None = None
 
     def localize(self, observation: Observation, run: int = 0, limit: int = 1,
                  length_s: float = 0.0, more: Iterable[Observation] = ()) -> Relocalization:
@@ -80,7 +82,9 @@ class Session:
         """
         stages = chain([observation], more)
         if observation.odom_from_camera is None:
-            return localize_on_demand(self._relocalizer, (), stages)[1]
+            alone, found = localize_on_demand(self._relocalizer, (), stages)
+            self.observation = alone.observation
+            return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
             self._frames, self._looks = [], Looks()
         self._run, self._stamp_ns = run, observation.stamp_ns
@@ -88,6 +92,7 @@ class Session:
         newest, found = localize_on_demand(
             self._relocalizer, [one.searched for one in earlier], stages, self._looks)
         self._frames = [*earlier, KeptFrame(newest, anchor)]
+        self.observation = newest.observation
         if found.map_from_camera is not None:
             self._looks = self._looks.with_look(observation, found.map_from_camera)
         return found

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods run on queries: the pose that each search found, and its error."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,7 +14,11 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.on_demand import crops_on_demand, is_on_demand, localize_on_demand
+from cliploc_ros.core.on_demand import (
+    can_do_without_crops,
+    localize_on_demand,
+    stages_of,
+)
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
@@ -163,7 +167,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    localize = _localize_on_demand if is_on_demand(method.options) else _localize
+    on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
+    localize = _localize_on_demand if on_demand else _localize
     return [_judge(method.name, trial, query, *localize(landmark_map, relocalizer, query))
             for query in queries]
 
@@ -181,18 +186,11 @@ def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, que
     frames: list[SearchedFrame] = []
     for observation in (*query.neighbours, query.observation):
         frame, found = localize_on_demand(
-            relocalizer, frames, crops_of_recorded(landmark_map, observation))
+            relocalizer, frames, stages_of(landmark_map, observation, relocalizer.options))
         frames.append(frame)
     crops = sum(len(one.observation.detections) for one in frames)
     compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
     return found, compared / max(crops, 1)
-
-
-def crops_of_recorded(landmark_map: LandmarkMap, observation: Observation
-                      ) -> Iterator[Observation]:
-    """Yield a recorded observation with more and more of its similarities, the others withheld."""
-    recorded = np.asarray(observation.similarities)
-    return crops_on_demand(landmark_map, observation, lambda rows: recorded[rows])
 
 
 def _judge(method: str, trial: int, query: Query, found: Relocalization, crops_share: float

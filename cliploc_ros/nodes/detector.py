@@ -92,18 +92,17 @@ class DetectorNode(ManagedNode):
         """Detect objects in one image and publish them; in the worker's thread."""
         if not self.active or self._detector is None:
             return  # deactivated while the image waited
-        times = StageTimes(image.received_at)
-        times.mark('waiting')
+        times = StageTimes('waiting', image.received_at)
+        times.begin('decoding')
         try:
             self._detector.configure(detector_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
-            times.mark('decoding')
+            times.begin('detection')
             detections = self._detector.detect(pixels)
         except CliplocError as error:
             self._last_error = str(error)
             self.get_logger().error(self._last_error, throttle_duration_sec=_LOG_PERIOD_S)
             return
-        times.mark('detection')
         self._last_error = ''
         self.stages.add(times.ms)
         if self.active:

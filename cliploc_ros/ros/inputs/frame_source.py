@@ -42,12 +42,22 @@ class NoFrameError(CliplocError):
 
 @dataclass(frozen=True)
 class Frame:
-    """The messages of one stamp, and when the image arrived (monotonic clock) [s]."""
+    """The messages of one stamp.
+
+    Parameters
+    ----------
+    image : Image or CompressedImage
+    camera_info : CameraInfo
+    detections : Detection2DArray
+    received_at, detected_at : float
+        When the image arrived, and when its detections did (monotonic clock) [s].
+    """
 
     image: Image | CompressedImage
     camera_info: CameraInfo
     detections: Detection2DArray
     received_at: float
+    detected_at: float
 
 
 class FrameSource:
@@ -210,8 +220,9 @@ class FrameSource:
             if complete is None:
                 return
             image, received_at = complete['image']
-            frame = Frame(image, complete['camera_info'][0], complete['detections'][0],
-                          received_at)
+            detections, detected_at = complete['detections']
+            frame = Frame(image, complete['camera_info'][0], detections, received_at,
+                          max(received_at, detected_at))
             self._newest = frame
             self._changed.notify_all()
         self._on_frame(frame)
