@@ -242,6 +242,10 @@ class FrameSource:
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
+        if publishers and name == 'detections':
+            return (f'no detections on {topic} from its {publishers} publisher(s): the detector '
+                    'used up the time, or it stands still; choose a faster profile or a smaller '
+                    'detector, raise timeout_s, or look at its log')
         if publishers:
             return (f'no {name} on {topic} from its {publishers} publisher(s): is it sending, and '
                     'is its QoS compatible?')
