@@ -14,11 +14,12 @@ from cliploc_ros.models.images import crop_bounds
 # A box is the same if no edge has moved by more [px].
 _MOVED_PX = 2.0
 # Side of the small picture of a crop [px]. Its cells average out the noise of the sensor.
-_SIDE = 16
+_SIDE = 8
 # A crop is the same if its picture changed by less than this on average, and in its worst cell
-# [grey levels]. Guesses: noise of 5 levels changes a crop of 64 x 64 pixels by 1.4 and 8.
-_CHANGED, _CELL_CHANGED = 3.0, 24.0
-# A crop costs 4 KB with an embedding of 768 numbers.
+# [grey levels]. Guesses: the demo's images with noise of 3 levels stay below, those of an object
+# that is covered by a third do not.
+_CHANGED, _CELL_CHANGED = 4.0, 32.0
+# A crop costs 3.5 KB with an embedding of 768 numbers.
 _LIMIT = 256
 
 
