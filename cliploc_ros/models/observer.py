@@ -15,6 +15,8 @@ from cliploc_ros.models.protocols import ImageTextEncoder
 
 # A busy moment must not rule out CLIP for good: a time for which no crop fitted fades. A guess.
 _FADING = 0.9
+# The next batch may take this much longer than the newest one. A guess.
+_SLOWER = 1.3
 # The most crops between two looks at the clock.
 _MOST_CROPS = 64
 
@@ -50,10 +52,10 @@ class Observer:
         """Return how many crops there is time for [s], from the time of the newest batch."""
         if self._crop_s is None:
             return 1
-        if left_s < self._crop_s:
+        count = int(min(left_s / max(_SLOWER * self._crop_s, 1e-6), _MOST_CROPS))
+        if count < 1:
             self._crop_s *= _FADING
-            return 0
-        return int(min(left_s / max(self._crop_s, 1e-6), _MOST_CROPS))
+        return max(0, count)
 
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:

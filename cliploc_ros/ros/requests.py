@@ -104,7 +104,10 @@ class Requests:
 
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
         """Look at one frame after another while another frame can change the answer."""
-        look, looks = self._look_past_jumps(arrived_at, deadline), 1
+        try:
+            look, looks = self._look_past_jumps(arrived_at, deadline), 1
+        except TimeUpError as error:
+            return Answer(Verdict.REFUSED, str(error))
         stages_ms, unlinked = Counter(look.answer.stages_ms), int(not look.answer.is_linked)
         is_up = look.answer.is_cut
         while look.may_go_on and unlinked < _MAX_UNLINKED:

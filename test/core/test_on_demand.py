@@ -96,10 +96,19 @@ def test_an_early_stop_is_surer_than_the_last_one():
     asked = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
     frame, found = localize(asked)
     assert found.accepted and len(frame.observation.compared) > 0
-    frame, found = localize(replace(asked, min_confidence=1.0 - 20.0 * (1.0 - sure)))
+    frame, found = localize(replace(asked, min_confidence=1.0 - 100.0 * (1.0 - sure)))
     assert found.accepted and len(frame.observation.compared) == 0
     frame, found = localize(replace(OPTIONS, min_confidence=1.0))
     assert not found.accepted and len(frame.observation.compared) == len(SEEN)
+
+
+def test_without_time_for_all_crops_a_pose_must_be_as_sure():
+    sure = localize(OPTIONS)[1].confidence
+    options = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
+    stages = crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: 0)
+    _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
+    assert found.confidence == sure > options.min_confidence
+    assert not found.accepted and 'without all crops; raise timeout_s' in found.reason
 
 
 @pytest.mark.parametrize('options', [
@@ -133,6 +142,6 @@ def test_real_boxes_need_a_part_of_their_crops(office_map, queries, observe):
     print(f'\n{np.mean(shares):.2f} of the crops; accepted: ' + ', '.join(
         f'{crops} {one.sum()} ({(one & ~right[crops]).sum()} wrong)'
         for crops, one in accepted.items()))
-    assert np.mean(shares) < 0.4
+    assert np.mean(shares) < 0.5
     assert not (accepted['on_demand'] & ~right['on_demand']).any()
     assert accepted['on_demand'].sum() >= accepted['all'].sum() - 1

@@ -49,23 +49,19 @@ def crowded_frame(number):
     return make_frame(seen, stamp_s=100.0 + number)
 
 
-def compared(message):
-    return int(re.search(rf'CLIP of (\d+) of {BOXES} crops', message)[1])
-
-
 def test_the_answer_is_in_time_and_names_what_used_it_up(slow, tester):
     frame, counts = crowded_frame(0), []
     for _ in range(2):
         start = time.monotonic()
         answer = tester.relocalize(frame)
         took_s = time.monotonic() - start
-        counts.append(compared(answer.message))
         print(f'\nafter {took_s:.2f} s: {answer.message}')
         assert not answer.success and answer.message.startswith('refused: ')
+        assert re.search(r'time is up: CLIP took [\d.]+ of [\d.]+ s; choose a faster profile or a '
+                         r'smaller CLIP, or raise timeout_s', answer.message)
         assert took_s < TIMEOUT_S + LATE_S
-        if counts[-1] < BOXES:
-            assert re.search(r'time is up: CLIP took [\d.]+ of [\d.]+ s; choose a faster profile '
-                             r'or a smaller CLIP, or raise timeout_s', answer.message)
+        # without, where a batch took longer than the one before, and beyond the time-out
+        counts += map(int, re.findall(rf'CLIP of (\d+) of {BOXES} crops', answer.message))
+    assert all(0 < count < BOXES for count in counts)
     # what the first request has encoded, the second one does not encode again
-    assert 0 < counts[0] < BOXES
-    assert counts[1] > counts[0]
+    assert len(counts) < 2 or counts[1] > counts[0]
