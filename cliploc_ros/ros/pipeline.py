@@ -152,8 +152,9 @@ class Pipeline:
 
 
 def _summary(localized: Localized) -> str:
-    found, boxes = localized.found, len(localized.seen.observation.detections)
+    found, seen = localized.found, localized.seen.observation
+    crops = '' if seen.similarities is None else \
+        f', CLIP of {localized.compared} of {len(seen.detections)} crops'
     return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search, '
-            f'CLIP of {localized.compared} of {boxes} crops')
+            f'{100 * found.coverage:.3g} % of the search{crops}')
