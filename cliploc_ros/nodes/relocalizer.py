@@ -15,7 +15,7 @@ from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
-from cliploc_ros.ros.node.diagnostics import Health, StageTimes
+from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
@@ -127,9 +127,7 @@ class RelocalizerNode(ManagedNode):
     def _localize_and_log(self, frame: Frame) -> None:
         """Localize with a frame of continuous mode, in the worker's thread."""
         try:
-            times = StageTimes('detection', frame.received_at)
-            times.begin('waiting', frame.detected_at)
-            answer = self._pipeline.localize(frame, times)
+            answer = self._pipeline.localize(frame)
         except CliplocError as error:
             answer = Answer(Verdict.FAILED, str(error))
         self._record(answer)

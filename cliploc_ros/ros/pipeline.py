@@ -75,14 +75,15 @@ class Pipeline:
         """Drop map -> odom until the next accepted pose: time jumped."""
         self._map_to_odom.forget()
 
-    def localize(self, frame: Frame, times: StageTimes, deadline: float = math.inf) -> Answer:
+    def localize(self, frame: Frame, times: StageTimes | None = None,
+                 deadline: float = math.inf) -> Answer:
         """Localize with one frame and publish what was found.
 
         Parameters
         ----------
         frame : Frame
-        times : StageTimes
-            Of this frame.
+        times : StageTimes, optional
+            Of this frame; new ones since its image arrived by default.
         deadline : float
             When to stop comparing crops (monotonic clock) [s].
 
@@ -93,6 +94,9 @@ class Pipeline:
         CliplocError
             Names what to fix in the frame or in the parameters.
         """
+        if times is None:
+            times = StageTimes('detection', frame.received_at)
+            times.begin('waiting', frame.detected_at)
         values = self._node.settings.snapshot()
         self._node.check_active()
         localizer = self.localizer
