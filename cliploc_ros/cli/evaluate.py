@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
-from cliploc_ros.core.options import COMPARED
+from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
@@ -63,6 +63,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
                         help="of a query file; 'all' includes the neighbours of the queries")
+    parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
+                        default=RelocalizerOptions.crops,
+                        help=f"crops that '{AUTO}' compares with labels (%(default)s)")
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
     parser.add_argument('--workers', type=_positive_int, metavar='N',
                         help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
@@ -133,7 +136,6 @@ def evaluate(options: argparse.Namespace) -> int:
     """Evaluate with the options of the command line; return the exit code."""
     # imported late, so that --help is fast
     from cliploc_ros.core.landmark_map import LandmarkMap
-    from cliploc_ros.core.options import RelocalizerOptions
     from cliploc_ros.evaluation.evaluation import Evaluation
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
@@ -147,7 +149,7 @@ def evaluate(options: argparse.Namespace) -> int:
         random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
         height_range_m=tuple(options.height_range),
         tilt_deviation_deg=options.tilt_deviation,
-        vertical_deviation_deg=max(1.0, options.gravity_noise_deg))
+        vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)

@@ -27,6 +27,7 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import Localizer, load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.parameters import Value
 
@@ -117,9 +118,8 @@ def read_picture(file: Path | None) -> NDArray[np.uint8]:
 def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: Localizer,
            values: Mapping[str, Value]) -> Request:
     """Answer a request for a picture as the nodes do, and measure it."""
-    start = time.monotonic()
+    times = StageTimes('detection', time.monotonic())
     found = _NOTHING if detector is None else detector.detect(image_rgb)
-    detection_ms = (time.monotonic() - start) * 1e3
     height, width = image_rgb.shape[:2]
     boxes = with_drawn_boxes(found, localizer.landmark_map, (width, height))
     header = Header(frame_id='camera')
@@ -129,12 +129,14 @@ def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localize
     lens = [float(width), 0.0, width / 2, 0.0, float(width), height / 2, 0.0, 0.0, 1.0]
     info = CameraInfo(header=header, width=width, height=height, k=lens,
                       p=[*lens[:3], 0.0, *lens[3:6], 0.0, *lens[6:], 0.0])
+    now = time.monotonic()
     localized = localizer.localize(
-        Frame(image, info, detections_to_msg(boxes, header), time.monotonic()), values,
-        RobotState(np.eye(4)))
-    stage_ms = {'detection': detection_ms} if detector is not None else {}
-    return Request(stage_ms | localized.times.ms, len(found), len(boxes),
-                   localized.found.reason or 'accepted')
+        Frame(image, info, detections_to_msg(boxes, header), now, now), values,
+        RobotState(np.eye(4)), times)
+    stage_ms = times.ms
+    if detector is None:
+        del stage_ms['detection']
+    return Request(stage_ms, len(found), len(boxes), localized.found.reason or 'accepted')
 
 
 def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[int, int]

@@ -11,6 +11,8 @@ MATCHINGS = ('class', 'clip', 'hybrid')
 #: What crops are compared with: the map's labels, its images, or both.
 COMPARED = ('text', 'image', 'both')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
+#: Which crops of a frame are compared with labels.
+CROPS = ('all', 'on_demand')
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class RelocalizerOptions:
     min_confidence : float
         A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
         cliploc_ros.core.acceptance.confidence.
+    crops : str
+        'all' or 'on_demand': which crops are compared with labels, see
+        cliploc_ros.core.on_demand. hybrid_auto alone uses this.
 
     Raises
     ------
@@ -81,11 +86,13 @@ class RelocalizerOptions:
     refine: bool = True
     min_inliers: int = 3
     min_confidence: float = 0.99
+    crops: str = 'on_demand'
 
     def __post_init__(self) -> None:
         """Refuse values that an option does not allow."""
         _check_choice('matching', self.matching, MATCHINGS)
         _check_choice('algorithm', self.algorithm, ALGORITHMS)
+        _check_choice('crops', self.crops, CROPS)
         if self.matching == 'class' and 'prosac' in self.algorithm:
             raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
                                "'class' has none: set algorithm to auto, bf or ransac")

@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,11 @@ class Relocalizer:
         self._map = landmark_map
         landmark_map.prepare()
         self._options = options
+
+    @property
+    def options(self) -> RelocalizerOptions:
+        """Return the options."""
+        return self._options
 
     def warm_up(self) -> None:
         """Compile the kernels, or read them from disk, before the first request needs them."""
@@ -205,10 +211,12 @@ class Relocalizer:
                   poses: NDArray[np.float64], matches: Sequence[list[tuple[Match, ...]]]
                   ) -> list[Support]:
         """Return the support of each pose, from its matches in each frame."""
+        used = [one.observation if self._options.needs_similarities
+                else replace(one.observation, similarities=None) for one in frames]
         compared = [ComparedFrame(
             one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-            one.observation.similarities if self._options.needs_similarities else None, one.scene)
-            for one in frames]
+            seen.similarities, one.scene, seen.similarity_rows)
+            for one, seen in zip(frames, used, strict=True)]
         last_from_cameras = np.linalg.inv(cameras)
         return [support(self._map, compared, pose @ last_from_cameras, found)
                 for pose, found in zip(poses, matches, strict=True)]

@@ -70,7 +70,8 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
         return 'choice'
     detections = query.observation.detections
     compared = ComparedFrame(detections.bboxes_xyxy, detections.class_ids,
-                             query.observation.similarities, frame.scene)
+                             query.observation.similarities, frame.scene,
+                             query.observation.similarity_rows)
     true_support = support(landmark_map, [compared], true_pose[None], [matches])
     supports = [true_support, *(one.support for one in found.hypotheses[:1])]
     return 'search' if int(np.argmax(utilities(supports))) == 0 else 'choice'

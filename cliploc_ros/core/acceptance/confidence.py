@@ -120,12 +120,15 @@ class ComparedFrame(NamedTuple):
         None where classes alone are matched.
     scene : Scene
         Of the same detections.
+    similarity_rows : ndarray (n,) of int
+        Row of similarities of each detection; -1 where its class alone is matched.
     """
 
     bboxes_xyxy: NDArray[np.float64]
     class_ids: tuple[str, ...]
     similarities: Similarities | None
     scene: Scene
+    similarity_rows: NDArray[np.int64]
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
@@ -179,13 +182,15 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     classes = landmark_map.classes.classes_of(frame.class_ids)
+    rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
+    compared = rows >= 0
+    if frame.similarities is not None and compared.any():
+        likenesses[compared] = _likenesses(frame.similarities, rows[compared],
+                                           landmarks[compared])
     return np.column_stack([
         [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks),
-        np.zeros(len(matches)) if frame.similarities is None
-        else _likenesses(frame.similarities, detections, landmarks),
-        landmark_map.classes.have(landmarks, classes[detections]),
-        np.full(len(matches), frame.similarities is None)])
+        _misfits(frame.scene, map_from_camera, detections, landmarks), likenesses,
+        landmark_map.classes.have(landmarks, classes[detections]), ~compared])
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
@@ -273,9 +278,9 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
 
 
-def _likenesses(similarities: Similarities, detections: NDArray[np.int64],
+def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
                 landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    sample = sampled_similarities(similarities, detections, _LABELS_SAMPLED)
+    sample = sampled_similarities(similarities, rows, _LABELS_SAMPLED)
     deviations = np.maximum(sample.std(axis=1), 1e-6)
-    return np.asarray((pair_similarities(similarities, detections, landmarks)
+    return np.asarray((pair_similarities(similarities, rows, landmarks)
                        - sample.mean(axis=1)) / deviations)
