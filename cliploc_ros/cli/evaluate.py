@@ -97,6 +97,9 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
                        help='heights that the camera may have in the map [m]')
+    group.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
+                       help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
+                       "the map's z axis is not up (%(default)s)")
     group.add_argument('--fuse', action='store_true',
                        help='localize each query with the other frames of its group, linked by '
                        'odometry from the true poses')
@@ -145,6 +148,7 @@ def evaluate(options: argparse.Namespace) -> int:
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
         random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
         height_range_m=tuple(options.height_range),
+        tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg))
     methods = parse_methods(options.methods, paper, len(landmark_map))
     make_folder(options.out)

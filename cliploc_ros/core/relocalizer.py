@@ -4,21 +4,26 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import (
+    RIGHT_M,
     ComparedFrame,
     Support,
     agreeing_poses,
     confidences,
     support,
+    utilities,
 )
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
 from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
     Match,
@@ -143,19 +148,19 @@ class Relocalizer:
         if not finalists:
             return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
                                                   'camera to more objects')
-        best, matches = finalists[0], [matches_of(rig, one) for one in finalists]
-        poses = np.array([one.map_from_camera for one in finalists])
-        supports = self._supports(frames, cameras, poses, matches)
-        likely = confidences(supports, poses, upright=is_upright)
-        evidence = self._evidence(frames, best, matches[0], supports[0], poses, likely,
+        compared = self._compare(frames, rig, cameras, finalists, is_upright)
+        best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
+        likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
+        covariance = covariance_of(frames, rig, best, matches)
+        evidence = self._evidence(frames, compared, likely, covariance,
                                   looks.with_look(frames[-1].observation, poses[0]))
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
-            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in finalists),
-                                 likely * evidence.found, supports)),
-            matches=matches[0][-1], evidence=evidence,
-            covariance=covariance_of(frames, rig, best, matches[0]),
+            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
+                                 likely * evidence.found * evidence.near,
+                                 compared.supports)),
+            matches=matches[-1], evidence=evidence, covariance=covariance,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
 
@@ -177,6 +182,25 @@ class Relocalizer:
         finalists = upright + elsewhere
         return finalists, np.arange(len(finalists)) < len(upright)
 
+    def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
+                 finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
+        """Return the finalists with their supports, the likeliest first.
+
+        Poses that ignore the known vertical come last. Without refinement the greatest score is
+        first, as in the paper.
+        """
+        poses = np.array([one.map_from_camera for one in finalists])
+        matches = [matches_of(rig, one) for one in finalists]
+        supports = self._supports(frames, cameras, poses, matches)
+        handicaps = np.where(is_upright, 0.0, WRONG_MOUNT) if rig.verticals[:, 6].any() \
+            else tilt_handicaps(poses, self._options.tilt_deviation_deg)
+        order = list(range(len(finalists)))
+        if self._options.refine:
+            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+        return _Compared([finalists[row] for row in order], poses[order],
+                         [matches[row] for row in order], [supports[row] for row in order],
+                         handicaps[order])
+
     def _supports(self, frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
                   poses: NDArray[np.float64], matches: Sequence[list[tuple[Match, ...]]]
                   ) -> list[Support]:
@@ -189,20 +213,46 @@ class Relocalizer:
         return [support(self._map, compared, pose @ last_from_cameras, found)
                 for pose, found in zip(poses, matches, strict=True)]
 
-    def _evidence(self, frames: Sequence[SearchedFrame], best: Finalist,
-                  matches: Sequence[tuple[Match, ...]], its_support: Support,
-                  poses: NDArray[np.float64], likely: NDArray[np.float64], looks: Looks
+    def _evidence(self, frames: Sequence[SearchedFrame], compared: '_Compared',
+                  likely: NDArray[np.float64], covariance: NDArray[np.float64], looks: Looks
                   ) -> Evidence:
         """Return the evidence for the best pose, the first of all."""
-        coverage = _coverage(frames)
-        rivals = likely[~agreeing_poses(poses)[0]]
+        coverage, best = _coverage(frames), compared.finalists[0]
+        rivals = likely[~agreeing_poses(compared.poses)[0]]
         return Evidence(
-            its_support.inliers, likely[0], min(max(rivals, default=0.0), 1.0 - likely[0]),
-            coverage,
+            compared.supports[0].inliers, likely[0],
+            min(max(rivals, default=0.0), 1.0 - likely[0]),
+            # the covariance of a minimal sample is too rough to decide
+            near=1.0 if best.information is None else share_within(RIGHT_M, covariance),
+            deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
+            coverage=coverage,
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
-            else meetings_of(frames, best, matches),
-            unexplained=its_support.unexplained, looks=len(looks), agreeing=looks.agreeing)
+            else meetings_of(frames, best, compared.matches[0]),
+            unexplained=compared.supports[0].unexplained, looks=len(looks),
+            agreeing=looks.agreeing)
+
+
+class _Compared(NamedTuple):
+    """The finalists, best first, and what supports or contradicts each.
+
+    Parameters
+    ----------
+    finalists : list of m Finalist
+    poses : ndarray (m, 4, 4)
+        map_from_camera.
+    matches : list of m list of tuple of Match
+        Inliers in each frame.
+    supports : list of m Support
+    handicaps : ndarray (m,)
+        See confidences.
+    """
+
+    finalists: list[Finalist]
+    poses: NDArray[np.float64]
+    matches: list[list[tuple[Match, ...]]]
+    supports: list[Support]
+    handicaps: NDArray[np.float64]
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str

@@ -77,6 +77,9 @@ RELOCALIZER = (
     ParameterRow('gravity', 'none', 'Source of the vertical: base_frame (the robot stands '
                  'upright) or the topic imu. auto then needs two objects instead of three.',
                  choices=SOURCES, read_only=True),
+    ParameterRow('tilt_deviation_deg', 40.0, 'Standard deviation of the tilt of the camera off '
+                 'upright, where no vertical is known; 0: any tilt is as likely, as where the '
+                 "map's z axis is not up.", unit='deg', low=0.0, high=60.0),
     ParameterRow('vertical_deviation_deg', 1.0, 'Standard deviation of that vertical.',
                  unit='deg', low=0.01, high=45.0),
     ParameterRow('height_range_m', [0.0, 0.0], 'Least and greatest height of the camera in the '

@@ -35,7 +35,8 @@ def make_cases(rng, count):
         right = np.zeros(some, dtype=bool)
         chosen = int(np.searchsorted(np.cumsum(chances), rng.random()))
         right[chosen:chosen + 1] = True
-        cases.append(Case(str(number // 5), calibration.WHOLE, supports, poses, right))
+        cases.append(Case(str(number // 5), calibration.WHOLE, supports, poses, right,
+                          np.zeros(some)))
     return cases
 
 

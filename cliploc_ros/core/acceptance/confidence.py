@@ -28,14 +28,13 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 
 # Boxes that overlap more than this show the same object, detected twice.
 _SAME_BOX_IOU = 0.8
-# A right pose is within 1 m; two poses turned by more than 45 degrees are never both right.
-_RIGHT_M = 1.0
+#: A right pose is within this distance of the truth [m].
+RIGHT_M = 1.0
+# Two poses turned by more than 45 degrees are never both right.
 _AGREEING_TRACE = 1.0 + 2.0 * np.cos(np.radians(45.0))
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
-# Log odds that a known vertical is right. A guess: one mount of a hundred is wrong.
-_TILTED_PENALTY = 4.6
 # The recordings are too short to justify a higher confidence.
 _MOST_CONFIDENCE = 0.9999
 # Number of labels that gives mean and deviation of a crop's similarities to 2 %.
@@ -190,8 +189,8 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
-                calibration: Calibration = DEFAULT, upright: NDArray[np.bool_] | None = None
-                ) -> NDArray[np.float64]:
+                calibration: Calibration = DEFAULT,
+                handicaps: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     """Return the probability that each hypothesis is within 1 m of the truth.
 
     Parameters
@@ -200,19 +199,17 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     poses : ndarray (m, 4, 4)
         map_from_camera of the same hypotheses.
     calibration : Calibration, optional
-    upright : ndarray (m,) of bool, optional
-        Hypotheses that use the known vertical; all of them where none is known.
+    handicaps : ndarray (m,), optional
+        Log odds that speak against each hypothesis besides its support.
 
     Returns
     -------
     ndarray (m,)
         0 to 1. The rest to 1 is the probability that another pose is right, or none.
     """
-    utilities = np.array([_utility(one, calibration) for one in supports])
-    if upright is not None:
-        utilities[~upright] -= _TILTED_PENALTY
-    shares = np.exp(np.append(utilities, calibration.none_right)
-                    - max(utilities.max(), calibration.none_right))
+    odds = utilities(supports, calibration) - handicaps
+    shares = np.exp(np.append(odds, calibration.none_right)
+                    - max(odds.max(), calibration.none_right))
     shares = shares[:-1] / shares.sum()
     agreeing = agreeing_poses(poses)
     likely = np.clip(agreeing @ shares, 1.0 - _MOST_CONFIDENCE, _MOST_CONFIDENCE)
@@ -225,17 +222,20 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), _MOST_CONFIDENCE)
 
 
-def _utility(one: Support, calibration: Calibration) -> float:
-    return (calibration.score * one.score + calibration.misfit * one.misfit
-            + calibration.likeness * one.likeness + calibration.same_class * one.same_class
-            + calibration.unlabelled * one.unlabelled
-            + calibration.unexplained * one.unexplained)
+def utilities(supports: Sequence[Support], calibration: Calibration = DEFAULT
+              ) -> NDArray[np.float64]:
+    """Return the utility (m,) of each support: the logarithm of its odds, up to a constant."""
+    return np.array([
+        calibration.score * one.score + calibration.misfit * one.misfit
+        + calibration.likeness * one.likeness + calibration.same_class * one.same_class
+        + calibration.unlabelled * one.unlabelled + calibration.unexplained * one.unexplained
+        for one in supports])
 
 
 def agreeing_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (m, m): which of the poses (m, 4, 4) agree to 1 m and 45 degrees."""
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
-    near = np.linalg.norm(positions[:, None] - positions, axis=2) < _RIGHT_M
+    near = np.linalg.norm(positions[:, None] - positions, axis=2) < RIGHT_M
     traces = np.einsum('iab,jab->ij', rotations, rotations)
     return np.asarray(near & (traces > _AGREEING_TRACE))
 

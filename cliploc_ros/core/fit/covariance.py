@@ -5,6 +5,7 @@
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import gammainc
 
 from cliploc_ros.core.fit.box_edges import RELATIVE_DEVIATION
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -177,6 +178,24 @@ def odometry_covariance(camera_from_reference: NDArray[np.float64], weights: NDA
     deviations = np.stack([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * distances_m,
                            _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angles]) * others
     return np.diag(np.repeat((deviations @ weights / weights.sum()) ** 2, 3))
+
+
+def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
+    """Return the probability that a position is within a distance of the truth.
+
+    The squared distance is a sum of squares with different variances. A scaled chi-squared
+    distribution of the same mean and variance stands for it (Box, "Some Theorems on Quadratic
+    Forms Applied in the Study of Analysis of Variance Problems", 1954).
+
+    Parameters
+    ----------
+    radius_m : float
+    covariance : ndarray (6, 6)
+        As of pose_covariance.
+    """
+    mean = np.trace(covariance[:3, :3])
+    squares = np.sum(covariance[:3, :3] ** 2)
+    return float(gammainc(0.5 * mean ** 2 / squares, 0.5 * radius_m ** 2 * mean / squares))
 
 
 def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
