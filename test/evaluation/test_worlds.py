@@ -29,7 +29,8 @@ def test_worlds_are_reproducible_and_sound(kind):
     assert not np.array_equal(world.queries[0].map_from_camera, other.queries[0].map_from_camera)
 
 
-def test_a_map_without_errors_has_each_object_in_its_place(rng=np.random.default_rng(1)):
+def test_a_map_without_errors_has_each_object_in_its_place():
+    rng = np.random.default_rng(1)
     objects = make_objects(KINDS['office'](rng).things, rng)
     found = survey(objects, MapErrors(0.0, 0.0, 0.0, 0.0, 0.0, False), rng)
     assert np.array_equal(found.objects, np.arange(len(objects.class_ids)))
@@ -59,7 +60,8 @@ def test_simulation_is_like_the_office_recording(record_property):
 
 
 def test_judge_counts_right_and_wrong_poses(record_property):
-    verdicts = [one for seed in range(3) for one in judge.judge_world('room', seed, 'hybrid', 0.99)]
+    verdicts = [one for seed in range(3)
+                for one in judge.judge_world('room', seed, 'hybrid', 0.99)]
     assert len(verdicts) == 3 * 4 * len(judge.MODES)
     fused = [one for one in verdicts if one.mode == 'five images']
     alone = [one for one in verdicts if one.mode == 'one image']
