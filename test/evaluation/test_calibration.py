@@ -90,7 +90,7 @@ def test_confidences_of_other_places_are_true(office):
     print(f'\naccepted {accepted.sum()}, {(accepted & ~right).sum()} of them wrong; of '
           f'{right.sum()} right ones {(accepted & right).sum() / right.sum():.3f} are accepted')
     assert right[accepted].mean() >= 0.99
-    assert (accepted & right).sum() / right.sum() >= 0.88
+    assert (accepted & right).sum() / right.sum() >= 0.83
     # confidences are true on average
     assert right[likely > 0.5].mean() == pytest.approx(likely[likely > 0.5].mean(), abs=0.05)
 
