@@ -20,6 +20,7 @@ from cliploc_ros.core.acceptance.confidence import (
     support,
     utilities,
 )
+from cliploc_ros.core.acceptance.look_alikes import chance_distinct, look_alike
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
@@ -164,8 +165,7 @@ class Relocalizer:
         return Relocalization(
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 likely * evidence.found * evidence.near,
-                                 compared.supports)),
+                                 likely * evidence.certainty, compared.supports)),
             matches=matches[-1], evidence=evidence, covariance=covariance,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
@@ -225,11 +225,15 @@ class Relocalizer:
                   likely: NDArray[np.float64], covariance: NDArray[np.float64], looks: Looks
                   ) -> Evidence:
         """Return the evidence for the best pose, the first of all."""
-        coverage, best = _coverage(frames), compared.finalists[0]
-        rivals = likely[~agreeing_poses(compared.poses)[0]]
+        coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
+        elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
+        rivals = likely[elsewhere]
+        twins = elsewhere[look_alike(self._map, compared.poses[0], compared.poses[elsewhere])]
         return Evidence(
-            compared.supports[0].inliers, likely[0],
+            supports[0].inliers, likely[0],
             min(max(rivals, default=0.0), 1.0 - likely[0]),
+            distinct=chance_distinct(supports[0], [supports[row] for row in twins]),
+            twin=_position(compared.poses[twins[0]]) if len(twins) else None,
             # the covariance of a minimal sample is too rough to decide
             near=1.0 if best.information is None else share_within(RIGHT_M, covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
@@ -237,7 +241,7 @@ class Relocalizer:
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
             else meetings_of(frames, best, compared.matches[0]),
-            unexplained=compared.supports[0].unexplained, looks=len(looks),
+            unexplained=supports[0].unexplained, looks=len(looks),
             agreeing=looks.agreeing)
 
 
@@ -261,6 +265,11 @@ class _Compared(NamedTuple):
     matches: list[list[tuple[Match, ...]]]
     supports: list[Support]
     handicaps: NDArray[np.float64]
+
+
+def _position(pose: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = pose[:3, 3].tolist()
+    return x, y, z
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str
