@@ -57,6 +57,7 @@ setup(
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
             f'import_map = {PACKAGE}.cli.import_map:main',
+            f'prepare = {PACKAGE}.cli.prepare:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'studio = {PACKAGE}.cli.studio:main',

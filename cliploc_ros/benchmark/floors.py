@@ -18,6 +18,8 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.evaluation.worlds.detector import hidden
+from cliploc_ros.evaluation.worlds.things import CLASS_NAMES, TYPICAL
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
 CAMERA = Camera(640, 480, 420.0, 420.0, 320.0, 240.0)
@@ -35,27 +37,6 @@ _NOISE_PX, _NOISE_SHARE = 1.0, 0.015
 _MISSED_NEAR, _MISSED_A_METRE = 0.08, 0.04
 _WRONG_CLASS, _FALSE_BOXES = 0.03, 0.2
 _LEAST_EXTENT_PX, _RANGE_M, _HIDDEN_SHARE = 12.0, 8.0, 0.5
-
-# Semi-axes [m] and height of the centre [m] of COCO's classes of things indoors. Guesses.
-_CLASSES = {
-    'chair': (0.25, 0.25, 0.45, 0.45), 'couch': (0.9, 0.45, 0.4, 0.4),
-    'potted plant': (0.2, 0.2, 0.35, 0.5), 'bed': (1.0, 0.8, 0.3, 0.3),
-    'dining table': (0.8, 0.5, 0.38, 0.38), 'toilet': (0.2, 0.3, 0.4, 0.4),
-    'bench': (0.7, 0.2, 0.25, 0.25), 'refrigerator': (0.35, 0.35, 0.85, 0.85),
-    'suitcase': (0.25, 0.15, 0.35, 0.35), 'backpack': (0.18, 0.14, 0.25, 0.3),
-    'handbag': (0.18, 0.1, 0.15, 0.7), 'umbrella': (0.1, 0.1, 0.4, 0.45),
-    'tv': (0.5, 0.06, 0.3, 1.3), 'clock': (0.15, 0.04, 0.15, 1.9),
-    'microwave': (0.25, 0.18, 0.15, 1.1), 'oven': (0.3, 0.3, 0.4, 0.4),
-    'sink': (0.28, 0.22, 0.1, 0.9), 'toaster': (0.14, 0.1, 0.1, 1.0),
-    'laptop': (0.17, 0.12, 0.12, 0.85), 'keyboard': (0.22, 0.07, 0.03, 0.76),
-    'mouse': (0.05, 0.035, 0.025, 0.76), 'cell phone': (0.04, 0.08, 0.02, 0.76),
-    'book': (0.1, 0.14, 0.03, 0.8), 'vase': (0.08, 0.08, 0.15, 0.95),
-    'bottle': (0.04, 0.04, 0.13, 0.88), 'wine glass': (0.04, 0.04, 0.1, 0.85),
-    'cup': (0.05, 0.05, 0.06, 0.82), 'bowl': (0.09, 0.09, 0.05, 0.81),
-    'scissors': (0.05, 0.09, 0.02, 0.77), 'teddy bear': (0.15, 0.12, 0.2, 0.6),
-    'sports ball': (0.11, 0.11, 0.11, 0.11), 'fire hydrant': (0.15, 0.15, 0.4, 0.4),
-}
-CLASS_NAMES = tuple(sorted(_CLASSES))
 
 
 @dataclass(frozen=True)
@@ -92,7 +73,7 @@ def make_floor(objects: int, seed: int = 0) -> Floor:
     pitch = _ROOM_M + np.array([0.2, _CORRIDOR_M])
     room_centers = np.array([_grid_place(room) for room in range(rooms)]) * pitch
     places = np.repeat(np.arange(2 * rooms), np.tile([_IN_ROOM, _IN_CORRIDOR], rooms))[:objects]
-    typical = np.array([_CLASSES[name] for name in CLASS_NAMES])
+    typical = np.array([TYPICAL[name] for name in CLASS_NAMES])
     shares = 1.0 / (0.1 + typical[:, :3].max(axis=1))  # large things are rarer
     classes = rng.choice(len(CLASS_NAMES), objects, p=shares / shares.sum())
     sizes = typical[classes]
@@ -200,20 +181,11 @@ def _see(true_map: LandmarkMap, pose: NDArray[np.float64], rows: NDArray[np.int6
     extents = clipped[:, 2:] - clipped[:, :2]
     seen = (extents > _LEAST_EXTENT_PX).all(axis=1) & (distances < _RANGE_M)  # never true of NaN
     seen &= extents.prod(axis=1) > _HIDDEN_SHARE * (full[:, 2:] - full[:, :2]).prod(axis=1)
-    seen[seen] = ~_hidden(clipped[seen])
+    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE)
     seen &= rng.random(len(rows)) > _MISSED_NEAR + _MISSED_A_METRE * distances
     deviations = np.hypot(_NOISE_PX, _NOISE_SHARE * np.tile(extents[seen], 2))
     noisy = np.clip(clipped[seen] + deviations * rng.normal(size=deviations.shape), 0.0, size)
     return noisy, rows[seen]
-
-
-def _hidden(boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of m boxes one nearer box covers for the most part; the nearest is first."""
-    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
-    shared = np.maximum(high - low, 0.0).prod(axis=2)
-    share = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-    return np.asarray((np.tril(share, -1) > _HIDDEN_SHARE).any(axis=1))
 
 
 def _false_boxes(rng: np.random.Generator) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
-from cliploc_ros.core.options import COMPARED
+from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
@@ -63,6 +63,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
                         help="of a query file; 'all' includes the neighbours of the queries")
+    parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
+                        default=RelocalizerOptions.crops,
+                        help=f"crops that '{AUTO}' compares with labels (%(default)s)")
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
     parser.add_argument('--workers', type=_positive_int, metavar='N',
                         help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
@@ -98,6 +101,9 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
                        help='heights that the camera may have in the map [m]')
+    group.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
+                       help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
+                       "the map's z axis is not up (%(default)s)")
     group.add_argument('--fuse', action='store_true',
                        help='localize each query with the other frames of its group, linked by '
                        'odometry from the true poses')
@@ -130,7 +136,6 @@ def evaluate(options: argparse.Namespace) -> int:
     """Evaluate with the options of the command line; return the exit code."""
     # imported late, so that --help is fast
     from cliploc_ros.core.landmark_map import LandmarkMap
-    from cliploc_ros.core.options import RelocalizerOptions
     from cliploc_ros.evaluation.evaluation import Evaluation
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
@@ -143,7 +148,8 @@ def evaluate(options: argparse.Namespace) -> int:
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
         random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
         height_range_m=tuple(options.height_range),
-        vertical_deviation_deg=max(1.0, options.gravity_noise_deg))
+        tilt_deviation_deg=options.tilt_deviation,
+        vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)

@@ -80,15 +80,12 @@ class Labeller:
 
     def _phrases(self, weights: 'ClipWeights', names: Sequence[str]) -> 'dict[str, list[Phrases]]':
         """Return the phrases of some classes; the user's change more often than the shipped."""
-        from cliploc_ros.mapping.labelling import Phrases
-        from cliploc_ros.models.phrase_embeddings import embed_phrases
+        from cliploc_ros.models.phrase_embeddings import phrases_of_classes
         from cliploc_ros.vocabulary.vocabulary import shipped_phrases
 
-        shipped = {name: shipped_phrases(name) for name in names}
-        added = {name: texts for name, texts in self.vocabulary.added.items() if name in names}
-        parts = [(texts, embed_phrases(weights, self.clip, texts)) for texts in (shipped, added)]
-        return {name: [Phrases(texts[name], rows[name]) for texts, rows in parts if name in texts]
-                for name in names}
+        return phrases_of_classes(weights, self.clip, [
+            {name: shipped_phrases(name) for name in names},
+            {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
 
 
 def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -> Labeller:

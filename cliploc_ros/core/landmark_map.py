@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
@@ -77,7 +78,7 @@ class LandmarkMap:
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
-        _ = self.shapes, self.classes, self.sorted_landmarks
+        _ = self.shapes, self.classes, self.sorted_landmarks, self.tree
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -103,6 +104,11 @@ class LandmarkMap:
     def sorted_landmarks(self) -> SortedLandmarks:
         """Return the landmarks sorted by place."""
         return sort_landmarks(self.centers, self.shapes, self.classes.members)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Return the centres, to find the landmarks near a spot."""
+        return cKDTree(self.centers)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':

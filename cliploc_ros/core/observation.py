@@ -75,7 +75,7 @@ class Observation:
     detections : Detections
         n of them.
     similarities : ndarray (n, L), CropSimilarities or None
-        Cosine similarity of each detection's crop with the label of each of the map's L
+        Cosine similarity of each compared detection's crop with the label of each of the map's L
         landmarks, in the map's order. None where only classes are known.
     stamp_ns : int
         Time of the image [ns].
@@ -84,6 +84,9 @@ class Observation:
     odom_from_camera : ndarray (4, 4) or None
         The camera in the coordinate frame of odometry, which links this frame to others; None if
         unknown.
+    compared : ndarray (m,) of int or None
+        The detections that the rows of similarities (m, L) belong to; None for all, in their
+        order. The other detections are matched by class alone.
     """
 
     camera: Camera
@@ -92,3 +95,15 @@ class Observation:
     stamp_ns: int = 0
     up_in_camera: NDArray[np.float64] | None = None
     odom_from_camera: NDArray[np.float64] | None = None
+    compared: NDArray[np.int64] | None = None
+
+    @property
+    def similarity_rows(self) -> NDArray[np.int64]:
+        """Return the row of similarities of each detection (n,); -1 where there is none."""
+        rows = np.full(len(self.detections), -1, dtype=np.int64)
+        if self.similarities is None:
+            return rows
+        if self.compared is None:
+            return np.arange(len(self.detections))
+        rows[self.compared] = np.arange(len(self.compared))
+        return rows

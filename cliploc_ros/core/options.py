@@ -11,6 +11,8 @@ MATCHINGS = ('class', 'clip', 'hybrid')
 #: What crops are compared with: the map's labels, its images, or both.
 COMPARED = ('text', 'image', 'both')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
+#: Which crops of a frame are compared with labels.
+CROPS = ('all', 'on_demand')
 
 
 @dataclass(frozen=True)
@@ -45,17 +47,24 @@ class RelocalizerOptions:
     max_tilt_deg : float
         The most that the camera may be tilted against upright [deg]; 180 allows any pose. Where
         the vertical is known, the limit for poses from three points against that vertical.
+    tilt_deviation_deg : float
+        Standard deviation of the camera's tilt against upright [deg], see
+        cliploc_ros.core.acceptance.attitude. It counts in the confidence where no vertical is
+        known. 0: every attitude is as likely, as in a map whose z axis is not up.
     vertical_deviation_deg : float
         Standard deviation of a known vertical [deg]. With one, auto samples two candidates
         instead of three.
     refine : bool
-        Refine the best hypotheses on all their inliers before the best one is chosen. The paper
-        does not.
+        Refine the best hypotheses on all their inliers, then choose the likeliest one. The paper
+        does not refine, and chooses the one with the greatest score.
     min_inliers : int
         A pose with fewer matched objects is refused.
     min_confidence : float
         A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
         cliploc_ros.core.acceptance.confidence.
+    crops : str
+        'all' or 'on_demand': which crops are compared with labels, see
+        cliploc_ros.core.on_demand. hybrid_auto alone uses this.
 
     Raises
     ------
@@ -72,15 +81,18 @@ class RelocalizerOptions:
     time_budget_s: float = math.inf
     height_range_m: tuple[float, float] = (-math.inf, math.inf)
     max_tilt_deg: float = 180.0
+    tilt_deviation_deg: float = 40.0
     vertical_deviation_deg: float = 1.0
     refine: bool = True
     min_inliers: int = 3
     min_confidence: float = 0.99
+    crops: str = 'on_demand'
 
     def __post_init__(self) -> None:
         """Refuse values that an option does not allow."""
         _check_choice('matching', self.matching, MATCHINGS)
         _check_choice('algorithm', self.algorithm, ALGORITHMS)
+        _check_choice('crops', self.crops, CROPS)
         if self.matching == 'class' and 'prosac' in self.algorithm:
             raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
                                "'class' has none: set algorithm to auto, bf or ransac")
@@ -90,6 +102,7 @@ class RelocalizerOptions:
         _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
         _check_height_range(self.height_range_m)
         _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
+        _check_range('tilt_deviation_deg', self.tilt_deviation_deg, 0.0, 60.0)
         _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
         _check_range('min_inliers', self.min_inliers, 3, math.inf)
         _check_range('min_confidence', self.min_confidence, 0.0, 1.0)

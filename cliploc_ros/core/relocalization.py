@@ -22,7 +22,8 @@ class Hypothesis:
     score : float
         Sum of the IoUs of its inliers.
     confidence : float
-        Probability that it is within 1 m of the truth, 0 to 1.
+        Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
+        uncertain as that of the best hypothesis.
     support : Support
         Basis of the confidence.
     """

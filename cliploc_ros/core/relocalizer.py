@@ -4,21 +4,28 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import (
+    RIGHT_M,
     ComparedFrame,
     Support,
     agreeing_poses,
     confidences,
     support,
+    utilities,
 )
+from cliploc_ros.core.acceptance.look_alikes import chance_distinct, look_alike
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
 from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
     Match,
@@ -65,6 +72,11 @@ class Relocalizer:
         self._map = landmark_map
         landmark_map.prepare()
         self._options = options
+
+    @property
+    def options(self) -> RelocalizerOptions:
+        """Return the options."""
+        return self._options
 
     def warm_up(self) -> None:
         """Compile the kernels, or read them from disk, before the first request needs them."""
@@ -143,19 +155,18 @@ class Relocalizer:
         if not finalists:
             return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
                                                   'camera to more objects')
-        best, matches = finalists[0], [matches_of(rig, one) for one in finalists]
-        poses = np.array([one.map_from_camera for one in finalists])
-        supports = self._supports(frames, cameras, poses, matches)
-        likely = confidences(supports, poses, upright=is_upright)
-        evidence = self._evidence(frames, best, matches[0], supports[0], poses, likely,
+        compared = self._compare(frames, rig, cameras, finalists, is_upright)
+        best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
+        likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
+        covariance = covariance_of(frames, rig, best, matches)
+        evidence = self._evidence(frames, compared, likely, covariance,
                                   looks.with_look(frames[-1].observation, poses[0]))
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
-            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in finalists),
-                                 likely * evidence.found, supports)),
-            matches=matches[0][-1], evidence=evidence,
-            covariance=covariance_of(frames, rig, best, matches[0]),
+            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
+                                 likely * evidence.certainty, compared.supports)),
+            matches=matches[-1], evidence=evidence, covariance=covariance,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
 
@@ -177,32 +188,88 @@ class Relocalizer:
         finalists = upright + elsewhere
         return finalists, np.arange(len(finalists)) < len(upright)
 
+    def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
+                 finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
+        """Return the finalists with their supports, the likeliest first.
+
+        Poses that ignore the known vertical come last. Without refinement the greatest score is
+        first, as in the paper.
+        """
+        poses = np.array([one.map_from_camera for one in finalists])
+        matches = [matches_of(rig, one) for one in finalists]
+        supports = self._supports(frames, cameras, poses, matches)
+        handicaps = np.where(is_upright, 0.0, WRONG_MOUNT) if rig.verticals[:, 6].any() \
+            else tilt_handicaps(poses, self._options.tilt_deviation_deg)
+        order = list(range(len(finalists)))
+        if self._options.refine:
+            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+        return _Compared([finalists[row] for row in order], poses[order],
+                         [matches[row] for row in order], [supports[row] for row in order],
+                         handicaps[order])
+
     def _supports(self, frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
                   poses: NDArray[np.float64], matches: Sequence[list[tuple[Match, ...]]]
                   ) -> list[Support]:
         """Return the support of each pose, from its matches in each frame."""
+        used = [one.observation if self._options.needs_similarities
+                else replace(one.observation, similarities=None) for one in frames]
         compared = [ComparedFrame(
             one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-            one.observation.similarities if self._options.needs_similarities else None, one.scene)
-            for one in frames]
+            seen.similarities, one.scene, seen.similarity_rows)
+            for one, seen in zip(frames, used, strict=True)]
         last_from_cameras = np.linalg.inv(cameras)
         return [support(self._map, compared, pose @ last_from_cameras, found)
                 for pose, found in zip(poses, matches, strict=True)]
 
-    def _evidence(self, frames: Sequence[SearchedFrame], best: Finalist,
-                  matches: Sequence[tuple[Match, ...]], its_support: Support,
-                  poses: NDArray[np.float64], likely: NDArray[np.float64], looks: Looks
+    def _evidence(self, frames: Sequence[SearchedFrame], compared: '_Compared',
+                  likely: NDArray[np.float64], covariance: NDArray[np.float64], looks: Looks
                   ) -> Evidence:
         """Return the evidence for the best pose, the first of all."""
-        coverage = _coverage(frames)
-        rivals = likely[~agreeing_poses(poses)[0]]
+        coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
+        elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
+        rivals = likely[elsewhere]
+        twins = elsewhere[look_alike(self._map, compared.poses[0], compared.poses[elsewhere])]
         return Evidence(
-            its_support.inliers, likely[0], min(max(rivals, default=0.0), 1.0 - likely[0]),
-            coverage,
+            supports[0].inliers, likely[0],
+            min(max(rivals, default=0.0), 1.0 - likely[0]),
+            distinct=chance_distinct(supports[0], [supports[row] for row in twins]),
+            twin=_position(compared.poses[twins[0]]) if len(twins) else None,
+            # the covariance of a minimal sample is too rough to decide
+            near=1.0 if best.information is None else share_within(RIGHT_M, covariance),
+            deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
+            coverage=coverage,
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
-            else meetings_of(frames, best, matches),
-            unexplained=its_support.unexplained, looks=len(looks), agreeing=looks.agreeing)
+            else meetings_of(frames, best, compared.matches[0]),
+            unexplained=supports[0].unexplained, looks=len(looks),
+            agreeing=looks.agreeing)
+
+
+class _Compared(NamedTuple):
+    """The finalists, best first, and what supports or contradicts each.
+
+    Parameters
+    ----------
+    finalists : list of m Finalist
+    poses : ndarray (m, 4, 4)
+        map_from_camera.
+    matches : list of m list of tuple of Match
+        Inliers in each frame.
+    supports : list of m Support
+    handicaps : ndarray (m,)
+        See confidences.
+    """
+
+    finalists: list[Finalist]
+    poses: NDArray[np.float64]
+    matches: list[list[tuple[Match, ...]]]
+    supports: list[Support]
+    handicaps: NDArray[np.float64]
+
+
+def _position(pose: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = pose[:3, 3].tolist()
+    return x, y, z
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str

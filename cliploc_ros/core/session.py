@@ -6,7 +6,8 @@ A session fuses each frame with the last few that odometry links to it, and acce
 where the successive looks agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.on_demand import localize_on_demand
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
@@ -49,9 +51,11 @@ class Session:
         self._looks = Looks()
         self._run = -1
         self._stamp_ns = 0
+        #: The newest frame that was localized, with the crops that it took.
+        self.observation: Observation | None = None
 
     def localize(self, observation: Observation, run: int = 0, limit: int = 1,
-                 length_s: float = 0.0) -> Relocalization:
+                 length_s: float = 0.0, more: Iterable[Observation] = ()) -> Relocalization:
         """Localize with a frame and, where odometry places it, with those before it.
 
         Odometry links all frames of one run. A new run or a stamp before the last one forgets
@@ -67,23 +71,28 @@ class Session:
             The most frames to fuse, this one included.
         length_s : float
             Older frames are dropped [s].
+        more : iterable of Observation, optional
+            The same frame with more and more of its crops, taken until the pose is accepted, see
+            cliploc_ros.core.on_demand.
 
         Raises
         ------
         OptionsError
             See Relocalizer.relocalize. The session drops this frame.
         """
+        stages = chain([observation], more)
         if observation.odom_from_camera is None:
-            return self._relocalizer.relocalize([observation])
+            alone, found = localize_on_demand(self._relocalizer, (), stages)
+            self.observation = alone.observation
+            return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
             self._frames, self._looks = [], Looks()
         self._run, self._stamp_ns = run, observation.stamp_ns
         earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
-        budget = self._relocalizer.begin(len(earlier) + 1)
-        newest = KeptFrame(self._relocalizer.search(observation, budget.search_end()), anchor)
-        frames = [*earlier, newest]
-        found = self._relocalizer.locate([one.searched for one in frames], budget, self._looks)
-        self._frames = frames
+        newest, found = localize_on_demand(
+            self._relocalizer, [one.searched for one in earlier], stages, self._looks)
+        self._frames = [*earlier, KeptFrame(newest, anchor)]
+        self.observation = newest.observation
         if found.map_from_camera is not None:
             self._looks = self._looks.with_look(observation, found.map_from_camera)
         return found

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare the demo's wake-ups with the ground truth, and find the matches behind each pose."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,7 +121,7 @@ class Reviewer:
     camera : Camera
     observe : Observe
     relocalize : callable
-        Searches the pose of observations, as `Relocalizer.relocalize`.
+        Searches the pose of an observation with all similarities.
     max_detections : int
         The relocalizer's parameter of this name.
     landmark_of : callable, optional
@@ -130,7 +130,7 @@ class Reviewer:
     """
 
     def __init__(self, sequence: TumSequence, camera: Camera, observe: Observe,
-                 relocalize: Callable[[Sequence[Observation]], Relocalization],
+                 relocalize: Callable[[Observation], Relocalization],
                  max_detections: int, landmark_of: Callable[[str], str] = str) -> None:
         self._sequence, self._camera = sequence, camera
         self._observe, self._relocalize = observe, relocalize
@@ -144,7 +144,7 @@ class Reviewer:
         detections = judged.wake_up.detections.usable(
             self._camera.width, self._camera.height, self._max_detections)
         observation = self._observe(image_rgb, self._camera, detections, stamp)
-        found = self._relocalize([observation])
+        found = self._relocalize(observation)
         repeated = _same_pose(found.map_from_camera, judged.pose)
         true_boxes = self._true_boxes.get(stamp)
         return Review(judged, image_rgb, self._camera, detections,

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.on_demand import localize_on_demand, stages_of
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.bag_reader import BagReader
 from cliploc_ros.datasets.intrinsics import find_camera
@@ -274,6 +277,11 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
             ClipOptions(model=str(values['clip_model']),
                         pretrained=str(values['clip_pretrained'])),
             landmark_map, str(values['map_file']), values['landmark_embeddings'])).observe
-    return Reviewer(sequence, camera, observe, Relocalizer(landmark_map, method).relocalize,
+    relocalizer = Relocalizer(landmark_map, method)
+
+    def relocalize(observation: Observation) -> Relocalization:
+        return localize_on_demand(relocalizer, (),
+                                  stages_of(landmark_map, observation, method))[1]
+    return Reviewer(sequence, camera, observe, relocalize,
                     values['max_detections'],
                     str if options.wake_up_map is None else options.wake_up_map.landmark_of)

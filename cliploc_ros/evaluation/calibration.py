@@ -21,6 +21,7 @@ from scipy.optimize import minimize, minimize_scalar
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
+from cliploc_ros.core.acceptance.attitude import tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import DEFAULT, Calibration, Support, confidences
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -101,6 +102,10 @@ class Case:
     supports : tuple of m Support
     poses : ndarray (m, 4, 4)
     right : ndarray (m,) of bool
+    handicaps : ndarray (m,)
+        See confidences.
+    near : float
+        See Evidence; of the first hypothesis.
     """
 
     place: str
@@ -108,6 +113,8 @@ class Case:
     supports: tuple[Support, ...]
     poses: NDArray[np.float64]
     right: NDArray[np.bool_]
+    handicaps: NDArray[np.float64]
+    near: float = 1.0
 
 
 def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: str,
@@ -116,7 +123,9 @@ def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: st
     poses = np.array([one.map_from_camera for one in found.hypotheses])
     errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
     return Case(place, of_round, tuple(one.support for one in found.hypotheses), poses,
-                (errors < RIGHT_M) & (not of_round.is_elsewhere))
+                (errors < RIGHT_M) & (not of_round.is_elsewhere),
+                tilt_handicaps(poses, RelocalizerOptions.tilt_deviation_deg),
+                1.0 if found.evidence is None else found.evidence.near)
 
 
 def collect(landmark_map: LandmarkMap, queries: Sequence[Query], places: Sequence[str],
@@ -163,12 +172,12 @@ def fit(cases: Sequence[Case]) -> Calibration:
     if first.all() or not first.any():
         raise OptionsError(f'{first.sum()} of {len(first)} poses are right; a fit needs right and '
                            'wrong ones')
-    support, given, right = _padded(cases)
+    support, given, right, handicaps = _padded(cases)
     scale = np.append(support[given].std(axis=0) + 1e-9, 1.0)
     weights = np.array([case.round.weight for case in cases])
     weights /= weights.sum()
     solved = minimize(_loss, np.append(0.0 * scale[:-1], 1.0),
-                      (support / scale[:-1], given, right, weights),
+                      (support / scale[:-1], given, right, handicaps, weights),
                       jac=True, method='L-BFGS-B', bounds=_BOUNDS)
     raw = Calibration(*map(float, [*solved.x / scale, 0.0, 0.0]))
     likely = np.clip(confidence(cases, raw), 1e-12, 1.0 - 1e-12)
@@ -185,24 +194,26 @@ def fit(cases: Sequence[Case]) -> Calibration:
 
 
 def _padded(cases: Sequence[Case]) -> tuple[NDArray[np.float64], NDArray[np.bool_],
-                                             NDArray[np.bool_]]:
-    """Return supports (n, h, 6), which hypotheses exist (n, h), and which are right (n, h)."""
+                                             NDArray[np.bool_], NDArray[np.float64]]:
+    """Return supports (n, h, 6), which exist (n, h), which are right (n, h), and handicaps."""
     support = np.zeros((len(cases), MAX_DISTINCT, len(_FIELDS)))
     given = np.zeros((len(cases), MAX_DISTINCT), dtype=bool)
-    right = np.zeros_like(given)
+    right, handicaps = np.zeros_like(given), np.zeros(given.shape)
     for row, case in enumerate(cases):
         count = len(case.supports)
         support[row, :count] = [[getattr(one, name) for name in _FIELDS]
                                 for one in case.supports]
         given[row, :count], right[row, :count] = True, case.right
-    return support, given, right
+        handicaps[row, :count] = case.handicaps
+    return support, given, right, handicaps
 
 
 def _loss(coefficients: NDArray[np.float64], support: NDArray[np.float64],
-          given: NDArray[np.bool_], right: NDArray[np.bool_], weights: NDArray[np.float64]
+          given: NDArray[np.bool_], right: NDArray[np.bool_],
+          handicaps: NDArray[np.float64], weights: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
     """Return the negative log likelihood and its derivatives (7,) by the coefficients."""
-    utility = np.where(given, support @ coefficients[:-1], -1e9)
+    utility = np.where(given, support @ coefficients[:-1] - handicaps, -1e9)
     utility = np.column_stack([utility, np.full(len(utility), coefficients[-1])])
     odds = np.exp(utility - utility.max(axis=1, keepdims=True))
     truth = np.column_stack([right, ~right.any(axis=1)])
@@ -218,7 +229,8 @@ def _loss(coefficients: NDArray[np.float64], support: NDArray[np.float64],
 
 def confidence(cases: Iterable[Case], calibration: Calibration = DEFAULT) -> NDArray[np.float64]:
     """Return the confidence (n,) in the best pose of each case."""
-    return np.array([confidences(case.supports, case.poses, calibration)[0] for case in cases])
+    return np.array([confidences(case.supports, case.poses, calibration, case.handicaps)[0]
+                     for case in cases])
 
 
 def halves(cases: Sequence[Case], seed: int = 0) -> tuple[set[str], set[str]]:
@@ -245,7 +257,7 @@ def cross_fitted(cases: Sequence[Case], seed: int = 0, elsewhere: bool = False
         calibration = fit([case for case in cases if case.place not in own])
         asked = [case for case in cases if case.place in own
                  and (case.round.is_elsewhere if elsewhere else case.round.is_whole)]
-        judged.append((confidence(asked, calibration),
+        judged.append((confidence(asked, calibration) * [case.near for case in asked],
                        np.array([case.right[0] for case in asked], dtype=bool)))
     return judged
 

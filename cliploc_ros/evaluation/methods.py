@@ -46,7 +46,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         to options, where 'base' names a method whose options are the defaults.
     paper : RelocalizerOptions
         Options of the paper's methods besides matching and algorithm. auto takes its seed,
-        height range and vertical deviation from them.
+        height range, deviations of vertical and tilt, and crops from them.
     landmarks : int
         Number of landmarks of the map; it limits k.
 
@@ -77,10 +77,12 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
     if name == AUTO:
         options = RelocalizerOptions(
             random_seed=paper.random_seed, height_range_m=paper.height_range_m,
-            vertical_deviation_deg=paper.vertical_deviation_deg)
+            vertical_deviation_deg=paper.vertical_deviation_deg,
+            tilt_deviation_deg=paper.tilt_deviation_deg, crops=paper.crops)
     elif name in PAPER_METHODS:
         matching, algorithm = name.split('_')
-        options = replace(paper, matching=matching, algorithm=algorithm, refine=False)
+        options = replace(paper, matching=matching, algorithm=algorithm, refine=False,
+                          tilt_deviation_deg=0.0)
     else:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
                            'nor a YAML file')

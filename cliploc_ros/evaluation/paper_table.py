@@ -58,6 +58,9 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
              'trials, at 1 m.',
              f'Confidences are fitted on {FITTED_ON}: on these frames, precision and recall are '
              'not held out.']
+    lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
+              'on average: --crops all compares all.'
+              for one in summaries if 0.0 < one.crops_share < 1.0]
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
@@ -87,7 +90,8 @@ def as_csv(summaries: Sequence[Summary]) -> str:
                      *(f'success_{limit:g}m_std' for limit in LIMITS_M), 'median_error_m',
                      'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
                      'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
-                     'less_than_best_1m', 'less_than_best_low', 'less_than_best_high'])
+                     'less_than_best_1m', 'less_than_best_low', 'less_than_best_high',
+                     'crops_share'])
     for one in summaries:
         difference = compare(one, best)
         writer.writerow([
@@ -96,7 +100,8 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             *(one.success_deviation(limit) for limit in LIMITS_M), one.median_error_m,
             one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
             float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
-            one.false_accepts(), difference.mean, difference.low, difference.high])
+            one.false_accepts(), difference.mean, difference.low, difference.high,
+            one.crops_share])
     return text.getvalue()
 
 

@@ -23,6 +23,7 @@ from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.on_demand import stages_of
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
@@ -82,7 +83,8 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
-            found = session.localize(look)
+            stages = stages_of(landmark_map, look, options)
+            found = session.localize(next(stages), more=stages)
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
                 replace(found.evidence, looks=1, agreeing=1), options))

@@ -36,6 +36,8 @@ class Summary:
     boxes : ndarray (q,) of int
     nees : ndarray (t, q)
         Infinite where no pose was found; empty where it was not recorded.
+    crops_share : float
+        Share of a query's crops that were compared with labels, on average.
     """
 
     method: str
@@ -49,6 +51,7 @@ class Summary:
     hypotheses: NDArray[np.int64]
     boxes: NDArray[np.int64]
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    crops_share: float = 1.0
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, accepted or not."""
@@ -130,7 +133,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
         column('hypotheses'), column('boxes')[0],
         np.array([np.inf if result.nees is None else result.nees for result in results]
-                 ).reshape(-1, len(queries)))
+                 ).reshape(-1, len(queries)), float(column('crops_share').mean()))
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,14 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.on_demand import (
+    can_do_without_crops,
+    localize_on_demand,
+    stages_of,
+)
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.datasets.queries import Queries, QueryFrame
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.methods import Method
@@ -81,6 +87,8 @@ class Result:
         Reason of the refusal; empty when accepted.
     search_ms : float
         The only field that differs from run to run.
+    crops_share : float
+        Share of the crops of its frames that were compared with labels.
     """
 
     method: str
@@ -102,6 +110,7 @@ class Result:
     coverage: float
     reason: str
     search_ms: float
+    crops_share: float = 1.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -158,12 +167,34 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    return [_judge(method.name, trial, query,
-                   relocalizer.relocalize([*query.neighbours, query.observation]))
+    on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
+    localize = _localize_on_demand if on_demand else _localize
+    return [_judge(method.name, trial, query, *localize(landmark_map, relocalizer, query))
             for query in queries]
 
 
-def _judge(method: str, trial: int, query: Query, found: Relocalization) -> Result:
+def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
+              ) -> tuple[Relocalization, float]:
+    """Localize with all crops; return the result and the share of crops compared."""
+    found = relocalizer.relocalize([*query.neighbours, query.observation])
+    return found, float(relocalizer.options.needs_similarities)
+
+
+def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
+                        ) -> tuple[Relocalization, float]:
+    """Localize as the node does: with each frame after those before it, crops on demand."""
+    frames: list[SearchedFrame] = []
+    for observation in (*query.neighbours, query.observation):
+        frame, found = localize_on_demand(
+            relocalizer, frames, stages_of(landmark_map, observation, relocalizer.options))
+        frames.append(frame)
+    crops = sum(len(one.observation.detections) for one in frames)
+    compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
+    return found, compared / max(crops, 1)
+
+
+def _judge(method: str, trial: int, query: Query, found: Relocalization, crops_share: float
+           ) -> Result:
     pose = found.map_from_camera
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
@@ -179,4 +210,4 @@ def _judge(method: str, trial: int, query: Query, found: Relocalization) -> Resu
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
-        reason=found.reason, search_ms=float(found.search_ms))
+        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector node: images in, detections out, and only while something subscribes to them."""
 
+import math
 import threading
 import time
 from collections.abc import Mapping
@@ -42,6 +43,9 @@ class DetectorNode(ManagedNode):
         # The node opens in one thread; subscribers match in another.
         self._lock = threading.Lock()
         self._open = False
+        # Since when boxes are awaited (monotonic clock) [s], and how long the first ones took.
+        self._awaited_since = math.inf
+        self._first_boxes_s: float | None = None
         self._publisher = self.create_publisher(
             Detection2DArray, 'detections', qos.DETECTIONS_OUT,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self._update()),
@@ -53,6 +57,11 @@ class DetectorNode(ManagedNode):
                                 str(self.settings['profile']))
         self._detector = YoloDetector(options)
         return f'detector {options.model} ({self._detector.inference})'
+
+    @property
+    def detector(self) -> YoloDetector | None:
+        """Return the network, None unless it is loaded."""
+        return self._detector
 
     def unload(self) -> None:
         """Drop the network."""
@@ -81,6 +90,8 @@ class DetectorNode(ManagedNode):
         health.values |= {'listened to': self._images.is_open,
                           'images dropped': self._newest.dropped,
                           'queue age [s]': f'{age_s:.2f}'}
+        if self._first_boxes_s is not None:
+            health.values['first boxes after [s]'] = f'{self._first_boxes_s:.2f}'
         if self._detector is not None:
             health.values['device'] = self._detector.device
 
@@ -88,31 +99,35 @@ class DetectorNode(ManagedNode):
         """Subscribe to images exactly while the node is open and detections have a subscriber."""
         with self._lock:
             if self._open and self._publisher.get_subscription_count() > 0:
+                if not self._images.is_open:
+                    self._awaited_since = time.monotonic()
                 self._images.open()
             else:
                 self._images.close()
 
     def _detect(self, image: TimedImage) -> None:
         """Detect objects in one image and publish them; in the worker's thread."""
-        if not self.active or self._detector is None:
-            return  # deactivated while the image waited
-        times = StageTimes(image.received_at)
-        times.mark('waiting')
+        if not self.active or self._detector is None or not self._images.is_open:
+            return  # deactivated, or the last subscriber left, while the image waited
+        times = StageTimes('waiting', image.received_at)
+        times.begin('decoding')
         try:
             self._detector.configure(detector_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
-            times.mark('decoding')
+            times.begin('detection')
             detections = self._detector.detect(pixels)
         except CliplocError as error:
             self._last_error = str(error)
             self.get_logger().error(self._last_error, throttle_duration_sec=_LOG_PERIOD_S)
             return
-        times.mark('detection')
         self._last_error = ''
         self.stages.add(times.ms)
         if self.active:
             self._published += 1
             self._publisher.publish(detections_to_msg(detections, image.msg.header))
+            if self._awaited_since < math.inf:
+                self._first_boxes_s = time.monotonic() - self._awaited_since
+                self._awaited_since = math.inf
 
 
 def detector_options(values: Mapping[str, Value]) -> YoloOptions:

@@ -3,7 +3,8 @@
 """The answer to a request, or to one frame in continuous mode."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -37,6 +38,10 @@ class Answer:
         When the image arrived (monotonic clock) [s]; -inf without one.
     is_linked : bool
         Whether odometry links the frame with those before and after it.
+    is_cut : bool
+        Whether time was too short for all crops, which could have changed the verdict.
+    stages_ms : mapping of str to float
+        How long each stage took [ms].
     """
 
     verdict: Verdict
@@ -44,6 +49,8 @@ class Answer:
     pose: PoseWithCovarianceStamped | None = None
     received_at: float = -math.inf
     is_linked: bool = False
+    is_cut: bool = False
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def message(self) -> str:

@@ -2,14 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame to a relocalization: the map and the network that stay loaded between requests."""
 
-from collections.abc import Mapping
+import math
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.core.index.similarities import Similarities
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.on_demand import BATCH, can_do_without_crops, crops_on_demand
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -23,19 +32,35 @@ from cliploc_ros.ros.conversions import (
     stamp_ns,
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
 
+# Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
+# of the time that is left, and for the answer. Guesses.
+_SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
+
 
 class Localized(NamedTuple):
-    """The result of one frame, what was seen in it, and how long each stage took."""
+    """The result of one frame.
+
+    Parameters
+    ----------
+    found : Relocalization
+    seen : SeenImage
+        With the crops that were compared.
+    compared : int
+        Number of crops that were compared with labels.
+    is_cut : bool
+        Whether there was no time for the other crops, which could have helped.
+    """
 
     found: Relocalization
     seen: SeenImage
-    times: StageTimes
+    compared: int
+    is_cut: bool
 
 
 class Localizer:
@@ -96,7 +121,8 @@ class Localizer:
                 values['landmark_embeddings']))
         return Localizer(landmark_map, observer, relocalizer, options, self.device)
 
-    def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState) -> Localized:
+    def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
+                 times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
         Parameters
@@ -106,38 +132,75 @@ class Localizer:
             The relocalizer's parameters, as they are now.
         state : RobotState
             At the stamp of the frame.
+        times : StageTimes
+            Of this frame.
+        deadline : float
+            When to stop comparing crops (monotonic clock) [s].
 
         Raises
         ------
         CliplocError
             Names what to fix in the frame or in the parameters.
         """
-        times = StageTimes(frame.received_at)
-        times.mark('waiting')
+        times.begin('decoding')
         image = image_from_msg(frame.image)
         height, width = image.shape[:2]
         camera = camera_from_msg(frame.camera_info, (width, height), values['rectified'])
         detections = detections_from_msg(
             frame.detections, parse_class_map(values['class_map'])).usable(
                 width, height, values['max_detections'])
-        times.mark('decoding')
-        stamp = stamp_ns(frame.image.header.stamp)
-        observation = Observation(camera, detections, stamp_ns=stamp) if self._observer is None \
-            else self._observer.observe(image, camera, detections, stamp)
-        times.mark('CLIP')
-        found = self._relocalize(replace(observation, up_in_camera=state.up_in_camera),
-                                 state.place, values)
-        times.mark('search')
-        return Localized(found, SeenImage(image, observation), times)
-
-    def _relocalize(self, observation: Observation, place: CameraPlace | None,
-                    values: Mapping[str, Any]) -> Relocalization:
-        """Localize with a frame and those before it that odometry links to it."""
-        session = self._session_for(relocalizer_options(values))
+        place = state.place
+        observation = Observation(
+            camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
+            up_in_camera=state.up_in_camera,
+            odom_from_camera=None if place is None else place.odom_from_camera)
+        options = relocalizer_options(values)
+        session = self._session_for(options)
+        times.begin('search')
+        stages = self._stages(image, observation, options, times, deadline)
         if place is None:
-            return session.localize(observation)
-        return session.localize(replace(observation, odom_from_camera=place.odom_from_camera),
-                                place.run, values['fuse_frames'], values['fuse_window_s'])
+            found = session.localize(next(stages), more=stages)
+        else:
+            found = session.localize(next(stages), place.run, values['fuse_frames'],
+                                     values['fuse_window_s'], stages)
+        seen = session.observation
+        assert seen is not None
+        compared = int((seen.similarity_rows >= 0).sum())
+        is_cut = not found.accepted and self._observer is not None and compared < len(detections)
+        return Localized(found, SeenImage(image, seen), compared, is_cut)
+
+    def _stages(self, image: NDArray[np.uint8], observation: Observation,
+                options: RelocalizerOptions, times: StageTimes, deadline: float
+                ) -> Iterator[Observation]:
+        """Return the observation with more and more of its crops, or at once as it is localized.
+
+        The paper's algorithms compare all crops, however long that takes.
+        """
+        observer, detections = self._observer, observation.detections
+        if observer is None:
+            return iter([observation])
+        if not can_do_without_crops(options):
+            times.begin('CLIP')
+            seen = observer.observe(image, observation.camera, detections, observation.stamp_ns)
+            times.begin('search')
+            return iter([replace(observation, similarities=seen.similarities)])
+        crops = observer.crops(image, detections.bboxes_xyxy)
+        on_demand = options.crops == 'on_demand'
+        end = deadline - _ANSWER_S - min(_SEARCHES * options.time_budget_s,
+                                         _MOST_SHARE * (deadline - time.monotonic()))
+
+        def compare(rows: NDArray[np.int64]) -> Similarities:
+            times.begin('CLIP')
+            similarities = crops.compare(rows)
+            times.begin('search')
+            return similarities
+
+        def room() -> int:
+            fitting = observer.crops_within(end - time.monotonic())
+            return min(BATCH, fitting) if on_demand else fitting
+
+        stages = crops_on_demand(self._map, observation, compare, crops.known, room)
+        return stages if on_demand else iter(deque(stages, maxlen=1))
 
     def _session_for(self, options: RelocalizerOptions) -> Session:
         """Return the session; other options begin a new one."""
@@ -154,6 +217,8 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     CliplocError
         Names the file, parameter or download to mend.
     """
+    if values['cache_dir']:
+        KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
     landmark_map = load_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
@@ -164,6 +229,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
             _clip_options(values), landmark_map, values['map_file'],
             values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
+        observer.measure()
     return Localizer(landmark_map, observer, relocalizer, options, device)
 
 

@@ -6,7 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cliploc_ros.core.options import ALGORITHMS, COMPARED, MATCHINGS, RelocalizerOptions
+from cliploc_ros.core.options import (
+    ALGORITHMS,
+    COMPARED,
+    CROPS,
+    MATCHINGS,
+    RelocalizerOptions,
+)
 from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
@@ -86,6 +92,9 @@ RELOCALIZER = (
     ParameterRow('gravity', 'none', 'Source of the vertical: base_frame (the robot stands '
                  'upright) or the topic imu. auto then needs two objects instead of three.',
                  choices=SOURCES, read_only=True),
+    ParameterRow('tilt_deviation_deg', 40.0, 'Standard deviation of the tilt of the camera off '
+                 'upright, where no vertical is known; 0: any tilt is as likely, as where the '
+                 "map's z axis is not up.", unit='deg', low=0.0, high=60.0),
     ParameterRow('vertical_deviation_deg', 1.0, 'Standard deviation of that vertical.',
                  unit='deg', low=0.01, high=45.0),
     ParameterRow('height_range_m', [0.0, 0.0], 'Least and greatest height of the camera in the '
@@ -104,6 +113,9 @@ RELOCALIZER = (
                  low=0.1, high=60.0),
     ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
                  "'tvmonitor=tv, pottedplant=potted plant'."),
+    ParameterRow('crops', 'on_demand', 'Crops that CLIP sees: all, or on demand: the most '
+                 'informative first, until the pose is accepted. matching hybrid with algorithm '
+                 'auto only; else all.', choices=CROPS),
     ParameterRow('max_detections', 50, 'Use only the most confident detections, this many.',
                  low=3, high=1000),
     ParameterRow('profile', 'auto', "Encoder of a profile: 'accurate', 'balanced' or 'fast'; "

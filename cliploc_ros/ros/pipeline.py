@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """From one frame to its answer: robot state, localizer, acceptance, outputs."""
 
+import math
+from dataclasses import replace
 from functools import partial
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import move_covariance
-from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
@@ -17,6 +18,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.localizer import Localized, Localizer, load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
@@ -73,8 +75,17 @@ class Pipeline:
         """Drop map -> odom until the next accepted pose: time jumped."""
         self._map_to_odom.forget()
 
-    def localize(self, frame: Frame) -> Answer:
+    def localize(self, frame: Frame, times: StageTimes | None = None,
+                 deadline: float = math.inf) -> Answer:
         """Localize with one frame and publish what was found.
+
+        Parameters
+        ----------
+        frame : Frame
+        times : StageTimes, optional
+            Of this frame; new ones since its image arrived by default.
+        deadline : float
+            When to stop comparing crops (monotonic clock) [s].
 
         Raises
         ------
@@ -83,6 +94,9 @@ class Pipeline:
         CliplocError
             Names what to fix in the frame or in the parameters.
         """
+        if times is None:
+            times = StageTimes('detection', frame.received_at)
+            times.begin('waiting', frame.detected_at)
         values = self._node.settings.snapshot()
         self._node.check_active()
         localizer = self.localizer
@@ -90,12 +104,15 @@ class Pipeline:
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
         state = self._robot.at(image, values)
-        localized = localizer.localize(frame, values, state)
-        self._node.stages.add(localized.times.ms)
+        localized = localizer.localize(frame, values, state, times, deadline)
+        stages_ms = times.ms
+        self._node.stages.add(stages_ms)
         self._node.check_active()
         self._jumps.check(image.stamp, frame.received_at)
         header = Header(stamp=image.stamp, frame_id=localizer.map_frame)
-        answer = self._answer(header, localized, state, frame.received_at)
+        answer = replace(
+            self._answer(header, localized, state, frame.received_at, in_words(stages_ms)),
+            is_cut=localized.is_cut, stages_ms=stages_ms)
         self._show(image, header, localizer, localized, state, answer)
         return answer
 
@@ -105,10 +122,10 @@ class Pipeline:
         return localizer.description
 
     def _answer(self, header: Header, localized: Localized, state: RobotState,
-                received_at: float) -> Answer:
+                received_at: float, times: str) -> Answer:
         """Publish an accepted pose; return the verdict in words."""
         found, is_linked = localized.found, state.place is not None
-        summary = f'[{_summary(found)}; {localized.times}]'
+        summary = f'[{_summary(localized)}; {times}]'
         if not found.accepted:
             return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at,
                           is_linked)
@@ -138,7 +155,10 @@ class Pipeline:
                 localizer.landmark_map, localized.found, answer.message))
 
 
-def _summary(found: Relocalization) -> str:
+def _summary(localized: Localized) -> str:
+    found, seen = localized.found, localized.seen.observation
+    crops = '' if seen.similarities is None else \
+        f', CLIP of {localized.compared} of {len(seen.detections)} crops'
     return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search')
+            f'{100 * found.coverage:.3g} % of the search{crops}')

@@ -5,7 +5,8 @@
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
 
@@ -22,6 +24,16 @@ from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerEr
 _MAX_UNLINKED = 3
 # An earlier request ends at its own deadline, shortly before those that wait for it.
 _GRACE_S = 0.2
+
+
+_SMALLER = 'choose a faster profile or a smaller'
+# Of each stage its name in a message, and what makes it faster.
+_STAGES = {'image': 'waiting for an image', 'detection': 'the detector',
+           'waiting': 'waiting for earlier work', 'decoding': 'reading the image',
+           'CLIP': 'CLIP', 'search': 'the search'}
+_REMEDIES = {'image': "raise the camera's rate", 'detection': f'{_SMALLER} detector',
+             'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
+             'search': 'lower iterations or time_budget_ms'}
 
 
 class _Look(NamedTuple):
@@ -45,13 +57,14 @@ class Requests:
     robot : RobotStateSource
     jumps : TimeJumps
     localize : callable
-        Takes a frame and returns its Answer; called in the worker's thread.
+        Takes a frame, its StageTimes and the deadline (monotonic clock) [s]; returns its Answer.
+        Called in the worker's thread.
     handoff : HandOff
     """
 
     def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
-                 jumps: TimeJumps, localize: Callable[[Frame], Answer], handoff: HandOff
-                 ) -> None:
+                 jumps: TimeJumps, localize: Callable[[Frame, StageTimes, float], Answer],
+                 handoff: HandOff) -> None:
         self._node = node
         self._frames = frames
         self._robot = robot
@@ -91,24 +104,41 @@ class Requests:
 
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
         """Look at one frame after another while another frame can change the answer."""
-        look, looks = self._look_past_jumps(arrived_at, deadline), 1
-        unlinked = int(not look.answer.is_linked)
+        try:
+            look, looks = self._look_past_jumps(arrived_at, deadline), 1
+        except TimeUpError as error:
+            return Answer(Verdict.REFUSED, str(error))
+        stages_ms, unlinked = Counter(look.answer.stages_ms), int(not look.answer.is_linked)
+        is_up = look.answer.is_cut
         while look.may_go_on and unlinked < _MAX_UNLINKED:
             try:
                 look = self._look_past_jumps(time.monotonic(), deadline)
             except (NoFrameError, TimeUpError, TimeJumpError):
+                is_up = True
                 break
             looks += 1
+            stages_ms.update(look.answer.stages_ms)
             unlinked += not look.answer.is_linked
+            is_up = look.answer.is_cut
+        answer = look.answer
+        if is_up and answer.verdict is Verdict.REFUSED:
+            answer = replace(answer, detail=f'{answer.detail}; {_time_is_up(stages_ms)}')
         if looks == 1:
-            return look.answer
-        return replace(look.answer, detail=f'{look.answer.detail} [{looks} frames in '
-                                           f'{time.monotonic() - arrived_at:.1f} s]')
+            return answer
+        return replace(answer, detail=f'{answer.detail} [{looks} frames in '
+                                      f'{time.monotonic() - arrived_at:.1f} s]')
 
     def _look(self, after: float, deadline: float) -> _Look:
         """Localize with the next frame and hand an accepted pose to the localizer."""
         frame = self._frames.next_frame(after, deadline)
-        answer = self._node.worker.run(lambda: self._localize(frame), deadline)
+        times = StageTimes('image', after)
+        times.begin('detection', frame.received_at)
+        times.begin('waiting', frame.detected_at)
+        try:
+            answer = self._node.worker.run(lambda: self._localize(frame, times, deadline),
+                                           deadline)
+        except TimeUpError as error:
+            raise TimeUpError(_time_is_up(times.ms)) from error
         may_go_on = answer.pose is None
         if answer.pose is not None:
             try:
@@ -134,3 +164,11 @@ class Requests:
                 if isinstance(error, NoTransformError) and not self._jumps.is_settling:
                     raise
                 jump, after = error, time.monotonic()
+
+
+def _time_is_up(stages_ms: Mapping[str, float]) -> str:
+    """Return which stage used up the time of a request, and what to do about it."""
+    stage = max(stages_ms, key=lambda name: stages_ms[name])
+    total_s = sum(stages_ms.values()) / 1e3
+    return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '
+            f'{_REMEDIES[stage]}, or raise timeout_s')

@@ -84,7 +84,7 @@ def compared(office_map, queries):
     similarities[1, 4] = 1.0
     scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
                        np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
-    return ComparedFrame(boxes, detections.class_ids, similarities, scene)
+    return ComparedFrame(boxes, detections.class_ids, similarities, scene, np.arange(len(boxes)))
 
 
 @pytest.fixture
@@ -128,7 +128,8 @@ def test_labels_and_classes_support_a_pose(measure, compared, queries, office_ma
     # one of all columns is 1, the others are 0
     assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
     assert (found.same_class, found.unlabelled) == (1, 0)
-    by_class = measure([compared._replace(similarities=None)], poses, matches)
+    by_class = measure([compared._replace(
+        similarities=None, similarity_rows=np.full(4, -1))], poses, matches)
     assert (by_class.likeness, by_class.unlabelled) == (0.0, 1)
     assert by_class.misfit == found.misfit > 0
 
@@ -231,7 +232,8 @@ def test_no_refusal_names_a_rival_at_the_same_place(office_map, queries, observe
             elsewhere = [one.confidence for one, (metres, degrees) in zip(
                 found.hypotheses, errors, strict=True) if metres >= 1.0 or degrees >= 45.0]
             assert 0.0 < found.evidence.rival <= 1.0 - best.confidence
-            assert found.evidence.rival <= max(elsewhere) / found.evidence.found + 1e-9
+            assert found.evidence.rival <= max(elsewhere) / (
+                found.evidence.found * found.evidence.near) + 1e-9
     assert ambiguous > 3
 
 

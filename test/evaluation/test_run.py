@@ -168,3 +168,19 @@ def test_a_journal_survives_a_full_disk(results, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     assert journal.read({'trials': 3}) == results[:2]
+
+
+def test_crops_on_demand_are_a_part_of_all(room, questions):
+    """The last one sees twelve objects: its classes suffice. The first one sees two."""
+    options = replace(PAPER, iterations=2000)
+    found = {crops: run_methods(room, parse_methods(['auto'], replace(options, crops=crops),
+                                                    len(room)), questions, trials=1)
+             for crops in ('all', 'on_demand')}
+    assert {one.crops_share for one in found['all']} == {1.0}
+    shares = [one.crops_share for one in found['on_demand']]
+    assert shares[0] == 1.0 and shares[-1] == 0.0
+    assert [one.accepted for one in found['on_demand']] == [one.accepted for one in found['all']]
+    assert all(share == 1.0 or one.accepted
+               for share, one in zip(shares, found['on_demand'], strict=True))
+    (summary,) = summarize(found['on_demand'])
+    assert summary.crops_share == pytest.approx(np.mean(shares))

@@ -22,6 +22,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
 
 
@@ -39,9 +40,10 @@ def localizer(values):
 
 
 def localize(localizer, values, image, info, found):
-    frame = Frame(*(stamped(msg, 100) for msg in (image, info, found)), 0.0)
+    frame = Frame(*(stamped(msg, 100) for msg in (image, info, found)), 0.0, 0.0)
     try:
-        return localizer.localize(frame, values, RobotState(np.eye(4))).found
+        return localizer.localize(frame, values, RobotState(np.eye(4)),
+                                  StageTimes('waiting', 0.0)).found
     except CliplocError as error:
         assert str(error).strip()
         return None

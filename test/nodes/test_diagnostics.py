@@ -81,6 +81,7 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
                                                        'detection mean [ms]': '.'})
         assert detected
         assert values['device'] in ('cpu', 'cuda:0')
+        assert float(values['first boxes after [s]']) > 0.0
         assert {'images dropped', 'queue age [s]', 'waiting last [ms]', 'memory [MiB]'} <= set(
             values)
         status.wait(WARN, 'no image on /image for')
@@ -88,6 +89,9 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         bad.encoding = 'yuv422'
         status.wait(WARN, "encoding 'yuv422' is none of", (bad,))
         status.wait(OK, 'active', (image,))
+    values = status.wait(OK, 'active', (image,),
+                         **{'listened to': 'False', 'image rate [Hz]': '0.0'})
+    assert values['detections rate [Hz]'] == '0.0', 'it rests while nobody asks'
     tester.destroy_publisher(tester.images)
     status.wait(WARN, 'nobody publishes /image')
     tester.images = tester.create_publisher(type(image), 'image', 10)

@@ -5,7 +5,14 @@ import time
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Rates, Stages, StageTimes
+from cliploc_ros.ros.node.diagnostics import (
+    Diagnostics,
+    Health,
+    Rates,
+    Stages,
+    StageTimes,
+    in_words,
+)
 
 
 def test_the_worst_problem_gives_the_level_and_comes_first():
@@ -29,19 +36,20 @@ def test_stages_in_numbers():
 
 
 def test_stages_of_one_result_follow_each_other():
-    times = StageTimes(time.monotonic() - 2.0)
-    times.mark('waiting')
-    times.mark('search')
-    assert list(times.ms) == ['waiting', 'search']
-    assert times.ms['waiting'] == pytest.approx(2000.0, abs=500.0)
-    assert 0.0 <= times.ms['search'] < 500.0
+    now = time.monotonic()
+    times = StageTimes('waiting', now - 9.0)
+    times.begin('search', now - 7.0)
+    times.begin('CLIP', now - 6.0)
+    times.begin('search', now - 1.0)
+    assert list(times.ms) == ['waiting', 'search', 'CLIP']
+    assert times.ms['waiting'] == pytest.approx(2000.0)
+    assert times.ms['CLIP'] == pytest.approx(5000.0)
+    assert 2000.0 <= times.ms['search'] < 2500.0, 'the running stage counts until now'
 
 
 def test_stages_are_told_in_whole_milliseconds():
-    times = StageTimes(time.monotonic())
-    assert str(times) == ''
-    times.mark('decoding')
-    assert str(times) == 'decoding 0 ms'
+    assert in_words({}) == ''
+    assert in_words({'decoding': 0.4, 'CLIP': 1200.0}) == 'decoding 0 ms, CLIP 1200 ms'
 
 
 @pytest.mark.clock

@@ -30,6 +30,7 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
 from cliploc_ros.units import NS_PER_S
 
@@ -91,12 +92,13 @@ def frame():
                       k=camera.matrix.ravel(), p=np.c_[camera.matrix, np.zeros(3)].ravel())
     return Frame(Image(header=HEADER, width=camera.width, height=camera.height, encoding='rgb8',
                        step=3 * camera.width, data=image.tobytes()),
-                 info, detections_to_msg(detections, HEADER), 0.0)
+                 info, detections_to_msg(detections, HEADER), 0.0, 0.0)
 
 
 def finds(localizer, frame, values) -> bool:
     """Return whether the pose is accepted; it then has to be right."""
-    found = localizer.localize(frame, values, RobotState(np.eye(4))).found
+    found = localizer.localize(frame, values, RobotState(np.eye(4)),
+                               StageTimes('waiting', 0.0)).found
     if found.accepted:
         truth = read_tum(ASSETS / 'sequence').pose_at(round(float(QUERY.timestamp) * NS_PER_S))
         distance_m, angle_deg = pose_error(found.map_from_camera, truth)

@@ -37,7 +37,7 @@ class Answering(ManagedNode):
         self.robot = RobotStateSource(self)
         self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
         self.requests = Requests(self, self.frames, self.robot, TimeJumps(self, lambda: None),
-                                 lambda frame: self.localize(frame),
+                                 lambda frame, times, deadline: self.localize(frame),
                                  HandOff(self, self.robot.odometry))
 
     def load(self):
@@ -144,8 +144,8 @@ def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, cl
     shoot_until(camera, wait, request)
     took_s = time.monotonic() - start
     release.set()
-    assert request.result().verdict is Verdict.FAILED
-    assert 'longer than timeout_s' in request.result().message
+    assert request.result().verdict is Verdict.REFUSED
+    assert 'time is up: waiting for' in request.result().message
     assert took_s < 1.0
 
 

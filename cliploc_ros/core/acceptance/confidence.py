@@ -28,14 +28,13 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 
 # Boxes that overlap more than this show the same object, detected twice.
 _SAME_BOX_IOU = 0.8
-# A right pose is within 1 m; two poses turned by more than 45 degrees are never both right.
-_RIGHT_M = 1.0
+#: A right pose is within this distance of the truth [m].
+RIGHT_M = 1.0
+# Two poses turned by more than 45 degrees are never both right.
 _AGREEING_TRACE = 1.0 + 2.0 * np.cos(np.radians(45.0))
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
-# Log odds that a known vertical is right. A guess: one mount of a hundred is wrong.
-_TILTED_PENALTY = 4.6
 # The recordings are too short to justify a higher confidence.
 _MOST_CONFIDENCE = 0.9999
 # Number of labels that gives mean and deviation of a crop's similarities to 2 %.
@@ -121,12 +120,15 @@ class ComparedFrame(NamedTuple):
         None where classes alone are matched.
     scene : Scene
         Of the same detections.
+    similarity_rows : ndarray (n,) of int
+        Row of similarities of each detection; -1 where its class alone is matched.
     """
 
     bboxes_xyxy: NDArray[np.float64]
     class_ids: tuple[str, ...]
     similarities: Similarities | None
     scene: Scene
+    similarity_rows: NDArray[np.int64]
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
@@ -180,18 +182,20 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     classes = landmark_map.classes.classes_of(frame.class_ids)
+    rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
+    compared = rows >= 0
+    if frame.similarities is not None and compared.any():
+        likenesses[compared] = _likenesses(frame.similarities, rows[compared],
+                                           landmarks[compared])
     return np.column_stack([
         [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks),
-        np.zeros(len(matches)) if frame.similarities is None
-        else _likenesses(frame.similarities, detections, landmarks),
-        landmark_map.classes.have(landmarks, classes[detections]),
-        np.full(len(matches), frame.similarities is None)])
+        _misfits(frame.scene, map_from_camera, detections, landmarks), likenesses,
+        landmark_map.classes.have(landmarks, classes[detections]), ~compared])
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
-                calibration: Calibration = DEFAULT, upright: NDArray[np.bool_] | None = None
-                ) -> NDArray[np.float64]:
+                calibration: Calibration = DEFAULT,
+                handicaps: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     """Return the probability that each hypothesis is within 1 m of the truth.
 
     Parameters
@@ -200,19 +204,17 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     poses : ndarray (m, 4, 4)
         map_from_camera of the same hypotheses.
     calibration : Calibration, optional
-    upright : ndarray (m,) of bool, optional
-        Hypotheses that use the known vertical; all of them where none is known.
+    handicaps : ndarray (m,), optional
+        Log odds that speak against each hypothesis besides its support.
 
     Returns
     -------
     ndarray (m,)
         0 to 1. The rest to 1 is the probability that another pose is right, or none.
     """
-    utilities = np.array([_utility(one, calibration) for one in supports])
-    if upright is not None:
-        utilities[~upright] -= _TILTED_PENALTY
-    shares = np.exp(np.append(utilities, calibration.none_right)
-                    - max(utilities.max(), calibration.none_right))
+    odds = utilities(supports, calibration) - handicaps
+    shares = np.exp(np.append(odds, calibration.none_right)
+                    - max(odds.max(), calibration.none_right))
     shares = shares[:-1] / shares.sum()
     agreeing = agreeing_poses(poses)
     likely = np.clip(agreeing @ shares, 1.0 - _MOST_CONFIDENCE, _MOST_CONFIDENCE)
@@ -225,17 +227,20 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), _MOST_CONFIDENCE)
 
 
-def _utility(one: Support, calibration: Calibration) -> float:
-    return (calibration.score * one.score + calibration.misfit * one.misfit
-            + calibration.likeness * one.likeness + calibration.same_class * one.same_class
-            + calibration.unlabelled * one.unlabelled
-            + calibration.unexplained * one.unexplained)
+def utilities(supports: Sequence[Support], calibration: Calibration = DEFAULT
+              ) -> NDArray[np.float64]:
+    """Return the utility (m,) of each support: the logarithm of its odds, up to a constant."""
+    return np.array([
+        calibration.score * one.score + calibration.misfit * one.misfit
+        + calibration.likeness * one.likeness + calibration.same_class * one.same_class
+        + calibration.unlabelled * one.unlabelled + calibration.unexplained * one.unexplained
+        for one in supports])
 
 
 def agreeing_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (m, m): which of the poses (m, 4, 4) agree to 1 m and 45 degrees."""
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
-    near = np.linalg.norm(positions[:, None] - positions, axis=2) < _RIGHT_M
+    near = np.linalg.norm(positions[:, None] - positions, axis=2) < RIGHT_M
     traces = np.einsum('iab,jab->ij', rotations, rotations)
     return np.asarray(near & (traces > _AGREEING_TRACE))
 
@@ -273,9 +278,9 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
 
 
-def _likenesses(similarities: Similarities, detections: NDArray[np.int64],
+def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
                 landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    sample = sampled_similarities(similarities, detections, _LABELS_SAMPLED)
+    sample = sampled_similarities(similarities, rows, _LABELS_SAMPLED)
     deviations = np.maximum(sample.std(axis=1), 1e-6)
-    return np.asarray((pair_similarities(similarities, detections, landmarks)
+    return np.asarray((pair_similarities(similarities, rows, landmarks)
                        - sample.mean(axis=1)) / deviations)

@@ -30,6 +30,14 @@ class Evidence:
     rival : float
         Probability that the likeliest hypothesis that does not agree with it is right instead; 0
         without one.
+    distinct : float
+        Probability that its place is not mistaken for one that looks alike.
+    twin : tuple of float, optional
+        Where the camera would be at the likeliest place that looks alike [m].
+    near : float
+        Probability that it is within 1 m if it is right, given its covariance.
+    deviation_m : float
+        Standard deviation of its position [m].
     coverage : float
         Share of its samples that the search tried, 0 to 1.
     tried : int
@@ -48,6 +56,10 @@ class Evidence:
     inliers: int
     likely: float
     rival: float = 0.0
+    distinct: float = 1.0
+    twin: tuple[float, float, float] | None = None
+    near: float = 1.0
+    deviation_m: float = 0.0
     coverage: float = 1.0
     tried: int = 0
     meetings: float = math.inf
@@ -69,8 +81,13 @@ class Evidence:
 
     @property
     def confidence(self) -> float:
-        """Return the probability that the best hypothesis is right."""
-        return self.likely * self.found
+        """Return the probability that the best hypothesis is within 1 m of the truth."""
+        return self.likely * self.certainty
+
+    @property
+    def certainty(self) -> float:
+        """Return the probability that nothing besides the hypotheses found makes it wrong."""
+        return self.distinct * self.found * self.near
 
 
 def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
@@ -108,6 +125,14 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.confidence >= options.min_confidence:
         return ''
     compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
+    others = evidence.likely * evidence.found * evidence.near
+    if evidence.twin is not None and others >= options.min_confidence:
+        x, y, z = evidence.twin
+        return (f'{compared}; the place around x {x:.2f} y {y:.2f} z {z:.2f} m looks alike; '
+                'turn the camera to objects that differ')
+    if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
+        return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
+                'turn the camera to more or nearer objects')
     if evidence.likely >= options.min_confidence:
         return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
                 'samples; raise iterations or set algorithm to auto')

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an observation and a map to the scene that is searched: the association of one frame."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,16 +87,20 @@ def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: C
 
 def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,
              sound: NDArray[np.bool_]) -> Candidates | None:
-    """Return the k most similar landmarks of each sound detection; None without CLIP."""
+    """Return the k most similar landmarks of each sound, compared detection; None without CLIP."""
     if not options.needs_similarities:
         return None
-    shape = (len(observation.detections), len(landmark_map))
+    compared = observation.compared
+    if compared is None:
+        compared = np.arange(len(observation.detections))
+    shape = (len(compared), len(landmark_map))
     similarities = observation.similarities
     if similarities is None or similarities.shape != shape:
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
     nearest = nearest_candidates(similarities, options.k)
+    nearest = replace(nearest, detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import (
+    REFINED_MOST,
     box_scatter,
     odometry_covariance,
     pose_covariance,
@@ -222,7 +223,8 @@ def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose
         boxes.append(frame.scene.box_ellipses[[match.detection for match in found]])
     seen = [row for found in matches for row in {match.landmark for match in found}]
     views = max(1.0, len(seen) / max(1, len(set(seen))))
-    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views), views
+    most = inf if pose.information is None else REFINED_MOST
+    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views, most), views
 
 
 def _sample_covariance(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],

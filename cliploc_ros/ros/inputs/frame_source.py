@@ -42,12 +42,22 @@ class NoFrameError(CliplocError):
 
 @dataclass(frozen=True)
 class Frame:
-    """The messages of one stamp, and when the image arrived (monotonic clock) [s]."""
+    """The messages of one stamp.
+
+    Parameters
+    ----------
+    image : Image or CompressedImage
+    camera_info : CameraInfo
+    detections : Detection2DArray
+    received_at, detected_at : float
+        When the image arrived, and when its detections did (monotonic clock) [s].
+    """
 
     image: Image | CompressedImage
     camera_info: CameraInfo
     detections: Detection2DArray
     received_at: float
+    detected_at: float
 
 
 class FrameSource:
@@ -210,8 +220,9 @@ class FrameSource:
             if complete is None:
                 return
             image, received_at = complete['image']
-            frame = Frame(image, complete['camera_info'][0], complete['detections'][0],
-                          received_at)
+            detections, detected_at = complete['detections']
+            frame = Frame(image, complete['camera_info'][0], detections, received_at,
+                          max(received_at, detected_at))
             self._newest = frame
             self._changed.notify_all()
         self._on_frame(frame)
@@ -231,6 +242,10 @@ class FrameSource:
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
+        if publishers and name == 'detections':
+            return (f'no detections on {topic} from its {publishers} publisher(s): the detector '
+                    'used up the time, or it stands still; choose a faster profile or a smaller '
+                    'detector, raise timeout_s, or look at its log')
         if publishers:
             return (f'no {name} on {topic} from its {publishers} publisher(s): is it sending, and '
                     'is its QoS compatible?')

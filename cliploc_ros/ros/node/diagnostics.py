@@ -62,32 +62,38 @@ class Health:
 
 
 class StageTimes:
-    """How long each stage of one result took.
+    """How long each stage of one result took; written in one thread, read in another.
 
     Parameters
     ----------
+    stage : str
+        The first stage.
     start : float
-        When the first stage began (monotonic clock) [s].
+        When it began (monotonic clock) [s].
     """
 
-    def __init__(self, start: float) -> None:
-        self._start = start
-        self._stages: dict[str, float] = {}
+    def __init__(self, stage: str, start: float) -> None:
+        # One tuple: a reader in another thread never sees half of a change.
+        self._now: tuple[dict[str, float], str, float] = ({}, stage, start)
 
-    def mark(self, stage: str) -> None:
-        """End a stage; it began where the previous one ended."""
-        now = time.monotonic()
-        self._stages[stage] = (now - self._start) * 1e3
-        self._start = now
+    def begin(self, stage: str, at: float | None = None) -> None:
+        """Begin a stage, or go on with it; the running one ends, by default now."""
+        now = time.monotonic() if at is None else at
+        self._now = (self._until(now), stage, now)
 
     @property
     def ms(self) -> dict[str, float]:
-        """Return how long each stage took [ms], in their order."""
-        return dict(self._stages)
+        """Return how long each stage took until now [ms], in their order."""
+        return self._until(time.monotonic())
 
-    def __str__(self) -> str:
-        """Return the stages in words."""
-        return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in self._stages.items())
+    def _until(self, now: float) -> dict[str, float]:
+        ms, stage, start = self._now
+        return {**ms, stage: ms.get(stage, 0.0) + max(0.0, now - start) * 1e3}
+
+
+def in_words(stages_ms: Mapping[str, float]) -> str:
+    """Return the times of stages [ms] in words."""
+    return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in stages_ms.items())
 
 
 class Stages:

@@ -71,13 +71,13 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
 
 
 def _similarity(observation: Observation, detection: int, landmark: int) -> str:
-    similarities = observation.similarities
-    if similarities is None:
+    similarities, row = observation.similarities, observation.similarity_rows[detection]
+    if similarities is None or row < 0:
         return ''
     if isinstance(similarities, CropSimilarities):
         label = similarities.labels.unique[similarities.labels.of_landmarks[landmark]]
-        return f'CLIP {float(similarities.crops[detection] @ label):.2f} '
-    return f'CLIP {float(similarities[detection, landmark]):.2f} '
+        return f'CLIP {float(similarities.crops[row] @ label):.2f} '
+    return f'CLIP {float(similarities[row, landmark]):.2f} '
 
 
 def _draw_box(canvas: NDArray[np.uint8], box: NDArray[np.float64], color: tuple[int, int, int]

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Acceptance in simulated worlds: ``python -m cliploc_ros.evaluation.worlds.judge --help``.
+
+Each group of five images is localized with its last image alone and with all of them, without
+and with the vertical and the height. Nothing here was used to fit the confidence.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.command import run_command
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
+from cliploc_ros.evaluation.summary import wilson_interval
+from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
+from cliploc_ros.evaluation.worlds.places import KINDS
+from cliploc_ros.evaluation.worlds.world import make_world
+from cliploc_ros.parallel import run_tasks
+
+RIGHT_M = 1.0
+#: What is known besides one image.
+MODES = ('one image', 'vertical', 'vertical, height', 'five images', 'five, vertical, height')
+# Deviations of the simulated sensors.
+_VERTICAL_DEG, _STEP_M, _STEP_DEG, _HEIGHT_M = 1.0, 0.01, 0.5, 0.2
+
+
+class Verdict(NamedTuple):
+    """The outcome of one search; the error is infinite where no pose was found."""
+
+    kind: str
+    mode: str
+    error_m: float
+    confidence: float
+    accepted: bool
+
+
+class MakeJudge(NamedTuple):
+    """Makes the function that judges a world."""
+
+    matching: str
+    min_confidence: float
+
+    def __call__(self) -> Callable[[tuple[str, int]], list[Verdict]]:
+        """Return the function."""
+        return lambda world: judge_world(*world, *self)
+
+
+def judge_world(kind: str, seed: int, matching: str, min_confidence: float) -> list[Verdict]:
+    """Return the verdicts on all groups of a world in all modes."""
+    world = make_world(kind, seed)
+    heights = [one.map_from_camera[2, 3] for one in world.queries]
+    options = RelocalizerOptions(matching=matching, k=min(3, len(world.landmark_map)),
+                                 min_confidence=min_confidence)
+    known = replace(options, height_range_m=(min(heights) - _HEIGHT_M, max(heights) + _HEIGHT_M))
+    level = with_vertical(world.queries, _VERTICAL_DEG, seed)
+    odometry = (_STEP_M, _STEP_DEG, seed)
+    asked = zip(MODES, (
+        (world.queries, options), (level, options), (level, known),
+        (with_neighbours(world.queries, world.groups, *odometry), options),
+        (with_neighbours(level, world.groups, *odometry), known)), strict=True)
+    return [verdict for mode, (queries, its) in asked
+            for verdict in _localize(kind, mode, world.landmark_map, queries, its)]
+
+
+def _localize(kind: str, mode: str, landmark_map: LandmarkMap, queries: Sequence[Query],
+              options: RelocalizerOptions) -> Iterator[Verdict]:
+    relocalizer = Relocalizer(landmark_map, options)
+    for query in queries[GROUP_SIZE - 1::GROUP_SIZE]:
+        found = relocalizer.relocalize([*query.neighbours, query.observation])
+        error = np.inf if found.map_from_camera is None \
+            else pose_error(found.map_from_camera, query.map_from_camera)[0]
+        yield Verdict(kind, mode, float(error), found.confidence, found.accepted)
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Return precision and recall of each kind of world and each mode, as Markdown."""
+    rows = ['| worlds | known | images | within 1 m | accepted | wrong | precision (95 %) | '
+            'recall |', '|---|---|---|---|---|---|---|---|']
+    for kind in [*dict.fromkeys(one.kind for one in verdicts), 'all']:
+        for mode in MODES:
+            its = [one for one in verdicts if one.mode == mode and kind in (one.kind, 'all')]
+            if its:
+                rows.append(f'| {kind} | {mode} | {_figures(its)} |')
+    return '\n'.join(rows)
+
+
+def _figures(verdicts: Sequence[Verdict]) -> str:
+    right = np.array([one.error_m < RIGHT_M for one in verdicts])
+    accepted = np.array([one.accepted for one in verdicts])
+    count, false = int(accepted.sum()), int((accepted & ~right).sum())
+    low, high = wilson_interval(count - false, count) if count else (0.0, 1.0)
+    recall = f'{accepted[right].mean():.2f}' if right.any() else ''
+    return (f'{len(verdicts)} | {right.mean():.2f} | {count} | {false} | {low:.3f} to {high:.3f} '
+            f'| {recall}')
+
+
+def run(arguments: list[str]) -> int:
+    """Localize in worlds and print the figures."""
+    parser = argparse.ArgumentParser(prog='judge', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS))
+    parser.add_argument('--worlds', type=int, default=50, metavar='N', help='of each kind')
+    parser.add_argument('--first-seed', type=int, default=0, metavar='N')
+    parser.add_argument('--matching', choices=('hybrid', 'class'), default='hybrid')
+    parser.add_argument('--min-confidence', type=float,
+                        default=RelocalizerOptions().min_confidence)
+    parser.add_argument('--workers', type=int, default=1, metavar='N')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='draw reliability diagrams there')
+    options = parser.parse_args(arguments)
+    if options.worlds < 1 or options.workers < 1:
+        raise OptionsError('--worlds and --workers must be at least 1')
+    tasks = [(kind, options.first_seed + number) for kind in options.kinds
+             for number in range(options.worlds)]
+    found = {}
+    with closing(run_tasks(MakeJudge(options.matching, options.min_confidence), tasks,
+                           workers=options.workers)) as results:
+        for task, verdicts in tqdm(results, 'worlds', len(tasks), disable=None):
+            found[task] = verdicts or []
+    verdicts = [one for task in tasks for one in found[task]]
+    print(table(verdicts))
+    if options.out is not None:
+        _draw(options.out, verdicts)
+    return 0
+
+
+def _draw(folder: Path, verdicts: Sequence[Verdict]) -> None:
+    # late, since the table needs no matplotlib
+    from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
+    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.trust import draw_reliability
+
+    make_folder(folder)
+    figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')
+    draw_reliability(axes, {mode: (
+        np.array([one.confidence for one in verdicts if one.mode == mode]),
+        np.array([one.error_m < RIGHT_M for one in verdicts if one.mode == mode]))
+        for mode in MODES})
+    axes.set_title('simulated worlds', fontsize=9)
+    add_legend(figure)
+    print(f'wrote {save_figure(figure, folder / "reliability.png")}')
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Crops on demand: which crops come first, when they end, and what that costs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room, see_room
+
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.on_demand import (
+    BATCH,
+    crops_on_demand,
+    informative_first,
+    localize_on_demand,
+    stages_of,
+)
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
+
+ROOM = make_room()
+SEEN = see_room(ROOM)
+OPTIONS = RelocalizerOptions(crops='on_demand')
+SURE = np.where(np.eye(len(ROOM)), 0.3, 0.15).astype(np.float32)
+VIEW = Observation(CAMERA, SEEN, SURE)
+
+
+def localize(options, observation=VIEW):
+    return localize_on_demand(Relocalizer(ROOM, options), (),
+                              stages_of(ROOM, observation, options))
+
+
+def poses_of(found):
+    return [one.map_from_camera for one in found.hypotheses]
+
+
+def test_the_crops_that_say_most_come_first():
+    lone = replace(ROOM, class_ids=('a', *'b' * 11))
+    boxes = np.array([[0, 0, 90, 90], [0, 0, 90, 90], [0, 0, 40, 40], [0, 0, 99, 99.0]])
+    seen = Observation(CAMERA, Detections(boxes, ('a', 'b', 'b', 'unknown'), np.ones(4)))
+    # many landmarks of its class, and large; a class that the map lacks tells nothing apart
+    assert informative_first(lone, seen).tolist() == [1, 2, 0, 3]
+
+
+def test_each_stage_has_more_crops_and_the_last_one_all():
+    stages = list(crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], np.array([5])))
+    assert [len(one.compared) for one in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
+    assert stages[0].compared.tolist() == [5], 'what is known costs nothing'
+    assert sorted(stages[-1].compared) == list(range(len(SEEN)))
+    for one in stages:
+        assert np.array_equal(one.similarities, SURE[one.compared])
+        rows = one.similarity_rows
+        assert np.array_equal(np.nonzero(rows >= 0)[0], np.sort(one.compared))
+        assert np.array_equal(one.compared[rows[rows >= 0]], np.nonzero(rows >= 0)[0])
+
+
+def test_crops_end_when_there_is_no_room():
+    rooms = iter([3, 0])
+    stages = list(crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: next(rooms)))
+    assert [len(one.compared) for one in stages] == [0, 3]
+    none = Observation(CAMERA, SEEN.select(np.array([], dtype=np.int64)))
+    (stage,) = crops_on_demand(ROOM, none, lambda rows: SURE[rows])
+    assert not Relocalizer(ROOM, OPTIONS).relocalize([stage]).accepted
+
+
+@pytest.mark.parametrize('embedded', [False, True])
+def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
+    """Of an array and of embeddings."""
+    unit = np.eye(len(ROOM), dtype=np.float32)
+    labels = LabelEmbeddings.of(unit)
+    *_, last = stages = list(crops_on_demand(ROOM, VIEW, lambda rows: CropSimilarities(
+        unit[rows], labels) if embedded else unit[rows]))
+    hybrid = Relocalizer(ROOM, RelocalizerOptions())
+    by_class = Relocalizer(ROOM, RelocalizerOptions(matching='class')).relocalize([VIEW])
+    none = hybrid.relocalize([stages[0]])
+    assert np.array_equal(poses_of(none), poses_of(by_class))
+    assert none.confidence == by_class.confidence
+    whole = hybrid.relocalize([replace(VIEW, similarities=unit)])
+    found = hybrid.relocalize([last])
+    assert pose_error(found.map_from_camera, whole.map_from_camera)[0] < 1e-6
+    assert found.confidence == pytest.approx(whole.confidence)
+
+
+def test_classes_that_suffice_take_no_crop():
+    frame, found = localize(OPTIONS)
+    assert found.accepted and len(frame.observation.compared) == 0
+
+
+def test_an_early_stop_is_surer_than_the_last_one():
+    """A pose that classes alone accept, but not surely, is compared with all crops."""
+    sure = localize(OPTIONS)[1].confidence
+    asked = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
+    frame, found = localize(asked)
+    assert found.accepted and len(frame.observation.compared) > 0
+    frame, found = localize(replace(asked, min_confidence=1.0 - 100.0 * (1.0 - sure)))
+    assert found.accepted and len(frame.observation.compared) == 0
+    frame, found = localize(replace(OPTIONS, min_confidence=1.0))
+    assert not found.accepted and len(frame.observation.compared) == len(SEEN)
+
+
+def test_without_time_for_all_crops_a_pose_must_be_as_sure():
+    sure = localize(OPTIONS)[1].confidence
+    options = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
+    stages = crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: 0)
+    _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
+    assert found.confidence == sure > options.min_confidence
+    assert not found.accepted and 'without all crops; raise timeout_s' in found.reason
+
+
+@pytest.mark.parametrize('options', [
+    RelocalizerOptions(crops='all'), RelocalizerOptions(matching='clip'),
+    RelocalizerOptions(algorithm='b-prosac', iterations=100)])
+def test_other_methods_see_all_crops_at_once(options):
+    assert list(stages_of(ROOM, VIEW, options)) == [VIEW]
+
+
+def test_similarities_of_another_number_of_crops_are_named():
+    wrong = replace(VIEW, compared=np.array([0, 1]))
+    with pytest.raises(OptionsError, match=r'similarities of shape \(2, 12\), found \(12, 12\)'):
+        Relocalizer(ROOM, OPTIONS).relocalize([wrong])
+
+
+def test_real_boxes_need_a_part_of_their_crops(office_map, queries, observe):
+    """Boxes and poses are real, similarities are simulated; every fifth of 258 frames."""
+    shares, verdicts = [], {'all': [], 'on_demand': []}
+    for frame in list(queries)[::5]:
+        view = observe(frame)
+        for crops, found in verdicts.items():
+            options = RelocalizerOptions(crops=crops)
+            searched, result = localize_on_demand(
+                Relocalizer(office_map, options), (), stages_of(office_map, view, options))
+            right = result.solved and pose_error(result.map_from_camera,
+                                                 frame.map_from_camera)[0] < 1.0
+            found.append((result.accepted, right))
+        shares.append(np.mean(searched.observation.similarity_rows >= 0))
+    accepted = {crops: np.array(found)[:, 0] for crops, found in verdicts.items()}
+    right = {crops: np.array(found)[:, 1] for crops, found in verdicts.items()}
+    print(f'\n{np.mean(shares):.2f} of the crops; accepted: ' + ', '.join(
+        f'{crops} {one.sum()} ({(one & ~right[crops]).sum()} wrong)'
+        for crops, one in accepted.items()))
+    assert np.mean(shares) < 0.5
+    assert not (accepted['on_demand'] & ~right['on_demand']).any()
+    assert accepted['on_demand'].sum() >= accepted['all'].sum() - 1

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated worlds: what makes each kind, its images and its map, and what is found in them."""
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.geometry.transforms import is_rigid
+from cliploc_ros.evaluation.worlds import compare, judge
+from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
+from cliploc_ros.evaluation.worlds.places import KINDS
+from cliploc_ros.evaluation.worlds.surveyor import MapErrors, survey
+from cliploc_ros.evaluation.worlds.things import make_objects
+from cliploc_ros.evaluation.worlds.world import make_world
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_worlds_are_reproducible_and_sound(kind):
+    world, again, other = make_world(kind, 3), make_world(kind, 3), make_world(kind, 4)
+    assert len(world.queries) == 4 * GROUP_SIZE
+    assert set(world.groups) == {0, 1, 2, 3}
+    for one, its_twin in zip(world.queries, again.queries, strict=True):
+        assert is_rigid(one.map_from_camera)
+        detections = one.observation.detections
+        assert np.array_equal(detections.bboxes_xyxy, its_twin.observation.detections.bboxes_xyxy)
+        assert np.array_equal(one.observation.similarities, its_twin.observation.similarities)
+        assert one.observation.similarities.shape == (len(detections), len(world.landmark_map))
+        assert (detections.bboxes_xyxy >= 0).all()
+    assert not np.array_equal(world.queries[0].map_from_camera, other.queries[0].map_from_camera)
+
+
+def test_a_map_without_errors_has_each_object_in_its_place():
+    rng = np.random.default_rng(1)
+    objects = make_objects(KINDS['office'](rng).things, rng)
+    found = survey(objects, MapErrors(0.0, 0.0, 0.0, 0.0, 0.0, False), rng)
+    assert np.array_equal(found.objects, np.arange(len(objects.class_ids)))
+    assert np.array_equal(found.landmark_map.centers, objects.centers)
+    assert found.landmark_map.class_ids == objects.class_ids
+
+
+def test_two_rooms_look_alike():
+    things = KINDS['two rooms'](np.random.default_rng(5)).things
+    looks = [(one.name, one.model) for one in things]
+    assert sum(looks.count(one) == 2 for one in looks) > 0.7 * len(looks)
+
+
+def test_simulation_is_like_the_office_recording(record_property):
+    """The figures of TUM fr3 are those of compare for its shared map, see doc/trust.md."""
+    worlds = [make_world(kind, seed) for kind in ('room', 'office') for seed in range(10)]
+    looks = [compare.look(one.landmark_map, query) for one in worlds for query in one.queries]
+    record_property('figures', f'rooms and offices: {compare.describe(looks)}')
+    ious = np.concatenate([one.ious for one in looks])
+    errors = np.abs(np.concatenate([one.edge_errors for one in looks]))
+    ranks = np.concatenate([one.ranks for one in looks])
+    explained = len(ious) / sum(one.boxes for one in looks)
+    assert 0.65 < np.median(ious) < 0.85  # fr3: .78
+    assert 0.03 < np.nanmedian(errors) < 0.10  # .053
+    assert 0.45 < (ranks < 1).mean() < 0.7  # .52
+    assert 0.7 < explained < 0.95  # .89
+
+
+def test_judge_counts_right_and_wrong_poses(record_property):
+    verdicts = [one for seed in range(3)
+                for one in judge.judge_world('room', seed, 'hybrid', 0.99)]
+    assert len(verdicts) == 3 * 4 * len(judge.MODES)
+    fused = [one for one in verdicts if one.mode == 'five images']
+    alone = [one for one in verdicts if one.mode == 'one image']
+    assert sum(one.error_m < 1.0 for one in fused) > sum(one.error_m < 1.0 for one in alone)
+    assert not [one for one in verdicts if one.accepted and one.error_m > 1.0]
+    assert '| room | five images | 12 |' in judge.table(verdicts)
