@@ -35,8 +35,8 @@ setup(
     install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
     extras_require={
         'models': [
-            'huggingface_hub', 'open_clip_torch', 'pillow', 'safetensors', 'torch', 'torchvision',
-            'ultralytics-opencv-headless',
+            'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
+            'torchvision', 'ultralytics-opencv-headless',
         ],
         'cluster': ['distributed'],
         'datasets': ['rosbags'],
@@ -57,6 +57,7 @@ setup(
             f'detector = {PACKAGE}.nodes.detector:main',
             f'evaluate = {PACKAGE}.cli.evaluate:main',
             f'import_map = {PACKAGE}.cli.import_map:main',
+            f'prepare = {PACKAGE}.cli.prepare:main',
             f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
             f'replay = {PACKAGE}.cli.replay:main',
             f'studio = {PACKAGE}.cli.studio:main',

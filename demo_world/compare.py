@@ -32,7 +32,8 @@ from cliploc_ros.evaluation.recording import make_queries_of
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions, import_ultralytics
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics
 from cliploc_ros.recording.networks import Look
 from cliploc_ros.recording.recorder import record_every_frame
 from demo_world import train_detector

@@ -29,7 +29,7 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import make_views
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.keyframes import KeyframeOptions
 from cliploc_ros.recording.recorder import RecordingOptions, record_once
 

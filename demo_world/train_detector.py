@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.demo.truth import TrueFrame, read_frames
-from cliploc_ros.models.yolo_detector import import_ultralytics
+from cliploc_ros.models.yolo_weights import import_ultralytics
 from demo_world.appearance import CLASSES
 from demo_world.trajectories import CAMERA
 from demo_world.worlds import find_worlds, hold_out

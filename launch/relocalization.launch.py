@@ -31,12 +31,14 @@ NAMES = {
 }
 # An argument that is not given leaves the choice to the file `parameters`, then to the default.
 DETECTOR_PARAMETERS = {
+    'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'model': 'YOLO weights',
     'image_transport': 'raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',
     'use_sim_time': 'true: use the time of /clock',
 }
 RELOCALIZER_PARAMETERS = {
+    'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'map_file': 'the map of objects',
     'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
     'gravity': 'source of the vertical: none, base_frame or imu',

@@ -19,7 +19,8 @@ SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('errors', 'replace_file', 'units'),
+    ('cache_folder', 'errors', 'replace_file', 'units'),
+    ('core.kernel_cache',),
     ('core.compiled', 'core.landmark_details', 'core.landmark_embeddings', 'core.parameter_file',
      'core.time_budget'),
     ('core.geometry',),

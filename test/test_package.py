@@ -21,8 +21,8 @@ SOURCES = [*MODULES, PROJECT / 'setup.py', *sorted((PROJECT / 'demo_world').rglo
            *sorted((PROJECT / 'test').rglob('*.py'))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
-EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'relocalizer', 'replay',
-               'studio', 'tum_to_bag']
+EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',
+               'relocalizer', 'replay', 'studio', 'tum_to_bag']
 
 # As vision_msgs 4.1.1 of Jazzy has them, in this order.
 VISION_MSGS_FIELDS = {

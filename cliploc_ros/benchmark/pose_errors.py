@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps from poses with simulated errors: plain, refined with given and with estimated errors.
 
+Both kinds of refinement also run with simulated odometry, a random walk as OdometryErrors says.
+
     python -m cliploc_ros.benchmark.pose_errors --observations office.npz --every 2
 
 Landmarks are compared with the nearest of their class in the map of the poses as they are. Errors
@@ -13,6 +15,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.building import BuiltMap, build_map
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
 LEVELS = ((0.02, 0.5), (0.05, 1.0), (0.1, 2.0))
@@ -40,6 +43,22 @@ def disturb(detections: PosedDetections, errors: NDArray[np.float64]) -> PosedDe
     poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += errors[:, :3]
     return detections.with_poses(poses)
+
+
+def with_odometry(detections: PosedDetections, truth: PosedDetections,
+                  rng: np.random.Generator, noise: OdometryErrors) -> PosedDetections:
+    """Return the detections with odometry: true motions with a random error of each step."""
+    before, after = truth.map_from_camera[:-1], truth.map_from_camera[1:]
+    steps = np.linalg.inv(before) @ after
+    sigmas = noise.sigmas(np.linalg.norm(steps[:, :3, 3], axis=1),
+                          Rotation.from_matrix(steps[:, :3, :3]).magnitude())
+    drawn = rng.normal(size=(len(steps), 6)) * np.repeat(sigmas, 3, axis=1)
+    steps[:, :3, :3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix() @ steps[:, :3, :3]
+    steps[:, :3, 3] += drawn[:, :3]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return replace(detections, odom_from_camera=np.array(poses))
 
 
 def draw_errors(kind: str, stamps_s: NDArray[np.float64], errors: PoseErrors,
@@ -111,29 +130,32 @@ def _nearest(centers: NDArray[np.float64], found: LandmarkMap, truth: LandmarkMa
 
 
 def compare(detections: PosedDetections, kind: str, level: tuple[float, float], seed: int,
-            truth: LandmarkMap) -> None:
-    """Print a row of the table for plain, given and estimated errors."""
-    prior = prior_of(kind, *level)
+            truth: LandmarkMap, odometry: OdometryErrors) -> None:
+    """Print rows of the table: plain, and refined without and with odometry."""
     drawn = draw_errors(kind, detections.stamps_s, PoseErrors(*level, CORRELATION_S),
                         np.random.default_rng(seed))
     disturbed, plain = disturb(detections, drawn), None
-    for name, options in (('plain', MappingOptions()),
-                          ('given', MappingOptions(pose_errors=prior)),
-                          ('estimated', MappingOptions(estimate_pose_errors=True))):
+    linked = with_odometry(disturbed, detections, np.random.default_rng([seed, 1]), odometry)
+    given = MappingOptions(pose_errors=prior_of(kind, *level), odometry_errors=odometry)
+    estimated = MappingOptions(estimate_pose_errors=True, odometry_errors=odometry)
+    for name, seen, options in (
+            ('plain', disturbed, MappingOptions()),
+            ('given', disturbed, given), ('given+odometry', linked, given),
+            ('estimated', disturbed, estimated), ('estimated+odometry', linked, estimated)):
         begin = time.process_time()
-        built = build_map(disturbed, options)
+        built = build_map(seen, options)
         seconds = time.process_time() - begin
         medians = np.array([np.median(measure(built.landmark_map, truth))
                             for measure in (offsets_m, aligned_offsets_m)])
         plain = medians if plain is None else plain
-        _show(f'{kind:11s} {100 * level[0]:4.0f} {level[1]:4.1f} {seed:4d} {name:9s}', built,
+        _show(f'{kind:11s} {100 * level[0]:4.0f} {level[1]:4.1f} {seed:4d} {name:18s}', built,
               medians, plain, seconds)
 
 
 def _show(head: str, built: BuiltMap, medians: NDArray[np.float64], plain: NDArray[np.float64],
           seconds: float) -> None:
     ratios = plain / np.maximum(medians, 1e-9)
-    notes = [note for note in built.report.notes if note.startswith('poses are off')]
+    notes = [note for note in built.report.notes if note.startswith(('poses are off', 'odometry'))]
     print(f'{head} {built.report.landmarks:9d} {100 * medians[0]:7.1f} {ratios[0]:5.2f} '
           f'{100 * medians[1]:10.1f} {ratios[1]:5.2f} {built.report.explained:9.3f} '
           f'{built.report.median_iou:5.3f} {seconds:6.1f} {" ".join(notes)}', flush=True)
@@ -148,16 +170,20 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=KINDS)
     parser.add_argument('--levels', type=int, nargs='+', choices=range(len(LEVELS)),
                         default=range(len(LEVELS)), help='rows of 2 cm, 5 cm, 10 cm')
+    parser.add_argument('--odometry-noise', type=float, nargs=2, metavar=('METRES', 'DEGREES'),
+                        default=(OdometryErrors.sigma_m, OdometryErrors.sigma_deg),
+                        help='after a metre, on each axis (%(default)s)')
     options = parser.parse_args(args)
+    odometry = OdometryErrors(*options.odometry_noise)
     recorded = load_observations(options.observations)
     detections = recorded.select_frames(range(0, len(recorded), options.every))
     truth = build_map(detections).landmark_map
-    print('errors        cm  deg seed poses     landmarks  off cm ratio aligned cm ratio '
+    print('errors        cm  deg seed poses              landmarks  off cm ratio aligned cm ratio '
           'explained   IoU  cpu s')
     for kind in options.kinds:
         for level in options.levels:
             for seed in options.seeds:
-                compare(detections, kind, LEVELS[level], seed, truth)
+                compare(detections, kind, LEVELS[level], seed, truth, odometry)
     return 0
 
 

@@ -73,6 +73,9 @@ def make_parser() -> argparse.ArgumentParser:
                        '--joint)')
     poses.add_argument('--pose-correlation', type=_seconds, default=3.0, metavar='SECONDS',
                        help='time after which a pose error is another one (%(default)s)')
+    poses.add_argument('--odometry-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
+                       help='standard deviations of odometry on each axis after a metre of the '
+                       'way (0.03 1.5)')
     poses.add_argument('--refine-mount', action='store_true',
                        help='correct a mount of the camera that is off by centimetres or degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
@@ -150,10 +153,11 @@ def _update(options: argparse.Namespace, old: OldMap, detections: 'PosedDetectio
 
 
 def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
-    from cliploc_ros.mapping.options import MappingOptions
+    from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
 
     return MappingOptions(
         pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
+        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {source_of(options).name}', random_seed=options.seed)

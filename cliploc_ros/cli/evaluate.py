@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -112,13 +113,10 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('options of --bag and --tum')
     group.add_argument('--save-queries', type=Path, metavar='NPZ',
                        help='write the recorded boxes and similarities, for --queries')
-    group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
-    group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
-    group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
+    add_network_options(group)
     group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
-    group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--every', type=_positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
@@ -184,15 +182,11 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
 
 def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     from cliploc_ros.evaluation.recording import recorded_queries
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_detector import YoloOptions
     from cliploc_ros.recording.keyframes import EVERY_FRAME
     from cliploc_ros.recording.recorder import RecordingOptions
 
     frames = _frames(options)
-    yolo = YoloOptions(model=options.model, device=options.device)
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device)
+    yolo, clip = yolo_options(options), clip_options(options)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified])
     recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.cli.networks import clip_options
 from cliploc_ros.errors import ModelError
 
 if TYPE_CHECKING:
@@ -79,15 +80,12 @@ class Labeller:
 
     def _phrases(self, weights: 'ClipWeights', names: Sequence[str]) -> 'dict[str, list[Phrases]]':
         """Return the phrases of some classes; the user's change more often than the shipped."""
-        from cliploc_ros.mapping.labelling import Phrases
-        from cliploc_ros.models.phrase_embeddings import embed_phrases
+        from cliploc_ros.models.phrase_embeddings import phrases_of_classes
         from cliploc_ros.vocabulary.vocabulary import shipped_phrases
 
-        shipped = {name: shipped_phrases(name) for name in names}
-        added = {name: texts for name, texts in self.vocabulary.added.items() if name in names}
-        parts = [(texts, embed_phrases(weights, self.clip, texts)) for texts in (shipped, added)]
-        return {name: [Phrases(texts[name], rows[name]) for texts, rows in parts if name in texts]
-                for name in names}
+        return phrases_of_classes(weights, self.clip, [
+            {name: shipped_phrases(name) for name in names},
+            {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
 
 
 def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -> Labeller:
@@ -98,12 +96,10 @@ def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -
     OptionsError, ModelError
         The vocabulary is invalid, or given where nothing can be labelled.
     """
-    from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
     vocabulary = load_vocabulary(options.vocabulary)
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device)
+    clip = clip_options(options)
     try:
         return Labeller(vocabulary, clip, _find_weights(options, clip, detections), '')
     except ModelError as error:
@@ -123,7 +119,7 @@ def _find_weights(options: argparse.Namespace, clip: 'ClipOptions',
         raise ModelError('the observations have no CLIP embeddings that name their encoder; '
                          'record them again with CLIP')
     key = detections.encoder_key
-    hint = 'give the --clip-model and --clip-pretrained of the recording'
+    hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
     # compared first, since the weights of another model would be downloaded in vain
     if _model_name(clip.model) != key.split(':')[0]:
         raise ModelError(f"the embeddings are of CLIP model '{key.split(':')[0]}', not "

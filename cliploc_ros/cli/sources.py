@@ -6,12 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.datasets.bag_frames import ReadPoses
     from cliploc_ros.datasets.frames import DepthFormat, Frames
     from cliploc_ros.datasets.observations import Recorded
+    from cliploc_ros.datasets.poses import Poses
 
 _NS_PER_S = 1_000_000_000
 # Of a recording, these change how its frames are read.
@@ -47,6 +49,12 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--mount', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera (z forward) on what the poses of a '
                        'topic or file are of')
+    odometry = group.add_mutually_exclusive_group()
+    odometry.add_argument('--odometry-topic', metavar='TOPIC',
+                          help='odometry of --bag, of what --pose-topic or --trajectory is of: '
+                          'Odometry, or another type of pose')
+    odometry.add_argument('--odometry-frame', metavar='FRAME',
+                          help='take odometry of --bag from /tf: its coordinate frame')
     group.add_argument('--max-gap', type=float, default=0.5, metavar='SECONDS',
                        help='interpolate between poses at most so far apart (%(default)s)')
 
@@ -74,14 +82,11 @@ def _add_network_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--keyframes', type=float, nargs=2, default=(0.1, 5.0),
                        metavar=('METRES', 'DEGREES'),
                        help='look at an image this far from the last one (0.1 5; 0 0: at all)')
-    group.add_argument('--model', default='yolov8x.pt', help='YOLO weights (%(default)s)')
+    add_network_options(group)
     group.add_argument('--conf', type=float, default=0.25,
                        help='least confidence of a detection (%(default)s)')
     group.add_argument('--no-clip', dest='clip', action='store_false',
                        help='classes and boxes only; no embeddings')
-    group.add_argument('--clip-model', default='ViT-L-14', help='(%(default)s)')
-    group.add_argument('--clip-pretrained', default='openai', help='tag or file (%(default)s)')
-    group.add_argument('--device', default='auto', help='(%(default)s)')
     group.add_argument('--record-to', type=Path, metavar='NPZ',
                        help='the observation file (next to the recording)')
     group.add_argument('--workers', type=int, default=1, metavar='N',
@@ -99,22 +104,21 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         The source, the networks or the options cannot be used.
     """
     from cliploc_ros.datasets.observations import load_recorded
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_detector import YoloOptions
     from cliploc_ros.recording.keyframes import KeyframeOptions
     from cliploc_ros.recording.recorder import RecordingOptions, record_once
 
+    if options.bag is None and (options.odometry_topic or options.odometry_frame):
+        raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
     if options.observations is not None:
         return load_recorded(options.observations)
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device) if options.clip else None
-    yolo = YoloOptions(model=options.model, conf=options.conf, device=options.device)
+    clip = clip_options(options) if options.clip else None
+    yolo = yolo_options(options, conf=options.conf)
     reading = repr([str(getattr(options, name)) for name in _READING])
     return record_once(_frames(options), RecordingOptions(
         yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,
-        options.scheduler), options.record_to)
+        options.scheduler), options.record_to, _odometry(options))
 
 
 def source_of(options: argparse.Namespace) -> Path:
@@ -176,6 +180,27 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
     return lambda reader, camera_frame: read_transforms(
         reader, options.map_frame, options.camera_frame or camera_frame.removeprefix('/'),
         max_gap_ns)
+
+
+def _odometry(options: argparse.Namespace) -> 'Poses | None':
+    """Return the camera of a bag by odometry; None where none is asked for."""
+    from cliploc_ros.datasets.bag_frames import bag_odometry, poses_of_topic
+    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.datasets.transforms import read_transforms
+
+    max_gap_ns = round(options.max_gap * _NS_PER_S)
+    if options.odometry_frame is not None:
+        return bag_odometry(options.bag, options.image, lambda reader, camera_frame:
+                            read_transforms(reader, options.odometry_frame, options.camera_frame
+                                            or camera_frame.removeprefix('/'), max_gap_ns))
+    if options.odometry_topic is None:
+        return None
+    if options.map_frame is not None:
+        raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
+                           '--odometry-frame')
+    mount = None if options.mount is None else mount_from_numbers(options.mount)
+    return bag_odometry(options.bag, options.image,
+                        poses_of_topic(options.odometry_topic, max_gap_ns, mount))
 
 
 def _depth_format(options: argparse.Namespace) -> 'DepthFormat':

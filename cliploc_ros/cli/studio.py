@@ -8,6 +8,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,10 @@ from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_arg
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.studio.images import Images
+    from cliploc_ros.studio.live import LiveRelocalizer
+    from cliploc_ros.studio.phrases import PhraseFinder
+    from cliploc_ros.studio.recording import Recording
     from cliploc_ros.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
@@ -23,6 +28,7 @@ examples:
   studio office.yaml --observations office.npz --images office_bag
   studio office.yaml --images tum_folder_with_ground_truth
   studio                     an empty map, to be saved as map.yaml
+  studio office.yaml --ros   with the answers of the relocalizer that runs
 
 Edits are kept beside the map as they are made: a studio that was killed restores them.
 """
@@ -30,8 +36,9 @@ Edits are kept beside the map as they are made: a studio that was killed restore
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the studio; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
+    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
     options = make_parser().parse_args(plain_args)
+    options.ros_args = ros_args
     interrupt_on_sigterm()
     return run_command(lambda: serve(options))
 
@@ -40,7 +47,8 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Create and correct a map in the browser. Needs no sourced ROS.')
+        description='Create and correct a map in the browser. Needs no sourced ROS, except for '
+        '--ros.')
     parser.add_argument('map', type=Path, nargs='?', metavar='MAP',
                         help='a map file; one that does not exist yet starts empty (map.yaml, '
                         'or the first free of map-2.yaml, map-3.yaml, ...)')
@@ -52,11 +60,21 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
                         help='(%(default)s)')
     parser.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+    parser.add_argument('--clip-model', metavar='NAME|JSON',
+                        help='offer the five phrases that this CLIP finds best, as build_map')
+    parser.add_argument('--clip-pretrained', metavar='TAG|FILE', help='its weights')
+    parser.add_argument('--device', default='auto', help='of CLIP (%(default)s)')
+    parser.add_argument('--vocabulary', type=Path, metavar='FILE',
+                        help='phrases by class (YAML), besides the shipped ones')
     parser.add_argument('--port', type=_port, default=8080, metavar='N',
                         help='the next free one from this on (%(default)s)')
     parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
                         help='listen at this address too; the URL then holds a token '
                         '(%(default)s: this machine only)')
+    parser.add_argument('--ros', action='store_true', help="show the running relocalizer's last "
+                        'answer in the map, and let it relocalize and reload the map')
+    parser.add_argument('--relocalizer', default='/relocalizer', metavar='NAME',
+                        help='its name, with its namespace (%(default)s)')
     parser.add_argument('--no-browser', action='store_true', help='print the URL only')
     return parser
 
@@ -71,7 +89,8 @@ def serve(options: argparse.Namespace) -> int:
 
     studio = open_studio(options)
     try:
-        with serve_studio(studio, options.host, options.port) as served:
+        with (follow(options) as live,
+              serve_studio(studio, options.host, options.port, live) as served):
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
             for note in studio.document.notes:
@@ -83,6 +102,24 @@ def serve(options: argparse.Namespace) -> int:
     finally:
         studio.document.close()
     return 0
+
+
+def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocalizer | None]':
+    """Return the running relocalizer where it is asked for.
+
+    Raises
+    ------
+    OptionsError
+        There is no ROS.
+    """
+    if not options.ros:
+        return nullcontext()
+    try:
+        from cliploc_ros.studio.live import follow_relocalizer
+    except ImportError as error:
+        raise OptionsError(f'--ros needs ROS ({error}): source it first, as with source '
+                           '/opt/ros/jazzy/setup.bash') from error
+    return follow_relocalizer(options.relocalizer, options.ros_args)
 
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
@@ -103,7 +140,26 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     elif options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)
-    return Studio(Document(options.map or _free_path()), recording, images)
+    finder = _phrase_finder(options, recording, images)
+    return Studio(Document(options.map or _free_path()), recording, images, finder)
+
+
+def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
+                   images: 'Images | None') -> 'PhraseFinder | None':
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.studio.phrases import PhraseFinder
+    from cliploc_ros.vocabulary.vocabulary import load_vocabulary
+
+    if (options.clip_model is None) != (options.clip_pretrained is None):
+        raise OptionsError('give both --clip-model and --clip-pretrained, or neither')
+    if options.clip_model is None:
+        if options.vocabulary is not None:
+            raise OptionsError('--vocabulary: CLIP chooses the phrases; give --clip-model and '
+                               '--clip-pretrained, too')
+        return None
+    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                       device=options.device)
+    return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording, images)
 
 
 def _free_path() -> Path:

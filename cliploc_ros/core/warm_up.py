@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A tiny problem that calls every compiled kernel once."""
+"""A tiny problem that calls every compiled kernel once.
+
+    python -m cliploc_ros.core.warm_up
+
+compiles them, as script/setup does.
+"""
+
+import logging
 
 import numpy as np
 
 from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import make_rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
@@ -42,3 +50,13 @@ def call_every_kernel() -> None:
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
     project_ellipsoids(np.eye(4), centers, shapes)
+
+
+def main() -> None:
+    """Compile the kernels that are not on disk yet, and say where they are kept."""
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    warm_up(call_every_kernel)
+
+
+if __name__ == '__main__':
+    main()

@@ -102,19 +102,9 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     if topics.depth == topics.image:
         raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')
     with BagReader(bag) as reader:
-        for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
-                            *([(topics.depth, _IMAGES)] if topics.depth else [])):
-            topic = reader.topic(name)
-            if topic.msgtype not in types:
-                raise DatasetError(f'{bag}: {name} is of type {topic.msgtype}, not '
-                                   f'{" or ".join(types)}')
-            if topic.message_count == 0:
-                raise DatasetError(f'{bag}: {name} has no messages')
-        image = _first(reader, topics.image)
+        _check_topics(reader, topics)
         depth_type = reader.topic(topics.depth).msgtype if topics.depth else ''
-        poses = read_poses(reader, str(image.header.frame_id))
-        first_ns = stamp_ns(image)
-        check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, str(bag))
+        poses = _poses_of_images(reader, topics.image, read_poses, str(bag))
         info = next(reader.messages([topics.camera_info])).data
         count = reader.topic(topics.image).message_count
     decode = partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified)
@@ -131,8 +121,91 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     return Frames(bag, count, read_raw)
 
 
-def _first(reader: BagReader, name: str) -> Any:
-    return reader.deserialize(next(reader.messages([name])))
+def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
+    """Return the poses of a recording's camera by odometry.
+
+    Raises
+    ------
+    DatasetError
+        The topic or tf is missing or broken, or of another time than the images.
+    """
+    with BagReader(bag) as reader:
+        return _poses_of_images(reader, image_topic, read_odometry, f'{bag}: odometry')
+
+
+def _poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses, where: str
+                     ) -> Poses:
+    image = reader.deserialize(next(reader.messages([image_topic])))
+    poses = read_poses(reader, str(image.header.frame_id))
+    first_ns = stamp_ns(image)
+    check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, where)
+    return poses
+
+
+def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
+    """Return the images of a recording, to be read in any order.
+
+    The recording is read once, for the stamps.
+
+    Raises
+    ------
+    DatasetError
+        A topic is missing, of another type, or empty.
+    """
+    with BagReader(bag) as reader:
+        _check_topics(reader, topics)
+        info = next(reader.messages([topics.camera_info])).data
+        times_ns = [(_peek_stamp_ns(one), one.stamp_ns) for one in reader.messages([topics.image])]
+        msgtype = reader.topic(topics.image).msgtype
+    return BagImages(bag, topics.image, np.array(times_ns, dtype=np.int64).reshape(-1, 2),
+                     partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified,
+                             msgtype))
+
+
+@dataclass(frozen=True)
+class BagImages:
+    """The images of a recording, read one at a time through its index of time.
+
+    Parameters
+    ----------
+    bag : Path
+    topic : str
+    times_ns : ndarray (F, 2) of int
+        When each image was taken, and when it was recorded [ns].
+    decode : callable
+        Makes an image and its camera of a message.
+    """
+
+    bag: Path
+    topic: str
+    times_ns: NDArray[np.int64]
+    decode: Callable[[bytes], tuple[NDArray[np.uint8], Camera]]
+
+    def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
+        """Return an image (h, w, 3), red first, and its camera.
+
+        Raises
+        ------
+        DatasetError
+            It cannot be decoded, or the recording changed.
+        """
+        taken_ns, recorded_ns = self.times_ns[place].tolist()
+        with BagReader(self.bag) as reader:
+            for one in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
+                if _peek_stamp_ns(one) == taken_ns:
+                    return self.decode(one.data)
+        raise DatasetError(f'{self.bag}: image {place} of {self.topic} is gone; start again')
+
+
+def _check_topics(reader: BagReader, topics: BagTopics) -> None:
+    for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
+                        *([(topics.depth, _IMAGES)] if topics.depth else [])):
+        topic = reader.topic(name)
+        if topic.msgtype not in types:
+            raise DatasetError(f'{reader.path}: {name} is of type {topic.msgtype}, not '
+                               f'{" or ".join(types)}')
+        if topic.message_count == 0:
+            raise DatasetError(f'{reader.path}: {name} has no messages')
 
 
 _Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']

@@ -146,12 +146,19 @@ def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Ca
             pose = poses.pose_at(file.stamp_ns)
             if is_wanted(place, file.stamp_ns, pose):
                 yield RawFrame(
-                    place, file.stamp_ns, pose, partial(_read_color, file.color, camera),
+                    place, file.stamp_ns, pose, partial(read_color, file.color, camera),
                     None if file.depth is None else partial(_read_depth, file.depth, form))
     return Frames(folder, len(files), read_raw)
 
 
-def _read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
+def read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
+    """Return an image file (h, w, 3), red first, and its camera.
+
+    Raises
+    ------
+    DatasetError
+        The image cannot be decoded, or is not of the camera's size.
+    """
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DatasetError(f'{path} cannot be read as an image')

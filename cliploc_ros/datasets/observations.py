@@ -36,6 +36,7 @@ OPTIONAL = {
     'depth_spreads': (('n',), 'f'),
     'embeddings': (('n', 'd'), 'f'),
     'encoder_key': ((), 'U'),
+    'odom_from_camera': (('F', 4, 4), 'f'),  # a row without odometry is NaN
     'stamps_ns': (('F',), 'iu'),
     'detector_ms': (('F',), 'f'),
     'clip_ms': (('F',), 'f'),
@@ -141,7 +142,7 @@ def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
         'map_from_camera': detections.map_from_camera,
         'timestamps': detections.stamps_s,
     }
-    for name in ('depths', 'depth_spreads', 'embeddings'):
+    for name in ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera'):
         if (values := getattr(detections, name)) is not None:
             arrays[name] = values
     if detections.encoder_key:
@@ -262,12 +263,20 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
     _refuse('boxes_xyxy', 'is not left, top, right, bottom',
             (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
     _refuse('scores', 'is outside 0 to 1', (scores < 0) | (scores > 1))
-    poses = arrays['map_from_camera']
-    rotations = poses[:, :3, :3]
-    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    _refuse('map_from_camera', 'is no rigid transform',
-            (error > _MAX_ROTATION_ERROR) | (np.linalg.det(rotations) < 0)
-            | (poses[:, 3] != [0, 0, 0, 1]).any(axis=1))
+    _refuse('map_from_camera', 'is no rigid transform', ~_are_rigid(arrays['map_from_camera']))
+    if 'odom_from_camera' in arrays:
+        poses = arrays['odom_from_camera']
+        _refuse('odom_from_camera', 'is no rigid transform',
+                ~np.isnan(poses).all(axis=(1, 2)) & ~_are_rigid(poses))
+
+
+def _are_rigid(poses: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which of some matrices (k, 4, 4) are finite rigid transforms."""
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    rotations = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return np.asarray((errors <= _MAX_ROTATION_ERROR) & (np.linalg.det(rotations) > 0)
+                      & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1))
 
 
 def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
@@ -305,4 +314,6 @@ def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
         classes=classes.astype(np.int64).reshape(-1),
         scores=arrays['scores'].astype(np.float64),
         depths=arrays.get('depths'), depth_spreads=arrays.get('depth_spreads'),
-        embeddings=arrays.get('embeddings'), encoder_key=str(arrays.get('encoder_key', '')))
+        embeddings=arrays.get('embeddings'), encoder_key=str(arrays.get('encoder_key', '')),
+        odom_from_camera=(arrays['odom_from_camera'].astype(np.float64)
+                          if 'odom_from_camera' in arrays else None))

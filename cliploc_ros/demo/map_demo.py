@@ -26,7 +26,7 @@ from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from cliploc_ros.ros.parameter_tables import relocalizer_options

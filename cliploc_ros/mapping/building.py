@@ -27,6 +27,7 @@ from cliploc_ros.mapping.joint import pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, join_landmarks, no_landmarks
 from cliploc_ros.mapping.merging import merge_classes, merge_duplicates
 from cliploc_ros.mapping.mount import MountCorrection, refine_mount
+from cliploc_ros.mapping.odometry import Steps, link_frames
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
 from cliploc_ros.mapping.posed_detections import PosedDetections
@@ -94,11 +95,12 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         given, options, depth_notes = _with_depths(detections, given, options, rng, tell)
         notes += depth_notes
     draft = _draft(given, options, rng, tell)
-    mount = None
+    mount, odometry = None, detections.odom_from_camera
     if options.refine_mount:
         mount, draft = _with_mount(given, draft, options, rng, tell)
         given, notes = mount.views, notes + mount.lines()
-    views, draft, pose_notes = _with_poses(given, draft, options, rng, tell)
+        odometry = None if odometry is None else odometry @ mount.given_from_corrected
+    views, draft, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
     notes += pose_notes
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
@@ -130,8 +132,9 @@ def _with_mount(given: Views, draft: '_Draft', options: MappingOptions,
     return found, draft
 
 
-def _with_poses(given: Views, draft: '_Draft', options: MappingOptions,
-                rng: np.random.Generator, tell: Progress) -> tuple[Views, '_Draft', list[str]]:
+def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: '_Draft',
+                options: MappingOptions, rng: np.random.Generator, tell: Progress
+                ) -> tuple[Views, '_Draft', list[str]]:
     """Return the views with refined poses, the landmarks that fit them, and notes.
 
     Poses are refined where their errors are given, or estimated and significant.
@@ -142,20 +145,32 @@ def _with_poses(given: Views, draft: '_Draft', options: MappingOptions,
         tell('estimating pose errors', 0.0)
         errors = significant_pose_errors(given, draft.landmarks, draft.shown)
     if errors is None:
-        return views, draft, notes
+        return views, draft, [] if odometry is None else [
+            'odometry is not used: the poses are taken as they are']
+    steps, link_notes = _links(given, odometry, errors, options)
     for number in range(options.rebuilds):
         tell('refining poses', number / options.rebuilds)
-        views, draft = _refine(given, views, draft, errors, options)
+        views, draft = _refine(given, views, draft, errors, steps, options)
         draft = _draft(views, options, rng, tell)
         if is_estimated:
             # objects that were split before tell more now
             errors = estimate_pose_errors(given, draft.landmarks, draft.shown, views) or errors
+            steps, link_notes = _links(given, odometry, errors, options)
     if is_estimated:
         notes.append(f'poses are off by about {100 * errors.sigma_m:.1f} cm and '
                      f'{errors.sigma_deg:.1f} degrees on each axis for {errors.correlation_s:.1f} '
                      's, estimated from the boxes; refined')
-    views, draft = _refine(given, views, draft, errors, options)
-    return views, draft, notes
+    views, draft = _refine(given, views, draft, errors, steps, options)
+    return views, draft, notes + link_notes
+
+
+def _links(given: Views, odometry: NDArray[np.float64] | None, errors: PoseErrors,
+           options: MappingOptions) -> tuple[Steps | None, list[str]]:
+    """Return the steps of odometry between frames, and notes on them."""
+    if odometry is None:
+        return None, []
+    steps, note = link_frames(given, odometry, errors, options.odometry_errors)
+    return steps, [note]
 
 
 class _Draft(NamedTuple):
@@ -192,7 +207,7 @@ def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell
 
 
 def _refine(given: Views, views: Views, draft: _Draft, errors: PoseErrors,
-            options: MappingOptions) -> tuple[Views, _Draft]:
+            steps: Steps | None, options: MappingOptions) -> tuple[Views, _Draft]:
     """Return the views with refined poses, and the landmarks that fit them.
 
     Errors of the poses split objects in two. Poses and parts move towards each other in turns,
@@ -200,7 +215,7 @@ def _refine(given: Views, views: Views, draft: _Draft, errors: PoseErrors,
     """
     landmarks, shown = draft.landmarks, draft.shown
     for _ in range(options.refinements):
-        views, landmarks = refine_jointly(given, views, landmarks, shown, errors)
+        views, landmarks = refine_jointly(given, views, landmarks, shown, errors, steps=steps)
         landmarks = _settle(views, landmarks, options)
         shown = associate(views, landmarks, options.association_iou)
     return views, draft._replace(landmarks=landmarks, shown=shown)

@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-The errors e of the given poses are a stationary process in the map's axes: each of x, y, z and
-the rotations about them has a standard deviation sigma and forgets itself with a time constant,
-
-    e_0 ~ N(0, sigma^2),   e_k+1 - a e_k ~ N(0, sigma^2 (1 - a^2)),   a = exp(-dt / tau),
-
-which covers independent noise (tau = 0), the slow errors of a localizer, and drift (large sigma
-and tau). Box edges give the same residuals as in cliploc_ros.mapping.fitting.
+A process of errors holds on to the given poses (cliploc_ros.mapping.pose_prior). Odometry, where
+there is any, joins successive frames (cliploc_ros.mapping.odometry). Box edges give the same
+residuals as in cliploc_ros.mapping.fitting.
 
 The normal equations have a block for each landmark, blocks for each pose and its successor, and
 a block for each box, which joins the two. Poses are eliminated: their part is banded. What is
@@ -34,7 +30,9 @@ from cliploc_ros.mapping.fitting import (
     robust_weight,
 )
 from cliploc_ros.mapping.landmarks import Landmarks
+from cliploc_ros.mapping.odometry import Steps
 from cliploc_ros.mapping.options import PoseErrors
+from cliploc_ros.mapping.pose_prior import Prior, pose_bands
 from cliploc_ros.mapping.projection import (
     LANDMARK_SIZE,
     POSE_SIZE,
@@ -51,13 +49,14 @@ _MAX_DAMPING = 1e4
 
 
 class Equations(NamedTuple):
-    """Normal equations: F poses, L landmarks, m boxes."""
+    """Normal equations: F poses, L landmarks, m boxes; with odometry, poses and the next ones."""
 
     of_landmarks: NDArray[np.float64]    # (L, 9, 9)
     of_poses: NDArray[np.float64]        # (F, 6, 6)
     of_boxes: NDArray[np.float64]        # (m, 6, 9)
     landmark_gradient: NDArray[np.float64]  # (L, 9)
     pose_gradient: NDArray[np.float64]   # (F, 6)
+    of_steps: NDArray[np.float64] | None = None  # (F, 6, 6)
 
 
 class Anchors(NamedTuple):
@@ -68,8 +67,8 @@ class Anchors(NamedTuple):
 
 
 def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                   errors: PoseErrors, iterations: int = 20, anchors: Anchors | None = None
-                   ) -> tuple[Views, Landmarks]:
+                   errors: PoseErrors, iterations: int = 20, anchors: Anchors | None = None,
+                   steps: Steps | None = None) -> tuple[Views, Landmarks]:
     """Return the views with refined poses, and the refined landmarks.
 
     Parameters
@@ -86,9 +85,11 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
         The most steps of Levenberg and Marquardt.
     anchors : Anchors, optional
         Where the landmarks are known to be from before.
+    steps : Steps, optional
+        Odometry between successive frames.
     """
     rows = np.nonzero(shown >= 0)[0]
-    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors)
+    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors, steps)
     state = State(views, landmarks, pose_errors(given, views))
     cost, equations = problem.linearize(state)
     damping = 1e-4
@@ -138,44 +139,6 @@ class State(NamedTuple):
                       self.errors + pose_steps)
 
 
-class Prior(NamedTuple):
-    """The information of the process of errors: its diagonal and next-to-diagonal (F, 6)."""
-
-    diagonal: NDArray[np.float64]
-    beside: NDArray[np.float64]
-
-    @staticmethod
-    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'Prior':
-        """Return the prior of frames at some times."""
-        kept = np.zeros(len(stamps_s))
-        if errors.correlation_s > 0.0:
-            kept[:-1] = np.exp(-np.maximum(np.diff(stamps_s), 1e-3) / errors.correlation_s)
-        # information of the innovation between a frame and the next one
-        gain = 1.0 / (1.0 - kept[:-1] ** 2)
-        diagonal = np.ones(len(stamps_s))
-        diagonal[1:] = gain
-        diagonal[:-1] += gain * kept[:-1] ** 2
-        beside = np.zeros(len(stamps_s))
-        beside[:-1] = -gain * kept[:-1]
-        weights = 1.0 / errors.sigmas ** 2
-        return Prior(diagonal[:, None] * weights, beside[:, None] * weights)
-
-    def log_determinant(self) -> float:
-        """Return the logarithm of the determinant of the information."""
-        # Q = L D L': each pivot is what the frames before leave of the diagonal
-        pivots = self.diagonal.copy()
-        for frame in range(1, len(pivots)):
-            pivots[frame] -= self.beside[frame - 1] ** 2 / pivots[frame - 1]
-        return float(np.log(pivots).sum())
-
-    def gradient(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the information times errors (F, 6)."""
-        product = self.diagonal * errors
-        product[:-1] += self.beside[:-1] * errors[1:]
-        product[1:] += self.beside[:-1] * errors[:-1]
-        return product
-
-
 class Problem(NamedTuple):
     """What stays the same over the iterations: m boxes and the landmark that each shows."""
 
@@ -184,28 +147,37 @@ class Problem(NamedTuple):
     landmarks: NDArray[np.int64]
     prior: Prior
     anchors: Anchors | None = None
+    steps: Steps | None = None
 
     def linearize(self, state: State) -> tuple[float, Equations]:
         """Return the cost of a state and its normal equations."""
         count, frames = len(state.landmarks.centers), len(state.errors)
-        equations = Equations(
-            np.zeros((count, LANDMARK_SIZE, LANDMARK_SIZE)),
-            np.zeros((frames, POSE_SIZE, POSE_SIZE)),
-            np.zeros((len(self.rows), POSE_SIZE, LANDMARK_SIZE)),
-            np.zeros((count, LANDMARK_SIZE)), np.zeros((frames, POSE_SIZE)))
+        arrays = (np.zeros((count, LANDMARK_SIZE, LANDMARK_SIZE)),
+                  np.zeros((frames, POSE_SIZE, POSE_SIZE)),
+                  np.zeros((len(self.rows), POSE_SIZE, LANDMARK_SIZE)),
+                  np.zeros((count, LANDMARK_SIZE)), np.zeros((frames, POSE_SIZE)))
         cost = _accumulate(state.views, self.rows, self.landmarks, state.landmarks.centers,
-                           state.landmarks.bases, *equations)
+                           state.landmarks.bases, *arrays)
+        equations = Equations(*arrays)
         if self.anchors is not None:
             cost += _hold(self.anchors, state.landmarks, equations)
         pull = self.prior.gradient(state.errors)
         equations.pose_gradient[:] += pull
-        return cost + 0.5 * float((pull * state.errors).sum()), equations
+        cost += 0.5 * float((pull * state.errors).sum())
+        if self.steps is None:
+            return cost, equations
+        moved = self.steps.linearize(state.views)
+        return cost + moved.cost, equations._replace(
+            of_poses=equations.of_poses + moved.of_poses, of_steps=moved.of_steps,
+            pose_gradient=equations.pose_gradient + moved.gradient)
 
     def solve(self, equations: Equations, damping: float
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the steps of the landmarks (L, 9) and of the poses (F, 6)."""
         count, frames = len(equations.of_landmarks), len(equations.of_poses)
-        factor = cholesky_banded(self.banded(equations.of_poses, damping), lower=True)
+        bands = pose_bands(equations.of_poses, self.prior, equations.of_steps)
+        bands[0] *= 1.0 + damping
+        factor = cholesky_banded(bands, lower=True)
         of_landmarks = equations.of_landmarks.copy()
         diagonal = np.arange(LANDMARK_SIZE)
         of_landmarks[:, diagonal, diagonal] *= 1.0 + damping
@@ -237,23 +209,6 @@ class Problem(NamedTuple):
         starts = np.searchsorted(self.views.frames[self.rows][order], np.arange(frames + 1))
         return bsr_matrix((of_boxes[order], self.landmarks[order], starts),
                           shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
-
-    def banded(self, of_poses: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
-        """Return the poses' part of the equations with the prior, as lower bands (7, 6 F)."""
-        bands = self.bands_of(of_poses, self.prior)
-        bands[0] *= 1.0 + damping
-        return bands
-
-    @staticmethod
-    def bands_of(of_poses: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
-        """Return blocks (F, 6, 6) with the information of a prior, as lower bands (7, 6 F)."""
-        bands = np.zeros((POSE_SIZE + 1, len(of_poses), POSE_SIZE))
-        for below in range(POSE_SIZE):
-            for column in range(POSE_SIZE - below):
-                bands[below, :, column] = of_poses[:, column + below, column]
-        bands[0] += prior.diagonal
-        bands[POSE_SIZE] = prior.beside
-        return bands.reshape(POSE_SIZE + 1, -1)
 
 
 def _hold(anchors: Anchors, landmarks: Landmarks, equations: Equations) -> float:

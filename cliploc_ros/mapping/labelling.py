@@ -66,7 +66,7 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
         mean, mean_length = _unit_rows(crop_weights[None] @ crops)
         if len(crops) and mean_length[0] > 0.0:
             means[row] = mean[0]
-            medoids.append(crops[_medoids(crops, crop_weights)])
+            medoids.append(crops[choose_medoids(crops, crop_weights)])
         else:
             medoids.append(crops[:0])
     offsets = np.cumsum(list(map(len, medoids)))
@@ -90,7 +90,7 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     labels = list(landmark_map.labels)
     details = list(landmark_map.details or [LandmarkDetails()] * len(labels))
     for row in np.nonzero(embeddings.is_known)[0]:
-        fitting = _best_phrases(embeddings.means[row].astype(np.float32),
+        fitting = best_phrases(embeddings.means[row].astype(np.float32),
                                 [part for name in classes_of(landmark_map, int(row))
                                  for part in phrases[name]])
         labels[row] = fitting[0][0]
@@ -105,7 +105,7 @@ def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
+def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
                   ) -> tuple[tuple[str, float], ...]:
     """Return the best phrases with their weights, the best one first."""
     similarities = {
@@ -119,8 +119,8 @@ def _best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
     return tuple(zip(best, weights.tolist(), strict=True))
 
 
-def _medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> list[int]:
-    """Return rows that stand for all m crops (m, d): each next one helps most."""
+def choose_medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> list[int]:
+    """Return at most five rows that stand for all m crops (m, d): each next one helps most."""
     cosines = crops @ crops.T
     nearest = np.full(len(crops), -1.0)
     chosen: list[int] = []

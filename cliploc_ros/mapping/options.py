@@ -31,6 +31,38 @@ class PoseErrors:
 
 
 @dataclass(frozen=True)
+class OdometryErrors:
+    """How the errors of odometry grow, as a random walk. All defaults are guesses.
+
+    Parameters
+    ----------
+    sigma_m, sigma_deg : float
+        Standard deviations on each axis after a metre [m] [deg].
+    metres_per_radian : float
+        A radian of turning counts as so many metres: wheels move then, too.
+    floor_m, floor_deg : float
+        Of each step, for stamps and interpolation [m] [deg].
+    """
+
+    sigma_m: float = 0.03
+    sigma_deg: float = 1.5
+    metres_per_radian: float = 0.5
+    floor_m: float = 0.002
+    floor_deg: float = 0.1
+
+    def sigmas(self, distances_m: NDArray[np.float64], angles: NDArray[np.float64]
+               ) -> NDArray[np.float64]:
+        """Return deviations (m, 2) [m] [rad] after ways (m,) [m] with turns (m,) [rad]."""
+        ways = (distances_m + self.metres_per_radian * angles)[:, None]
+        sigmas = np.hypot([self.floor_m, self.floor_deg],
+                          np.sqrt(ways) * [self.sigma_m, self.sigma_deg])
+        return np.asarray(sigmas * [1.0, np.radians(1.0)])
+
+
+_ODOMETRY_ERRORS = OdometryErrors()
+
+
+@dataclass(frozen=True)
 class MappingOptions:
     """Options of mapping.
 
@@ -74,6 +106,8 @@ class MappingOptions:
         Refine the poses with the landmarks, as far as they may be off; None: poses are exact.
     estimate_pose_errors : bool
         Without pose_errors, estimate them, and refine the poses where they are significant.
+    odometry_errors : OdometryErrors
+        Of odometry between frames, which joins the poses while they are refined.
     refine_mount : bool
         Correct the mount of the camera, which all poses share.
     rebuilds : int
@@ -106,6 +140,7 @@ class MappingOptions:
     min_median_iou: float = 0.5
     pose_errors: PoseErrors | None = None
     estimate_pose_errors: bool = False
+    odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
     refine_mount: bool = False
     rebuilds: int = 1
     refinements: int = 3

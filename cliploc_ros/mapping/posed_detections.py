@@ -41,6 +41,8 @@ class PosedDetections:
         Of the crops, unit rows.
     encoder_key : str
         Identifies the encoder of the embeddings.
+    odom_from_camera : ndarray (F, 4, 4), optional
+        The same cameras by odometry, which drifts but does not jump; NaN where unknown.
     """
 
     camera: Camera
@@ -55,6 +57,7 @@ class PosedDetections:
     depth_spreads: NDArray[np.float32] | None = None
     embeddings: NDArray[np.float16] | None = None
     encoder_key: str = ''
+    odom_from_camera: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -78,7 +81,9 @@ class PosedDetections:
             scores=self.scores[boxes],
             depths=None if self.depths is None else self.depths[boxes],
             depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
-            embeddings=None if self.embeddings is None else self.embeddings[boxes])
+            embeddings=None if self.embeddings is None else self.embeddings[boxes],
+            odom_from_camera=(None if self.odom_from_camera is None
+                              else self.odom_from_camera[frames]))
 
     def select_boxes(self, boxes: NDArray[np.bool_]) -> 'PosedDetections':
         """Return all frames with some of their boxes: those of a mask (n,)."""

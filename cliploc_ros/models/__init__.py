@@ -10,7 +10,8 @@ from cliploc_ros.models.clip_encoder import ClipEncoder, LoadedEncoder, load_enc
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.images import visible_boxes
 from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 
 __all__ = [
     'ClipEncoder', 'ClipOptions', 'ImageTextEncoder', 'LoadedEncoder', 'ObjectDetector',

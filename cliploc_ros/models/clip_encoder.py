@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 from cliploc_ros.core.index.similarities import LabelEmbeddings
 from cliploc_ros.core.landmark_details import WeightedLabels
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_towers import (
-    cut_padding,
-    load_image_tower,
-    load_text_tower,
-    quiet_root_logger,
-)
+from cliploc_ros.models.clip_towers import cut_padding, load_text_tower, quiet_root_logger
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
-from cliploc_ros.models.devices import free_memory, resolve_device, resolve_precision
+from cliploc_ros.models.devices import free_memory, resolve_device
 from cliploc_ros.models.files import resolve_cache_dir
+from cliploc_ros.models.image_towers import load_tower
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.models.weighted_labels import mixed_rows
@@ -72,7 +68,8 @@ def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder
     weights = resolve_clip_weights(options)
     embeddings = _embed_labels(weights, options, labels)
     encoder = ClipEncoder(weights, options)
-    logger.info('CLIP %s is ready after %.1f s', weights.model, time.monotonic() - started)
+    logger.info('CLIP %s is ready after %.1f s (%s, %s)', weights.model,
+                time.monotonic() - started, encoder.inference, encoder.device)
     return LoadedEncoder(encoder, embeddings)
 
 
@@ -120,18 +117,14 @@ class ClipEncoder:
     ModelError
         When the file does not hold the weights of the model, or they give no finite numbers.
     OptionsError
-        When the device is not there.
+        When the device or the inference engine is not there.
     """
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
-        import open_clip
-
         self._weights = weights
         self._max_batch = options.max_batch
         self._device = resolve_device(options.device)
-        precision = resolve_precision(options.precision, self._device)
-        self._model, self._preprocess = load_image_tower(weights, self._device, precision)
-        self._dtype = open_clip.get_input_dtype(precision)
+        self._tower = load_tower(weights, options, self._device)
         shortens = weights.preprocess.get('image_resize_mode', 'shortest') == 'shortest'
         self._max_aspect = _MAX_ASPECT if shortens else sys.maxsize
         # The first pass sets up kernels and memory: do it before the first request.
@@ -146,6 +139,11 @@ class ClipEncoder:
     def device(self) -> str:
         """Return where the network runs."""
         return str(self._device)
+
+    @property
+    def inference(self) -> str:
+        """Return what runs the network: 'pytorch' or 'openvino'."""
+        return self._tower.inference
 
     @property
     def embed_dim(self) -> int:
@@ -199,11 +197,10 @@ class ClipEncoder:
 
         crops = [Image.fromarray(np.ascontiguousarray(_cut(image_rgb, row, self._max_aspect)))
                  for row in bounds]
-        batch = torch.stack([self._preprocess(crop) for crop in crops])
+        batch = torch.stack([self._tower.preprocess(crop) for crop in crops])
         try:
             with torch.inference_mode():
-                batch = batch.to(self._device, dtype=self._dtype)
-                return _normalize(self._model.encode_image(batch, normalize=False))
+                return _normalize(self._tower(batch))
         except torch.cuda.OutOfMemoryError as error:
             raise ModelError(f'the GPU has no memory left for {len(crops)} crops at once: lower '
                              'max_batch or choose a smaller model') from error

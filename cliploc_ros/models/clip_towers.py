@@ -43,6 +43,11 @@ def load_image_tower(
     return model, preprocess
 
 
+def load_preprocess(weights: ClipWeights) -> 'Callable[[Image], torch.Tensor]':
+    """Return open_clip's preprocessing for a model, without the model."""
+    return _build_without_memory(weights, 'fp32')[1]  # type: ignore[no-any-return]
+
+
 def load_text_tower(weights: ClipWeights, device: 'torch.device') -> Any:
     """Return a CLIP with ``encode_text`` only, in fp32; see `load_image_tower`."""
     model, _ = _load(weights, 'text', device, 'fp32')

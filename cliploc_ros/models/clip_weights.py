@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.devices import check_precision
+from cliploc_ros.models.devices import check_inference, check_precision
 from cliploc_ros.models.download import download
 from cliploc_ros.models.files import check_weights_file, fingerprint_file, resolve_cache_dir
 
@@ -38,11 +38,15 @@ class ClipOptions:
     device : str
         'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
     precision : str
-        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'; of the image tower.
+        'auto' (fp16 on a GPU; fp32 on a CPU, or bf16 where OpenVINO finds it in the CPU), 'fp16'
+        or 'fp32'; of the image tower.
     max_batch : int
         Greatest number of crops in one forward pass; bounds the memory.
     cache_dir : str
-        Folder for downloads and label embeddings; '' is the user's cache.
+        Folder for downloads, label embeddings and converted networks; '' is the user's cache.
+    inference : str
+        'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'; of the image
+        tower.
 
     Raises
     ------
@@ -57,10 +61,12 @@ class ClipOptions:
     precision: str = 'auto'
     max_batch: int = 64
     cache_dir: str = ''
+    inference: str = 'auto'
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_precision(self.precision)
+        check_inference(self.inference)
         if self.max_batch < 1:
             raise OptionsError(f'max_batch must be at least 1, not {self.max_batch}')
 

@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Device, precision and memory of networks."""
+"""Device, inference engine, precision and memory of networks."""
 
 import ctypes
 import gc
+import logging
 import sys
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.errors import OptionsError
 
@@ -13,6 +15,15 @@ if TYPE_CHECKING:
     import torch
 
 PRECISIONS = ('auto', 'fp16', 'fp32')
+INFERENCES = ('auto', 'pytorch', 'openvino')
+
+logger = logging.getLogger(__name__)
+
+
+def check_inference(inference: str) -> None:
+    """Raise an OptionsError for an inference engine that is none of INFERENCES."""
+    if inference not in INFERENCES:
+        raise OptionsError(f"inference '{inference}' is none of {', '.join(INFERENCES)}")
 
 
 def check_precision(precision: str) -> None:
@@ -51,6 +62,51 @@ def resolve_precision(precision: str, device: 'torch.device') -> str:
     if precision == 'auto':
         return 'fp16' if device.type == 'cuda' else 'fp32'
     return precision
+
+
+def resolve_inference(inference: str, device: 'torch.device', precision: str) -> str:
+    """Return 'pytorch' or 'openvino'; 'auto' means OpenVINO on a CPU, where it is installed.
+
+    Parameters
+    ----------
+    inference : str
+        One of INFERENCES.
+    device : torch.device
+    precision : str
+        'fp16' or 'fp32'.
+
+    Raises
+    ------
+    OptionsError
+        When OpenVINO is required on a GPU, in fp16, or where it is not installed.
+    """
+    check_inference(inference)
+    fits = device.type == 'cpu' and precision == 'fp32'
+    if inference == 'pytorch' or (inference == 'auto' and not fits):
+        return 'pytorch'
+    if not fits:
+        raise OptionsError(f"inference 'openvino' needs device 'cpu' and precision 'fp32', not "
+                           f"'{device}' and '{precision}'")
+    if import_openvino() is not None:
+        return 'openvino'
+    if inference == 'openvino':
+        raise OptionsError("inference 'openvino': OpenVINO is not installed; run "
+                           "'pip install openvino', or set inference to 'pytorch'")
+    return 'pytorch'
+
+
+@cache
+def import_openvino() -> Any:
+    """Import OpenVINO without its reports to the network; return None where it is missing."""
+    # It reports its import and every conversion to Google if this package can be imported.
+    sys.modules.setdefault('openvino_telemetry', None)  # type: ignore[arg-type]
+    try:
+        import openvino
+    except ImportError as error:
+        logger.info('PyTorch runs the networks, at half the speed or less: OpenVINO is not '
+                    "installed (%s); run 'pip install openvino'", error)
+        return None
+    return openvino
 
 
 def free_memory() -> None:

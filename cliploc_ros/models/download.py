@@ -36,7 +36,9 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         folder.mkdir(parents=True, exist_ok=True)
         return Path(fetch())
     except Exception as error:  # each library raises exceptions of its own
-        raise ModelError(f'cannot download {what}: {_reason(error, folder)}. {remedy}') from error
+        raise ModelError(f'cannot download {what}: {_reason(error, folder)}. {remedy}; or run '
+                         'prepare --cache-dir there, and set cache_dir to a copy of its folder'
+                         ) from error
 
 
 def _reason(error: Exception, folder: Path) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.mapping.labelling import Phrases
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
 from cliploc_ros.models.devices import resolve_device
@@ -39,6 +40,31 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
     for name, rows in encoded.items():
         cache.store(weights.key, phrases[name], rows)
     return {name: rows for name, rows in (found | encoded).items() if rows is not None}
+
+
+def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
+                       parts: Sequence[Mapping[str, Sequence[str]]]) -> dict[str, list[Phrases]]:
+    """Return the phrases of each class with their embeddings.
+
+    Parameters
+    ----------
+    weights : ClipWeights
+    options : ClipOptions
+    parts : sequence of mapping of str to sequence of str
+        Phrases by class. Those that change together belong into one part: the cache then keeps
+        the others.
+
+    Raises
+    ------
+    ModelError, OptionsError
+        See embed_phrases.
+    """
+    embedded = [embed_phrases(weights, options, part) for part in parts]
+    found: dict[str, list[Phrases]] = {}
+    for part, rows in zip(parts, embedded, strict=True):
+        for name, texts in part.items():
+            found.setdefault(name, []).append(Phrases(tuple(texts), rows[name]))
+    return found
 
 
 def _encode(weights: ClipWeights, options: ClipOptions, phrases: Mapping[str, Sequence[str]]

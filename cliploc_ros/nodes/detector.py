@@ -13,7 +13,9 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.profiles import with_detector
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.image_source import ImageSource, TimedImage
@@ -51,8 +53,15 @@ class DetectorNode(ManagedNode):
 
     def load(self) -> str:
         """Load the network."""
-        self._detector = YoloDetector(detector_options(self.settings.snapshot()))
-        return f"detector {self.settings['model']}"
+        options = with_detector(detector_options(self.settings.snapshot()),
+                                str(self.settings['profile']))
+        self._detector = YoloDetector(options)
+        return f'detector {options.model} ({self._detector.inference})'
+
+    @property
+    def detector(self) -> YoloDetector | None:
+        """Return the network, None unless it is loaded."""
+        return self._detector
 
     def unload(self) -> None:
         """Drop the network."""

@@ -94,7 +94,9 @@ class RelocalizerNode(ManagedNode):
         """Report the inputs, the last verdict and the device."""
         self._frames.examine(health, self.settings['stale_after_s'])
         health.values |= {'frames skipped while busy': self._newest.dropped,
-                          'last verdict': self._last_verdict, **self._verdicts}
+                          'last verdict': self._last_verdict, **self._verdicts,
+                          'map file': self.settings['map_file'],
+                          'base frame': self.settings['base_frame']}
         if self._pipeline.localizer is not None:
             health.values |= {'map': self._pipeline.localizer.description,
                               'device': self._pipeline.localizer.device}

@@ -18,7 +18,8 @@ from cliploc_ros.datasets.frames import RawFrame
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 
 #: The most detections of an image that are used, as in the relocalizer node.
 MAX_DETECTIONS = 50

@@ -11,7 +11,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,11 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.depth import check_depth_unit
 from cliploc_ros.datasets.frames import Frames, RawFrame, Wanted
 from cliploc_ros.datasets.observations import Recorded, load_recorded, save_recorded
+from cliploc_ros.datasets.poses import Poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.parallel import run_tasks
 from cliploc_ros.recording.journal import Journal
 from cliploc_ros.recording.keyframes import EVERY_FRAME, KeyframeFilter, KeyframeOptions
@@ -38,6 +39,7 @@ logger = logging.getLogger(__name__)
 
 # The unit of depth is judged by the boxes of so many frames.
 _FRAMES_FOR_UNIT = 10
+_UNKNOWN = np.full((4, 4), np.nan)
 _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 
@@ -97,8 +99,11 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
 
 
-def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None) -> Recorded:
+def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
+                odometry: Poses | None = None) -> Recorded:
     """Return the observations of a source: those of an earlier run, or record them.
+
+    Odometry is no part of what the networks depend on: an earlier run without it serves as well.
 
     Parameters
     ----------
@@ -106,6 +111,8 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     options : RecordingOptions
     file : Path, optional
         The observation file; None: see observation_file.
+    odometry : Poses, optional
+        Of the camera, with odometry's coordinate frame in the place of the map's.
 
     Raises
     ------
@@ -119,16 +126,33 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             recorded = load_recorded(file)
             if recorded.described == described:
                 logger.warning('using the observations of an earlier run: %s', file)
-                return recorded
+                linked = _with_odometry(recorded, odometry)
+                if _adds_odometry(recorded, linked):
+                    save_recorded(file, linked)
+                return linked
             logger.warning('recording again, with other options: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
     with Journal(file.with_name(f'.{file.name}.unfinished'), described.encode()) as journal:
-        recorded = _record(frames, options, journal)
+        recorded = _with_odometry(_record(frames, options, journal), odometry)
         save_recorded(file, recorded)
         journal.remove()
     logger.warning('wrote %s', file)
     return recorded
+
+
+def _with_odometry(recorded: Recorded, odometry: Poses | None) -> Recorded:
+    """Return observations with the odometry at their stamps, in the place of any other one."""
+    placed = None
+    if odometry is not None:
+        poses = [odometry.pose_at(int(stamp_ns)) for stamp_ns in recorded.stamps_ns]
+        placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
+    return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
+
+
+def _adds_odometry(before: Recorded, after: Recorded) -> bool:
+    old, new = before.detections.odom_from_camera, after.detections.odom_from_camera
+    return new is not None and (old is None or not np.array_equal(old, new, equal_nan=True))
 
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
@@ -228,7 +252,7 @@ def _camera(seen: SeenFrame) -> Camera:
 def _settings(options: YoloOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change what a network says."""
     return {name: value for name, value in asdict(options).items()
-            if name not in ('cache_dir', 'max_batch')}
+            if name not in ('cache_dir', 'max_batch', 'inference')}
 
 
 def _state(path: Path) -> tuple[int, int] | None:

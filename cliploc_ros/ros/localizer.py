@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.index.similarities import Similarities
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import BATCH, can_do_without_crops, crops_on_demand
@@ -24,6 +26,7 @@ from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import (
     detections_from_msg,
     stamp_ns,
@@ -214,6 +217,8 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     CliplocError
         Names the file, parameter or download to mend.
     """
+    if values['cache_dir']:
+        KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
     landmark_map = load_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
@@ -229,6 +234,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:
-    return ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
-                       checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
-                       cache_dir=values['cache_dir'])
+    named = ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
+                        checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
+                        cache_dir=values['cache_dir'], inference=values['inference'])
+    return with_encoder(named, values['profile'])

@@ -15,6 +15,8 @@ from cliploc_ros.core.options import (
 )
 from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.models.devices import INFERENCES
+from cliploc_ros.models.profiles import PROFILE_NAMES
 from cliploc_ros.ros.inputs.vertical import SOURCES
 from cliploc_ros.ros.node.parameters import ParameterRow, Value
 
@@ -36,13 +38,19 @@ _IMAGE_TRANSPORT = ParameterRow(
 _DEVICE = ParameterRow(
     'device', 'auto', "Where the network runs: 'auto' (a GPU if there is one), 'cpu', 'cuda' or "
     "'cuda:N'.", read_only=True)
+_INFERENCE = ParameterRow(
+    'inference', 'auto', "What runs the network: 'auto' (OpenVINO on a CPU where it is installed, "
+    "else PyTorch), 'pytorch' or 'openvino'.", choices=INFERENCES, read_only=True)
 _CACHE_DIR = ParameterRow(
-    'cache_dir', '', 'Folder of downloads and label embeddings; empty: '
+    'cache_dir', '', 'Folder of downloads, label embeddings and converted networks; empty: '
     '~/.cache/cliploc_ros.', read_only=True)
 
 DETECTOR = (
-    ParameterRow('model', 'yolov8x.pt', 'Weights: a local file, or a name that ultralytics '
-                 'downloads once.', read_only=True),
+    ParameterRow('profile', 'auto', "Detector of a profile: 'accurate', 'balanced' or 'fast'; "
+                 "'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
+                 read_only=True),
+    ParameterRow('model', '', 'Weights: a local file, a folder with an OpenVINO export, or a name '
+                 "that ultralytics downloads once; empty: the profile's.", read_only=True),
     ParameterRow('conf', 0.1, 'Drop detections below this confidence.',
                  low=0.0, high=1.0),
     ParameterRow('iou', 0.7, 'Drop the weaker of two boxes of one class that overlap more.',
@@ -52,6 +60,7 @@ DETECTOR = (
     ParameterRow('max_det', 100, 'Publish only the most confident detections, this many.',
                  low=1, high=1000),
     _DEVICE,
+    _INFERENCE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
     _AUTOSTART,
@@ -106,16 +115,20 @@ RELOCALIZER = (
                  'auto only; else all.', choices=CROPS),
     ParameterRow('max_detections', 50, 'Use only the most confident detections, this many.',
                  low=3, high=1000),
-    ParameterRow('clip_model', 'ViT-L-14', 'Architecture: an open_clip name, or a model config '
-                 '(.json).', read_only=True),
-    ParameterRow('clip_pretrained', 'openai', 'Weights: a tag of open_clip, or a local file.',
+    ParameterRow('profile', 'auto', "Encoder of a profile: 'accurate', 'balanced' or 'fast'; "
+                 "'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
                  read_only=True),
+    ParameterRow('clip_model', '', 'Architecture: an open_clip name, or a model config (.json); '
+                 "empty: the profile's.", read_only=True),
+    ParameterRow('clip_pretrained', '', 'Weights: a tag of open_clip, or a local file; empty: the '
+                 "profile's, or openai with a clip_model.", read_only=True),
     ParameterRow('clip_checkpoint_path', '', 'Local file with the weights of that tag; empty: '
                  'download them once.', read_only=True),
     ParameterRow('landmark_embeddings', 'image', "What crops are compared with: the map's labels "
                  "('text'), the images next to map_file ('image'), or both. Without images of "
                  'this CLIP: labels.', choices=COMPARED, read_only=True),
     _DEVICE,
+    _INFERENCE,
     _CACHE_DIR,
     _IMAGE_TRANSPORT,
     _AUTOSTART,

@@ -8,6 +8,7 @@ from typing import Any
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio.landmark import Landmark, check_landmark
+from cliploc_ros.studio.looks import Look
 
 Landmarks = Mapping[str, Landmark]
 
@@ -80,13 +81,24 @@ def change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | No
 def to_json(change: Change) -> dict[str, Any]:
     """Return a change as JSON holds it."""
     def side(landmarks: Mapping[str, Landmark | None]) -> dict[str, Any]:
-        return {key: None if one is None else {'fields': one.fields, 'locked': one.is_locked}
+        return {key: None if one is None else _landmark_to_json(one)
                 for key, one in landmarks.items()}
     return {'what': change.what, 'before': side(change.before), 'after': side(change.after)}
 
 
-def from_json(tree: Any) -> Change:
+def _landmark_to_json(landmark: Landmark) -> dict[str, Any]:
+    look = {} if landmark.look is None else {'look': landmark.look.key}
+    return {'fields': landmark.fields, 'locked': landmark.is_locked, **look}
+
+
+def from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
     """Return a change from JSON.
+
+    Parameters
+    ----------
+    tree : object
+    looks : mapping of str to Look
+        By key. A landmark whose look is missing has none.
 
     Raises
     ------
@@ -96,7 +108,8 @@ def from_json(tree: Any) -> Change:
     try:
         what = tree['what']
         before, after = ({key: None if one is None else
-                          Landmark(dict(one['fields']), bool(one['locked']))
+                          Landmark(dict(one['fields']), bool(one['locked']),
+                                   looks.get(str(one.get('look'))))
                           for key, one in tree[side].items()} for side in ('before', 'after'))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError('not a change') from error

@@ -7,15 +7,17 @@ once holds it, too.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.studio.changes import Change, EditError, Landmarks, from_json, to_json
 from cliploc_ros.studio.journal import Journal
 from cliploc_ros.studio.landmark import Landmark, map_of
+from cliploc_ros.studio.looks import Look, LookFile, look_from_json, read_look_file
 from cliploc_ros.studio.map_source import (
     NO_FILE,
     ChangedOnDiskError,
@@ -50,7 +52,8 @@ class Document:
         self._undone: list[Change] = []
         self._gesture: object = None
         self._source = read_source(path)
-        self._landmarks: Landmarks = self._source.landmarks
+        self._look_file = self._read_looks()
+        self._landmarks: Landmarks = self._landmarks_of_file()
         self._saved: Landmarks = self._landmarks
         self._journal = Journal(self.path.with_name(f'.{self.path.name}.studio'))
         try:
@@ -76,6 +79,17 @@ class Document:
     def landmarks(self) -> Landmarks:
         """Return the landmarks by id. An edit makes a new mapping and leaves this one alone."""
         return self._landmarks
+
+    @property
+    def encoder_key(self) -> str:
+        """Return the encoder of the landmarks' looks; '' where the map has none."""
+        return self._look_file.encoder_key
+
+    def take_encoder(self, encoder_key: str) -> None:
+        """Let a map that starts empty have looks of an encoder; any other map stays as it is."""
+        with self.lock:
+            if not self._source.landmarks and self._look_file.state is None:
+                self._look_file = self._look_file._replace(encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
@@ -158,6 +172,10 @@ class Document:
 
     def _do(self, kind: str, change: Change) -> None:
         landmarks: Landmarks = change.apply(self._landmarks)
+        for one in change.after.values():
+            if one is not None and one.look is not None and one.look.key not in self._kept_looks:
+                self._journal.append(one.look.to_json())
+                self._kept_looks.add(one.look.key)
         self._journal.append({'do': kind, **to_json(change)})
         self._take(kind, change, landmarks)
         self._tell()
@@ -206,7 +224,7 @@ class Document:
         ChangedOnDiskError
             Another program changed the file.
         CliplocError
-            The map is empty, or the file cannot be written; it is as it was.
+            The map is empty, or a file cannot be written; that one is as it was.
         """
         with self.lock:
             if not self._landmarks:
@@ -217,11 +235,12 @@ class Document:
             if found not in (NO_FILE, self._source.digest, over):
                 raise ChangedOnDiskError(self.path, found)
             new = self._source.with_landmarks(self._landmarks)
-            self._journal.append({'writing': new.digest})
+            self._journal.append({'writing': new.digest, 'looks': self._changed_looks()})
             self._source = new.write()
+            self._write_looks()
             self._saved = self._landmarks
             self._gesture = None
-            self._journal.restart([self._header()])
+            self._restart_journal()
             self._tell()
 
     def reload(self) -> None:
@@ -234,16 +253,17 @@ class Document:
         """
         with self.lock:
             self._source = read_source(self.path)
-            found: Landmarks = {key: Landmark(one.fields, key in self._landmarks
-                                   and self._landmarks[key].is_locked)
-                     for key, one in self._source.landmarks.items()}
+            self._look_file = self._read_looks()
+            found: Landmarks = {key: replace(one, is_locked=key in self._landmarks
+                                             and self._landmarks[key].is_locked)
+                                for key, one in self._landmarks_of_file().items()}
             change = Change('reload the file', self._landmarks,
                             {**dict.fromkeys(self._landmarks), **found})
             change = Change(change.what, {key: self._landmarks.get(key) for key in change.after},
                             change.after)
             self._take('edit', change, found)
             self._saved = found
-            self._journal.restart([self._header()])
+            self._restart_journal()
             self._note_unknown_fields()
             self._tell()
 
@@ -252,6 +272,30 @@ class Document:
         with self.lock:
             is_needed = not self.is_saved or self._locked()
             self._journal.close() if is_needed else self._journal.remove()
+
+    def _read_looks(self) -> LookFile:
+        found, fault = read_look_file(self.path)
+        self.notes += (fault,) if fault else ()
+        self._kept_looks = {look.key for look in found.looks.values()}
+        return found
+
+    def _write_looks(self) -> None:
+        self._look_file, fault = self._look_file.write(_looks(self._landmarks))
+        self.notes += (fault,) if fault and fault not in self.notes else ()
+
+    def _landmarks_of_file(self) -> dict[str, Landmark]:
+        return {key: replace(one, look=self._look_file.looks.get(key))
+                for key, one in self._source.landmarks.items()}
+
+    def _changed_looks(self) -> dict[str, str]:
+        """Return the keys of looks that the file does not hold so, '' for none."""
+        old = _look_keys(_looks(self._landmarks_of_file()))
+        return {key: look for key, look in _look_keys(_looks(self._landmarks)).items()
+                if look != old.get(key, '')}
+
+    def _restart_journal(self) -> None:
+        self._kept_looks = {look.key for look in self._look_file.looks.values()}
+        self._journal.restart([self._header()])
 
     def _header(self) -> dict[str, Any]:
         return {'base': self._source.digest, 'locked': self._locked()}
@@ -272,8 +316,13 @@ class Document:
         if not starts:
             self._journal.restart([self._header()])
             return
+        kept = [*self._look_file.looks.values(), *map(look_from_json, entries)]
+        looks = {look.key: look for look in kept if look is not None}
+        self._kept_looks = set(looks)
         self._restore_locks(entries[:starts[-1] + 1])
-        count = self._replay_edits([entry for entry in entries[starts[-1] + 1:] if 'do' in entry])
+        self._restore_looks(entries[starts[-1]].get('looks'), looks)
+        count = self._replay_edits(
+            [entry for entry in entries[starts[-1] + 1:] if 'do' in entry], looks)
         if count:
             self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
 
@@ -286,18 +335,33 @@ class Document:
             if isinstance(after := entry.get('after'), dict):
                 locked |= {key: isinstance(one, dict) and one.get('locked') is True
                            for key, one in after.items()}
-        self._landmarks = {key: Landmark(one.fields, locked.get(key, False))
+        self._landmarks = {key: replace(one, is_locked=locked.get(key, False))
                            for key, one in self._landmarks.items()}
         self._saved = self._landmarks
 
-    def _replay_edits(self, edits: list[dict[str, Any]]) -> int:
+    def _restore_looks(self, keys: object, looks: Mapping[str, Look]) -> None:
+        """Finish a save that ended between the map and its image embeddings."""
+        if not isinstance(keys, dict) or not keys:
+            return
+        self._landmarks = {key: replace(one, look=looks.get(str(keys[key]))) if key in keys
+                           else one for key, one in self._landmarks.items()}
+        self._saved = self._landmarks
+        try:
+            self._write_looks()
+        except MapError as error:
+            self.notes += (str(error),)
+
+    def _replay_edits(self, edits: list[dict[str, Any]], looks: Mapping[str, Look]) -> int:
         for row, entry in enumerate(edits):
             try:
-                change = from_json(entry)
+                change = from_json(entry, looks)
                 self._take(str(entry['do']), change, change.apply(self._landmarks))
             except (ValueError, CliplocError) as error:
                 aside = self._journal.set_aside()
-                self._journal.restart([self._header(), *edits[:row]])
+                in_file = {look.key for look in self._look_file.looks.values()}
+                self._journal.restart([
+                    self._header(), *(look.to_json() for key, look in looks.items()
+                                      if key not in in_file), *edits[:row]])
                 self.notes += (f'the last {len(edits) - row} edits of an earlier session cannot '
                                f'be restored ({error}); they lie in {aside.name}',)
                 return row
@@ -313,3 +377,11 @@ class Document:
 
 def _fields(landmarks: Landmarks) -> Mapping[str, Mapping[str, Any]]:
     return {key: one.fields for key, one in landmarks.items()}
+
+
+def _looks(landmarks: Landmarks) -> dict[str, Look | None]:
+    return {key: one.look for key, one in landmarks.items()}
+
+
+def _look_keys(looks: Mapping[str, Look | None]) -> dict[str, str]:
+    return {key: '' if look is None else look.key for key, look in looks.items()}

@@ -4,6 +4,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.studio.changes import Change, EditError, Landmarks, change_of
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M, Landmark, rounded, shape_fields
+from cliploc_ros.studio.looks import Look, merge_looks
 
 _SOURCE = 'studio'
 # What a recording said of a landmark is not known of an ellipsoid that a person placed.
@@ -97,18 +99,18 @@ def delete(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
 
 def lock(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
     """Refuse further edits of landmarks."""
-    after = {key: Landmark(_get(landmarks, key).fields, True) for key in landmark_ids}
+    after = {key: replace(_get(landmarks, key), is_locked=True) for key in landmark_ids}
     return change_of(f'lock {", ".join(after)}'[:80], landmarks, after)
 
 
 def unlock(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
     """Allow edits of landmarks again."""
-    after = {key: Landmark(_get(landmarks, key).fields, False) for key in landmark_ids}
+    after = {key: replace(_get(landmarks, key), is_locked=False) for key in landmark_ids}
     return change_of(f'unlock {", ".join(after)}'[:80], landmarks, after)
 
 
 def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.float64],
-           basis: NDArray[np.float64]) -> Change:
+           basis: NDArray[np.float64], look: Look | None = None) -> Change:
     """Add a landmark. The change has one id, that of the new landmark.
 
     Parameters
@@ -117,11 +119,13 @@ def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.f
     label, class_id : str
     center, basis : ndarray (3,), (3, 3)
         The basis' columns are the semi-axes [m].
+    look : Look, optional
     """
     landmark_id = new_id(landmarks, class_id)
     fields = {'label': ' '.join(label.split()), 'class_id': ' '.join(class_id.split()),
               **shape_fields(center, basis), 'source': _SOURCE}
-    return change_of(f'create {landmark_id}', landmarks, {landmark_id: Landmark(fields)})
+    return change_of(f'create {landmark_id}', landmarks,
+                     {landmark_id: Landmark(fields, look=look)})
 
 
 def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
@@ -142,7 +146,10 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
         raise EditError('merge: select two landmarks or more')
     parts = [_get(landmarks, key) for key in ids]
     center, basis = fit or _together(parts)
-    merged = parts[0].changed(**shape_fields(center, basis), **_NO_EVIDENCE)
+    merged = replace(
+        parts[0].changed(**shape_fields(center, basis), **_NO_EVIDENCE),
+        look=merge_looks([one.look for one in parts],
+                         [one.details.support or 1 for one in parts]))
     return change_of(f'merge {", ".join(ids)}'[:80], landmarks,
                      {ids[0]: merged, **dict.fromkeys(ids[1:])})
 

@@ -5,16 +5,15 @@
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.frames import Frames, ImageFile, folder_frames
+from cliploc_ros.datasets.frames import read_color
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.poses import TrajectoryPoses
 from cliploc_ros.datasets.tum import read_tum
@@ -27,35 +26,22 @@ _MAX_DELAY_NS = 20_000_000
 _IMAGES_KEPT = 32
 
 
-class _AnyTime(NamedTuple):
-    """Poses that are not needed: the views bring their own."""
-
-    span_ns: tuple[int, int] | None = (0, 2**62)
-
-    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        return None
-
-
 class Images:
     """The images of a folder or a recording.
 
     Parameters
     ----------
-    frames : Frames
+    stamps_ns : ndarray (F,) of int
+        When each was taken [ns].
+    read : callable
+        Returns image and camera of a place, 0 to F - 1.
     """
 
-    def __init__(self, frames: Frames):
-        self._frames = frames
-        stamps: list[int] = []
-
-        def note(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
-            stamps.append(stamp_ns)
-            return False
-
-        for _ in frames.read_raw(note):
-            pass
-        self._stamps_ns = np.array(stamps, dtype=np.int64)
-        self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(self._read_place)
+    def __init__(self, stamps_ns: NDArray[np.int64],
+                 read: Callable[[int], tuple[NDArray[np.uint8], Camera]]):
+        self._stamps_ns = stamps_ns
+        self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
+            lambda place: _undistorted(*read(place)))
 
     def near(self, stamp_s: float) -> NDArray[np.uint8] | None:
         """Return the undistorted image (h, w, 3) of a time [s], red first; None without one."""
@@ -64,12 +50,6 @@ class Images:
         offsets = np.abs(self._stamps_ns - round(stamp_s * NS_PER_S))
         place = int(np.argmin(offsets))
         return self._read(place) if offsets[place] <= _MAX_DELAY_NS else None
-
-    def _read_place(self, wanted: int) -> NDArray[np.uint8]:
-        for raw in self._frames.read_raw(lambda place, stamp_ns, pose: place == wanted):
-            frame = raw.decode()
-            return _undistorted(frame.image_rgb, frame.camera)
-        raise DatasetError(f'{self._frames.source}: image {wanted} is gone; start again')
 
 
 def _undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
@@ -95,11 +75,11 @@ def open_images(path: Path, topics: BagTopics) -> Images:
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
     if (path / 'rgb.txt').exists():
-        sequence = read_tum(path)
-        files = [ImageFile(stamp, image) for stamp, image in
-                 zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
-        return Images(folder_frames(path, files, _AnyTime(), find_camera(None, path)[0]))
-    return Images(bag_frames(path, topics, lambda reader, camera_frame: _AnyTime()))
+        sequence, camera = read_tum(path), find_camera(None, path)[0]
+        return Images(np.array(sequence.stamps_ns, dtype=np.int64),
+                      lambda place: read_color(sequence.image_paths[place], camera))
+    images = bag_images(path, topics)
+    return Images(images.times_ns[:, 0], images.read)
 
 
 def views_of_folder(path: Path) -> PosedDetections:

@@ -8,7 +8,7 @@ without effect. The studio opens such a map, keeps these fields, and says that t
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.studio.looks import Look
 
 REQUIRED_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 KNOWN_FIELDS = REQUIRED_FIELDS + OPTIONAL_FIELDS
@@ -37,10 +38,13 @@ class Landmark:
         As in the map file, below the landmark's id.
     is_locked : bool
         Edits are refused. The map file does not hold it.
+    look : Look, optional
+        What an image encoder saw of it, from the file next to the map.
     """
 
     fields: Mapping[str, Any]
     is_locked: bool = False
+    look: Look | None = field(default=None, compare=False)
 
     @cached_property
     def details(self) -> LandmarkDetails:

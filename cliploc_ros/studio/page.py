@@ -9,7 +9,7 @@ browsers show the same state, and a slow one delays no edit.
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -18,8 +18,10 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.replace_file import replace_file
 from cliploc_ros.studio import edits
+from cliploc_ros.studio.live_panel import LivePanel
 from cliploc_ros.studio.panels import LandmarkPanel, MapPanel, TablePanel, ViewPanel
 from cliploc_ros.studio.picture import SELECTED_RGB
+from cliploc_ros.studio.places_panel import PlacesPanel
 from cliploc_ros.studio.scene import (
     Answers,
     Ellipsoids,
@@ -30,6 +32,9 @@ from cliploc_ros.studio.scene import (
     wxyz_of,
 )
 from cliploc_ros.studio.studio import Studio
+
+if TYPE_CHECKING:
+    from cliploc_ros.studio.live import LiveRelocalizer
 
 _REDRAW_INTERVAL_S = 0.05
 _GRID_M = 20.0
@@ -43,29 +48,38 @@ class Page:
     ----------
     studio : Studio
     server : viser.ViserServer
+    live : LiveRelocalizer, optional
     """
 
-    def __init__(self, studio: Studio, server: viser.ViserServer):
+    def __init__(self, studio: Studio, server: viser.ViserServer,
+                 live: 'LiveRelocalizer | None' = None):
         self.studio, self.server = studio, server
         self.is_drawing = False
         self._changed, self._stopped = threading.Event(), threading.Event()
         self._drag = 0
         self._shown_picture: object = None
-        self._build()
+        self._build(live)
         studio.document.subscribe(self._changed.set)
+        if studio.finder is not None:
+            studio.finder.subscribe(self._changed.set)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
         self._redrawer.start()
         self._changed.set()
 
+    def redraw_soon(self) -> None:
+        """Show what has changed; any thread may call this."""
+        self._changed.set()
+
     def stop(self) -> None:
-        """Stop redrawing."""
+        """Stop what runs, and redrawing."""
+        self._places.search.stop()
         self._stopped.set()
         self._changed.set()
         self._redrawer.join()
 
     # ---- building -------------------------------------------------------------------------------
 
-    def _build(self) -> None:
+    def _build(self, live: 'LiveRelocalizer | None') -> None:
         server, recording = self.server, self.studio.recording
         server.gui.configure_theme(show_logo=False, show_share_button=False,
                                    control_width='large')
@@ -79,6 +93,7 @@ class Page:
         self._map_panel = MapPanel(self)
         self._landmark_panel = LandmarkPanel(self)
         self._table_panel = TablePanel(self)
+        tools = server.gui.add_panel()
         self._image: ViewImage | None = None
         self._view_panel: ViewPanel | None = None
         if recording is not None:
@@ -87,7 +102,14 @@ class Page:
             self._image = ViewImage(server.scene, recording.detections.camera)
             self._image.handle.on_click(self._clicked_image)
             self._image.handle.on_drag('left')(self._dragged_image)
-            self._view_panel = ViewPanel(self)
+            self._view_panel = ViewPanel(self, tools)
+        with tools.add_tab('Places'):
+            self._places = PlacesPanel(self)
+        self._tools: list[PlacesPanel | LivePanel] = [self._places]
+        if live is not None:
+            with tools.add_tab('Robot'):
+                self._tools.append(LivePanel(self, live))
+        tools.dock_left()
         self._place_camera()
 
     def _place_camera(self) -> None:
@@ -116,6 +138,9 @@ class Page:
         except CliplocError as error:
             self._notify(client, 'Not done', str(error), 'red')
             return
+        except Exception as error:
+            self._notify(client, 'Internal error', f'{error}; the terminal has more', 'red')
+            raise
         finally:
             self._changed.set()
         if message:
@@ -240,6 +265,8 @@ class Page:
         self._map_panel.show()
         self._landmark_panel.show()
         self._table_panel.show()
+        for tool in self._tools:
+            tool.show()
         if self._view_panel is not None and self._image is not None:
             self._answers.show(self.studio.answers)
             key = (self.studio.document.revision, self.studio.view,

@@ -34,13 +34,18 @@ def _set(handle: Any, **props: Any) -> None:
 
 
 def _button(page: 'Page', label: str, action: Callable[[], str | None], hotkey: Any = None,
-            modifier: Any = None, **options: Any) -> Any:
-    """Add a button, and a key that does the same."""
+            modifier: Any = None, then: Callable[[Any], None] = lambda event: None,
+            **options: Any) -> Any:
+    """Add a button, and a key that does the same; ``then`` follows with the lock released."""
+    def run(event: Any) -> None:
+        page.act(event, action)
+        then(event)
+
     handle = page.server.gui.add_button(label, **options)
-    handle.on_click(lambda event: page.act(event, action))
+    handle.on_click(run)
     if hotkey is not None:
         command = page.server.gui.add_command(label, hotkey=hotkey, modifier=modifier)
-        command.on_trigger(lambda event: page.act(event, action))
+        command.on_trigger(run)
     return handle
 
 
@@ -198,7 +203,8 @@ class LandmarkPanel:
             return
         key, one = selected
         _set(self._name, content=_paragraph([
-            f'{key}{" (locked)" if one.is_locked else ""}', *self._studio.faults(key)]))
+            f'{key}{" (locked)" if one.is_locked else ""}', *self._studio.faults(key),
+            *filter(None, [self._studio.phrase_note])]))
         phrases = (_NO_PHRASE, *self._studio.phrases())
         if tuple(self._phrases.handle.options) != phrases:
             self._phrases.handle.options = phrases
@@ -242,6 +248,7 @@ class TablePanel:
         self._page, self._studio = page, page.studio
         self._first = 0
         self._ids: list[str] = []
+        self._followed: tuple[str, ...] = ()
         gui = page.server.gui
         with gui.add_folder('Landmarks'):
             self._search = gui.add_text('Find', '')
@@ -252,8 +259,9 @@ class TablePanel:
             self._rows = [gui.add_button('', visible=False) for _ in range(_ROWS)]
             self._pages = gui.add_button_group('Rows', ('previous', 'next'))
             _button(page, 'Check against the recording', self._studio.check)
-            _button(page, 'Next landmark', self._studio.select_next, 'N')
-            _button(page, 'Accept and next', self._studio.accept, 'A')
+            for label, action, hotkey in (('Next landmark', self._studio.select_next, 'N'),
+                                          ('Accept and next', self._studio.accept, 'A')):
+                _button(page, label, action, hotkey, then=page.look_at_selection)
         for number, row in enumerate(self._rows):
             row.on_click(partial(self._clicked, number))
         self._pages.on_click(lambda event: self._turn(
@@ -274,8 +282,14 @@ class TablePanel:
         self._page.act(None, lambda: None)
 
     def show(self) -> None:
-        """Show one page of rows."""
+        """Show one page of rows; a new selection turns to its page."""
         rows = self._studio.rows(self._search.value)
+        selection = self._studio.document.selection
+        if selection != self._followed:
+            self._followed = selection
+            for place, one in enumerate(rows):
+                if selection and one.landmark_id == selection[-1]:
+                    self._first = place // _ROWS * _ROWS
         if self._first >= max(1, len(rows)):
             self._first = max(0, (len(rows) - 1) // _ROWS * _ROWS)
         shown = rows[self._first:self._first + _ROWS]
@@ -294,10 +308,9 @@ class TablePanel:
 class ViewPanel:
     """The selected view: its picture, and boxes for a new landmark."""
 
-    def __init__(self, page: 'Page'):
+    def __init__(self, page: 'Page', panel: Any):
         self._page, self._studio = page, page.studio
         gui = page.server.gui
-        panel = gui.add_panel()
         with panel.add_tab('View'):
             self._view = Field(gui.add_slider('View', 0, max(1, self._studio.views - 1), 1, 0))
             self._picture = gui.add_image(np.zeros((3, 4, 3), dtype=np.uint8), format='jpeg')
@@ -317,7 +330,6 @@ class ViewPanel:
                 self._create = _button(page, 'Create landmark', lambda: self._studio.create(
                     self._label.value, self._class.value), color='green')
                 _button(page, 'Forget the boxes', self._studio.clear_boxes)
-        panel.dock_left()
         look.on_click(page.look_through)
         here.on_click(lambda event: page.ask(event, self._studio.relocalize_here))
         everywhere.on_click(lambda event: page.ask(event, self._studio.relocalize_all))

@@ -24,9 +24,11 @@ from cliploc_ros.mapping.refit import RefitMap, refit_map
 from cliploc_ros.mapping.views import Views, make_views
 from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.landmark import Landmark, map_of
+from cliploc_ros.studio.looks import Look, look_of_boxes
+from cliploc_ros.studio.picture import project
 
-# Fewer boxes leave an ellipsoid open.
-_MIN_BOXES = 3
+#: Fewer boxes leave an ellipsoid open.
+LEAST_BOXES = 3
 
 
 class Recording:
@@ -58,6 +60,25 @@ class Recording:
         shown = associate(self.views, ellipsoids, self.options.association_iou)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
+    def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Look | None:
+        """Return what an encoder saw in some boxes; None where this recording does not know it."""
+        if self.detections.encoder_key != encoder_key:
+            return None
+        return look_of_boxes(self.detections, rows)
+
+    def best_views(self, landmark: Landmark) -> list[tuple[int, NDArray[np.float64]]]:
+        """Return the views that show all of a landmark, and the box (4,) there; largest first."""
+        camera = self.detections.camera
+        size = np.array([camera.width, camera.height], dtype=np.float64)
+        found = []
+        for view, pose in enumerate(self.detections.map_from_camera):
+            for one in project({'': landmark}, camera, pose):
+                half = np.sqrt(one.ellipse[[2, 4]])
+                box = np.concatenate([one.ellipse[:2] - half, one.ellipse[:2] + half])
+                if box.min() >= 0.0 and (box[2:] <= size).all():
+                    found.append((view, box))
+        return sorted(found, key=lambda pair: -float((pair[1][2:] - pair[1][:2]).prod()))
+
     def refit(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str]) -> RefitMap:
         """Fit some of the landmarks to their boxes.
 
@@ -83,8 +104,8 @@ class Recording:
         """
         boxes = self.boxes_of(landmarks)
         rows = np.unique(np.concatenate([boxes[key] for key in landmark_ids]))
-        if len(rows) < _MIN_BOXES:
-            raise EditError(f'merge: {len(rows)} boxes show these landmarks, {_MIN_BOXES} are '
+        if len(rows) < LEAST_BOXES:
+            raise EditError(f'merge: {len(rows)} boxes show these landmarks, {LEAST_BOXES} are '
                             'needed for a fit')
         return fit_ellipsoid(self.views, rows, center, basis)
 

@@ -5,13 +5,16 @@
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import viser
 
 from cliploc_ros.studio.gate import Gate
 from cliploc_ros.studio.page import Page
 from cliploc_ros.studio.studio import Studio
+
+if TYPE_CHECKING:
+    from cliploc_ros.studio.live import LiveRelocalizer
 
 
 class Served(NamedTuple):
@@ -22,7 +25,8 @@ class Served(NamedTuple):
 
 
 @contextmanager
-def serve_studio(studio: Studio, host: str, port: int) -> Iterator[Served]:
+def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | None' = None
+                 ) -> Iterator[Served]:
     """Serve the page of a studio for as long as the block lasts; yield where.
 
     Parameters
@@ -32,13 +36,15 @@ def serve_studio(studio: Studio, host: str, port: int) -> Iterator[Served]:
         The address to listen at. Beyond the loopback interface, the URL holds a token.
     port : int
         The next free one from this on; 0: any.
+    live : LiveRelocalizer, optional
+        The running relocalizer, to show it, too.
     """
     gate = Gate(host)
     with gate.guard(), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
         server = viser.ViserServer(host, port, verbose=False)
     # viser would open a tunnel to a server on the Internet for any browser that asks
     server.request_share_url = _share_nothing  # type: ignore[method-assign]
-    page = Page(studio, server)
+    page = Page(studio, server, live)
     try:
         shown_host = f'[{host}]' if ':' in host else host
         yield Served(f'http://{shown_host}:{server.get_port()}{gate.path}', server)

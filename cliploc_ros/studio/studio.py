@@ -20,8 +20,9 @@ from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import Images
 from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
 from cliploc_ros.studio.picture import Outline, Pixel, box_at, draw, landmark_at, project
-from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.recording import LEAST_BOXES, Recording
 from cliploc_ros.studio.trials import Answer, relocalize
 
 Rgb = tuple[int, int, int]
@@ -51,20 +52,27 @@ class Studio:
         Views with boxes and poses.
     images : Images, optional
         The images of these views.
+    finder : PhraseFinder, optional
+        Finds phrases for landmarks.
     """
 
     def __init__(self, document: Document, recording: Recording | None = None,
-                 images: Images | None = None):
+                 images: Images | None = None, finder: PhraseFinder | None = None):
         self.document = document
+        self.finder = finder
         self.recording = recording
         self.view = 0
         self.drawn: dict[int, tuple[float, float, float, float]] = {}
         self.accepted: set[str] = set()
         self._images = images
         self._checks: dict[str, LandmarkCheck] = {}
+        # the row of the table that was selected last by walking through it
+        self._row = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
         self._counts: dict[str, int] = {}
+        if recording is not None and recording.detections.encoder_key:
+            document.take_encoder(recording.detections.encoder_key)
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -86,19 +94,11 @@ class Studio:
     def best_view(self) -> str:
         """Select the view that shows the selected landmark largest, wholly in the image."""
         landmark_id, landmark = self._one_selected()
-        detections = self._recording().detections
-        best, largest = None, 0.0
-        for view, pose in enumerate(detections.map_from_camera):
-            for one in project({landmark_id: landmark}, detections.camera, pose):
-                half = np.sqrt(one.ellipse[[2, 4]])
-                low, high = one.ellipse[:2] - half, one.ellipse[:2] + half
-                size = (detections.camera.width, detections.camera.height)
-                if low.min() >= 0.0 and (high <= size).all() and half.prod() > largest:
-                    best, largest = view, float(half.prod())
-        if best is None:
+        views = self._recording().best_views(landmark)
+        if not views:
             raise EditError(f'{landmark_id}: no view shows all of it')
-        self.view = best
-        return f'view {best} shows {landmark_id} largest'
+        self.view = views[0][0]
+        return f'view {self.view} shows {landmark_id} largest'
 
     def boxes_in_view(self) -> NDArray[np.float64]:
         """Return the detector's boxes (n, 4) in the selected view [px]."""
@@ -255,12 +255,17 @@ class Studio:
         detections = self._recording().detections
         fit = fit_boxes(detections.camera, [DrawnBox(detections.map_from_camera[view], box)
                                             for view, box in sorted(self.drawn.items())])
-        change = edits.create(self.document.landmarks, label, class_id, fit.center, fit.basis)
-        self.document.apply(change)
-        self.document.select(change.after)
-        self.drawn.clear()
+        landmarks = self.document.landmarks
+        change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
         (landmark_id,) = change.after
-        return f'created {landmark_id}' + (f'; {fit.warning}' if fit.warning else '')
+        rows = self._recording().boxes_of(change.apply(landmarks))[landmark_id]
+        look = self._recording().look_of(rows, self.document.encoder_key)
+        self.document.apply(edits.create(landmarks, label, class_id, fit.center, fit.basis, look))
+        self.document.select([landmark_id])
+        self.drawn.clear()
+        hint = (f'{len(rows)} boxes of the recording show it: Refit fits it to them'
+                if len(rows) >= LEAST_BOXES else '')
+        return '; '.join(filter(None, [f'created {landmark_id}', fit.warning, hint]))
 
     # ---- the table ------------------------------------------------------------------------------
 
@@ -268,6 +273,7 @@ class Studio:
         """Judge all landmarks by the recording; the table then has the worst first."""
         found = self._recording().check(self.document.landmarks)
         self._checks = {one.landmark_id: one for one in found}
+        self._row = 0
         serious = sum(one.severity >= 1.0 for one in found)
         return f'checked {len(found)} landmarks: {serious} with a serious fault'
 
@@ -289,17 +295,25 @@ class Studio:
 
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""
-        self.accepted.update(self._selected())
-        return f'accepted {", ".join(self._selected())}; {self.select_next()}'
+        ids = self._selected()
+        following = self._following()  # acceptance sorts the table anew
+        self.accepted.update(ids)
+        return f'accepted {", ".join(ids)}; {self._select_row(following)}'
 
     def select_next(self) -> str:
-        """Select the next landmark of the table."""
-        ids = [row.landmark_id for row in self.rows()]
+        """Select the next landmark of the table; after a deletion, the one that moved up."""
+        return self._select_row(self._following())
+
+    def _following(self) -> str:
+        ids, selection = [row.landmark_id for row in self.rows()], self.document.selection
         if not ids:
             raise EditError('there are no landmarks')
-        here = ids.index(self.document.selection[0]) if self.document.selection else -1
-        self.document.select([ids[(here + 1) % len(ids)]])
-        return f'selected {self.document.selection[0]}'
+        return ids[(ids.index(selection[0]) + 1 if selection else self._row) % len(ids)]
+
+    def _select_row(self, landmark_id: str) -> str:
+        self.document.select([landmark_id])
+        self._row = [row.landmark_id for row in self.rows()].index(landmark_id)
+        return f'selected {landmark_id}'
 
     # ---- the relocalizer ------------------------------------------------------------------------
 
@@ -321,14 +335,26 @@ class Studio:
         return f'{len(views)} views: {counts}; similarities are simulated'
 
     def phrases(self) -> tuple[str, ...]:
-        """Return up to five phrases for the selected landmark: its own, then its class's."""
+        """Return up to five phrases for the selected landmark: CLIP's, or else the map's."""
         if self.document.selected is None:
             return ()
         _, one = self.document.selected
+        if found := self._ask_clip().phrases:
+            return found
         own = sorted(one.details.labels or (), key=lambda pair: -pair[1])
         alike = [other.label for other in self.document.landmarks.values()
                  if other.class_id == one.class_id and other.label != one.label]
         return tuple(dict.fromkeys([text for text, _ in own] + alike))[:5]
+
+    @property
+    def phrase_note(self) -> str:
+        """Return what a person should know of CLIP's phrases; '' for nothing."""
+        return self._ask_clip().note
+
+    def _ask_clip(self) -> FoundPhrases:
+        if self.finder is None or self.document.selected is None:
+            return FoundPhrases((), '')
+        return self.finder.answer(Question(self.document.selected[0], self.document.landmarks))
 
 
 def color_of(class_id: str) -> Rgb:

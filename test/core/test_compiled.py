@@ -1,85 +1,203 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled kernels' cache on disk may be damaged; the search still works."""
+"""Compiled kernels on disk: found by their source, whole, and never needed for the search."""
 
 import os
-import pickle
+import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 
 import numpy as np
 import pytest
 
+import cliploc_ros
+from cliploc_ros.core.kernel_cache import KernelFolders, source_stamp
+
 PROJECT = Path(__file__).resolve().parents[2]
-# A few kernels of one module, which are compiled within a second; then one that calls them.
-FEW = """
+# A few kernels, which are compiled within seconds. The last one calls the others.
+PROGRAM = """
+import logging
+logging.basicConfig(format='%(levelname)s %(message)s', level=logging.INFO)
 from cliploc_ros.core.compiled import warm_up
+from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
-warm_up(lambda: unit_circle_overlap(0.1, 0.2, 1.0, 2.0))
-print('warm')
+warm_up(lambda: unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
+print(KERNEL_FOLDERS.missing, unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
 """
-CALLER = """
-from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.geometry.ellipse import ellipse_iou
-warm_up(lambda: ellipse_iou(0.0, 0.0, 1.0, 2.0, 0.1, 0.2, 1.0, 0.0, 1.0))
-print('warm')
-"""
+KERNELS = 5
+# Without the rights of root, and without a home folder.
+HOMELESS = ('unshare', '--user', '--map-user=54321', 'env', '--unset=HOME')
 
 
-def run(code, folder):
-    """Run a program whose compiled kernels are kept in a folder."""
-    return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                          cwd=PROJECT, check=False,
-                          env=os.environ | {'NUMBA_CACHE_DIR': str(folder)})
+def run(*within, package=PROJECT, program=PROGRAM, **environment):
+    """Run the program; return how many kernels were missing, the result, and the log."""
+    variables = {name: value for name, value in os.environ.items()
+                 if name not in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME')}
+    done = subprocess.run([*within, sys.executable, '-c', program], text=True, check=False,
+                          capture_output=True, cwd='/', timeout=300,
+                          env=variables | {'PYTHONPATH': str(package)} | environment)
+    assert done.returncode == 0, done.stderr
+    missing, result = done.stdout.split()
+    return int(missing), float(result), done.stderr
 
 
-@pytest.mark.parametrize(('ending', 'size', 'code'), [('nbi', 0, FEW), ('nbc', 100, CALLER)])
-def test_a_damaged_cache_is_mended(tmp_path, ending, size, code):
-    assert run(FEW, tmp_path).stdout == 'warm\n'
-    files = list(tmp_path.rglob(f'*.{ending}'))
-    assert len(files) > 3
-    for file in files:
-        os.truncate(file, size)
-    done = run(code, tmp_path)
-    assert done.stdout == 'warm\n', done.stderr
-    assert 'compiling them again' in done.stderr
-    # and is whole again
-    assert 'compiling them again' not in run(code, tmp_path).stderr
+def run_in(folder, **environment):
+    return run(NUMBA_CACHE_DIR=str(folder), **environment)
 
 
-def test_a_cache_of_another_version_is_replaced(tmp_path):
-    """After an upgrade, the index of a kernel may name a module that is gone."""
-    assert run(FEW, tmp_path).stdout == 'warm\n'
-    for file in tmp_path.rglob('*.nbi'):
-        with file.open('rb') as index:
-            pickle.load(index)  # numba's version
-            end = index.tell()
-        file.write_bytes(file.read_bytes()[:end] + b'ccliploc_ros.core.gone\nThing\n.')
-    done = run(FEW, tmp_path)
-    assert done.stdout == 'warm\n', done.stderr
-    assert 'compiling them again' in done.stderr
-    assert 'compiling them again' not in run(FEW, tmp_path).stderr
+@pytest.fixture(scope='module')
+def compiled_kernels(tmp_path_factory):
+    """Compile the kernels into a folder."""
+    folder = tmp_path_factory.mktemp('kernels')
+    missing, result, log = run_in(folder)
+    assert missing == KERNELS and result == pytest.approx(np.pi)
+    assert 'INFO compiling the search for this processor' in log
+    assert f'INFO compiled {KERNELS} kernels in' in log and f'kept in {folder}' in log
+    return folder
 
 
-FULL_DISK = """
-import logging, resource
-from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.geometry.cubic import largest_cubic_root
-from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
-logging.basicConfig()
-def run():
-    return largest_cubic_root(0.0, 0.0, -8.0), unit_circle_overlap(0.0, 0.0, 1.0, 1.0)
-resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # writing fails as on a full disk
-warm_up(run)
-print(*run())
-"""
+@pytest.fixture
+def kernels(compiled_kernels, tmp_path):
+    return Path(shutil.copytree(compiled_kernels, tmp_path / 'kernels'))
+
+
+@pytest.fixture
+def package(tmp_path):
+    """Copy the modules that the program needs to another place."""
+    copy = tmp_path / 'elsewhere'
+    for file in (PROJECT / 'cliploc_ros').glob('*.py'):
+        (copy / 'cliploc_ros').mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, copy / 'cliploc_ros')  # with a new time of modification
+    shutil.copytree(PROJECT / 'cliploc_ros/core', copy / 'cliploc_ros/core',
+                    ignore=shutil.ignore_patterns('__pycache__'))
+    return copy
+
+
+def replace_in(file, old, new):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_a_second_start_compiles_nothing(kernels):
+    missing, result, log = run_in(kernels)
+    assert (missing, log) == (0, '') and result == pytest.approx(np.pi)
+
+
+def test_an_upgrade_of_other_code_compiles_nothing(kernels, package):
+    """Neither a copy, nor new lines, comments and descriptions, nor another file count."""
+    geometry = package / 'cliploc_ros/core/geometry'
+    replace_in(geometry / 'cubic.py', '@compiled\n', '# a new line\n\n@compiled\n')
+    replace_in(geometry / 'cubic.py', 'Return the largest real root', 'Give the largest root')
+    replace_in(package / 'cliploc_ros/errors.py', '_HEAD, _TAIL = 700', '_HEAD, _TAIL = 701')
+    assert run_in(kernels, package=package)[0] == 0
+
+
+@pytest.mark.parametrize(('old', 'new'), [
+    ('_ROUNDING = 4e-16', '_ROUNDING = 5e-16'),  # a constant of a callee
+    ('for _ in range(2)', 'for _ in range(3)')])  # its code
+def test_a_change_of_a_callee_compiles_its_callers(kernels, package, old, new):
+    count = len(list(kernels.iterdir()))
+    replace_in(package / 'cliploc_ros/core/geometry/cubic.py', old, new)
+    assert run_in(kernels, package=package)[0] == 2, 'the cubic, and the overlap that calls it'
+    assert len(list(kernels.iterdir())) == count, 'the outdated ones remain'
+
+
+def test_another_processor_has_kernels_of_its_own(kernels):
+    other = {'NUMBA_CPU_NAME': 'generic', 'NUMBA_CPU_FEATURES': ''}
+    assert run_in(kernels, **other)[0] == KERNELS
+    assert run_in(kernels, **other)[0] == run_in(kernels)[0] == 0
+
+
+@pytest.mark.parametrize('damage', ['empty', 'cut', 'changed'])
+def test_a_damaged_kernel_is_compiled_again(kernels, damage):
+    (file,) = kernels.glob('*unit_circle_overlap*')
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes({'empty': b'', 'cut': content[:100], 'changed': content}[damage])
+    missing, result, log = run_in(kernels)
+    assert missing == 1 and result == pytest.approx(np.pi)
+    assert f'WARNING {file} is damaged' in log
+    assert run_in(kernels)[0] == 0
+
+
+def test_a_folder_that_others_can_write_to_is_not_used(kernels):
+    kernels.chmod(0o777)
+    missing, _, log = run_in(kernels)
+    assert missing == KERNELS and 'other users own it or can write to it' in log
 
 
 def test_a_full_disk_costs_only_the_cache(tmp_path):
-    done = run(FULL_DISK, tmp_path)
-    assert np.array(done.stdout.split(), float) == pytest.approx([2.0, np.pi]), done.stderr
-    assert done.stderr.count('WARNING') == 1, 'not one for each kernel'
-    assert 'NUMBA_CACHE_DIR' in done.stderr
-    assert run(FULL_DISK.replace('(100, 100)', '(-1, -1)'), tmp_path).stderr == ''
-    assert list(tmp_path.rglob('*.nbc'))
+    limit = 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n'
+    missing, result, log = run_in(tmp_path, program=limit + PROGRAM)
+    assert missing == KERNELS and result == pytest.approx(np.pi)
+    assert log.count('WARNING') == 1, 'not one for each kernel'
+    assert 'cannot keep compiled kernels' in log and 'set cache_dir' in log
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def drop_root(tmp_path):
+    if subprocess.run([*HOMELESS, 'true'], capture_output=True, check=False).returncode:
+        pytest.skip('no user namespaces here')
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(0o755)
+
+
+def lock(folder):
+    """Make folders read-only, as in an installation by another user."""
+    for each in (folder, *(path for path in folder.rglob('*') if path.is_dir())):
+        each.chmod(0o555)
+
+
+def unlock(folder):
+    for each in (folder, *(path for path in folder.rglob('*') if path.is_dir())):
+        each.chmod(0o755)
+
+
+@pytest.mark.usefixtures('drop_root')
+def test_kernels_in_a_read_only_installation_are_read(kernels, package):
+    own = package / 'cliploc_ros/__pycache__/kernels'
+    shutil.copytree(kernels, own)
+    lock(package)
+    missing, _, log = run(*HOMELESS, package=package)
+    unlock(package)
+    assert (missing, log) == (0, '')
+
+
+@pytest.mark.usefixtures('drop_root')
+def test_a_read_only_installation_keeps_kernels_in_the_users_cache(kernels, package, tmp_path):
+    lock(package)
+    environment = {'package': package, 'XDG_CACHE_HOME': str(tmp_path / 'mine')}
+    first, second = run(*HOMELESS, **environment), run(*HOMELESS, **environment)
+    unlock(package)
+    assert (first[0], second[0]) == (KERNELS, 0)
+    assert len(list((tmp_path / 'mine/cliploc_ros/kernels').iterdir())) == KERNELS
+
+
+def test_the_preferred_folder_gets_what_lies_elsewhere(tmp_path, monkeypatch):
+    """So a folder to carry to another machine becomes complete."""
+    monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
+    monkeypatch.setattr('cliploc_ros.core.kernel_cache._PACKAGE', tmp_path / 'package')
+    folders = KernelFolders()
+    folders.store('a.kernel', b'code', 'a*')
+    folders.prefer(tmp_path / 'carried')
+    assert folders.read('a.kernel') == b'code'
+    shutil.rmtree(tmp_path / 'package')
+    assert folders.read('a.kernel') == b'code'
+    assert folders.read('b.kernel') is None and folders.missing == 1
+
+
+def test_every_kernel_has_a_stamp_of_its_own():
+    """A kernel that uses what no stamp covers would otherwise fail at its first call."""
+    for module in walk_packages(cliploc_ros.__path__, 'cliploc_ros.'):
+        if module.name.startswith(('cliploc_ros.core', 'cliploc_ros.mapping')):
+            import_module(module.name)
+    modules = [module for name, module in sys.modules.items() if name.startswith('cliploc_ros.')]
+    kernels = {id(value): value for module in modules for value in vars(module).values()
+               if hasattr(value, 'py_func')}.values()
+    stamps = {source_stamp(kernel) for kernel in kernels}
+    assert len(stamps) == len(kernels) > 100

@@ -63,6 +63,20 @@ def test_a_written_file_is_read_back(tmp_path):
     assert (again.camera, again.class_names) == (first.camera, first.class_names)
 
 
+def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
+    odometry = np.tile(np.eye(4), (3, 1, 1))
+    odometry[:, 0, 3] = [3.0, np.nan, 1.0]
+    odometry[1] = np.nan
+    arrays = make_arrays() | {'timestamps': np.array([11.0, 10.5, 10.0]),
+                              'odom_from_camera': odometry}
+    loaded = load_observations(save(tmp_path / 'o.npz', arrays))
+    assert loaded.odom_from_camera[[0, 2], 0, 3].tolist() == [1.0, 3.0]
+    assert np.isnan(loaded.odom_from_camera[1]).all()
+    save_observations(tmp_path / 'again.npz', loaded)
+    np.testing.assert_array_equal(load_observations(tmp_path / 'again.npz').odom_from_camera,
+                                  loaded.odom_from_camera)
+
+
 def test_embeddings_stay_in_the_file(tmp_path):
     rows = np.random.default_rng(0).normal(size=(3, 300_000)).astype(np.float16)
     given = replace(load_observations(save(tmp_path / 'o.npz', make_arrays())), embeddings=rows)
@@ -111,6 +125,13 @@ def become(name, value):
     (put('boxes_xyxy', (1, 0), 9.0), 'boxes_xyxy is not left, top, right, bottom in row 1'),
     (put('scores', 2, 1.5), 'scores is outside 0 to 1 in row 2'),
     (put('map_from_camera', (2, 0, 0), 2.0), 'map_from_camera is no rigid transform in row 2'),
+    (become('odom_from_camera', np.zeros((2, 4, 4))), 'shape .2, 4, 4., expected .3, 4, 4.'),
+    (become('odom_from_camera', [np.eye(4), np.eye(4), np.diag([1.0, 1, -1, 1])]),
+     'odom_from_camera is no rigid transform in row 2'),
+    (become('odom_from_camera', [np.eye(4), np.diag([np.nan, 1, 1, 1]), np.eye(4)]),
+     'odom_from_camera is no rigid transform in row 1'),
+    (become('odom_from_camera', [np.eye(4), np.diag([1.0, 1, 1, np.inf]), np.eye(4)]),
+     'odom_from_camera is no rigid transform in row 1'),
     (put('intrinsics_fx_fy_cx_cy', 0, 0.0), 'focal lengths must be positive'),
     (become('image_size', [0, 480]), 'image size 0x480'),
 ])

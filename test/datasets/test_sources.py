@@ -16,6 +16,7 @@ from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bag_frames import (
     BagTopics,
     bag_frames,
+    bag_odometry,
     pose_sources,
     poses_of_topic,
 )
@@ -167,6 +168,18 @@ def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
         reader, 'base', camera, 0)).read()
     np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
+
+
+def test_odometry_is_read_from_tf(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [450], tf_messages())
+    odometry = bag_odometry(bag, '/image', lambda reader, camera: read_transforms(
+        reader, 'odom', camera, 200 * MS))
+    # map -> odom moves, and is no part of it
+    np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
+    assert odometry.pose_at(START + 1200 * MS) is None
+    other = write_bag(tmp_path / 'other', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
+    with pytest.raises(DatasetError, match=r'other: odometry: images begin at .*another clock'):
+        bag_odometry(other, '/image', poses_of_topic('/pose'))
 
 
 @pytest.mark.parametrize(('messages', 'frames', 'expected'), [

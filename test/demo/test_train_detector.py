@@ -7,7 +7,8 @@ import re
 import numpy as np
 
 from cliploc_ros.demo.truth import read_frames
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 from demo_world import train_detector
 from demo_world.appearance import CLASSES
 

@@ -32,7 +32,8 @@ BBOXES = np.array([
 
 def options(reference, tmp_path, **changes) -> ClipOptions:
     return ClipOptions(**{'model': reference.name, 'pretrained': str(reference.file),
-                          'device': 'cpu', 'cache_dir': str(tmp_path), **changes})
+                          'device': 'cpu', 'cache_dir': str(tmp_path), 'inference': 'pytorch',
+                          **changes})
 
 
 def load_image_encoder(clip_options: ClipOptions) -> ClipEncoder:
@@ -142,7 +143,8 @@ def test_forms_of_checkpoints(small_clip, tmp_path, write, suffix):
     expected, found = read_state_dict(small_clip.file), read_state_dict(file)
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
-    tower = load_image_encoder(options(small_clip, tmp_path, pretrained=str(file)))._model.visual
+    encoder = load_image_encoder(options(small_clip, tmp_path, pretrained=str(file)))
+    tower = encoder._tower.model.visual
     assert all(torch.equal(tensor, expected[f'visual.{name}'])
                for name, tensor in tower.state_dict().items())
 
@@ -153,7 +155,7 @@ def test_weights_stored_in_half(small_clip, small_encoder, tmp_path, image_rgb):
                for name, tensor in small_clip.model.state_dict().items()}, file)
     encoder, label_embeddings = load_encoder(
         options(small_clip, tmp_path, pretrained=str(file)), LABELS)
-    assert {tensor.dtype for tensor in encoder._model.visual.parameters()} == {torch.float32}
+    assert {tensor.dtype for tensor in encoder._tower.model.visual.parameters()} == {torch.float32}
     assert difference(encoder.encode_crops(image_rgb, BBOXES),
                       small_encoder.encode_crops(image_rgb, BBOXES)) < 5e-3
     assert difference(label_embeddings, small_clip.labels(LABELS)) < 5e-3
@@ -198,7 +200,7 @@ def test_openai_torchscript_archive(small_clip, tmp_path, image_rgb):
 def test_a_tag_says_how_weights_were_trained(large_clip, tmp_path):
     tagged = options(large_clip, tmp_path, pretrained='openai',
                      checkpoint_path=str(large_clip.file))
-    tower = load_image_encoder(tagged)._model.visual
+    tower = load_image_encoder(tagged)._tower.model.visual
     assert {type(block.mlp.gelu) for block in tower.transformer.resblocks} == {QuickGELU}
     weights, plain, laion = map(resolve_clip_weights, (
         tagged, options(large_clip, tmp_path),
@@ -229,8 +231,8 @@ def test_the_text_tower_is_gone(small_clip, tmp_path):
     before = text_towers()
     encoder, _ = load_encoder(options(small_clip, tmp_path), LABELS)
     assert text_towers() == before
-    held = weakref.ref(encoder._model)
-    parameters = {name for name, tensor in encoder._model.named_parameters()
+    held = weakref.ref(encoder._tower.model)
+    parameters = {name for name, tensor in encoder._tower.model.named_parameters()
                   if not tensor.is_meta}
     assert parameters and all(name.startswith('visual.') for name in parameters)
     del encoder

@@ -25,7 +25,7 @@ ROOM = make_room()
 @pytest.fixture(scope='module')
 def clip(small_clip, tmp_path_factory):
     return ClipOptions(model=small_clip.name, pretrained=str(small_clip.file), device='cpu',
-                       cache_dir=str(tmp_path_factory.mktemp('cache')))
+                       cache_dir=str(tmp_path_factory.mktemp('cache')), inference='pytorch')
 
 
 @pytest.fixture

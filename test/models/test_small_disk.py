@@ -21,7 +21,7 @@ logging.basicConfig(format='%(levelname)s %(message)s')
 config = pathlib.Path(sys.argv[2]).with_suffix('.json')
 config.write_text(json.dumps({SMALL_CONFIG!r}))
 options = ClipOptions(model=str(config), pretrained=sys.argv[2], device='cpu',
-                      cache_dir=str(folder / 'cache'))
+                      cache_dir=str(folder / 'cache'), inference='pytorch')
 labels = [f'thing number {{number}}' for number in range(100)]  # 26 kB
 
 def load(labels=labels):

@@ -8,7 +8,7 @@ from cliploc_ros.models import ClipOptions
 
 def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):
     options = ClipOptions(large_clip.name, str(large_clip.file), device='cpu',
-                          cache_dir=str(tmp_path))
+                          cache_dir=str(tmp_path), inference='pytorch')
     first, warm = results = [measure_startup(kind, options) for kind in KINDS[1:]]
     print(f'\n{format_results(results)}')
     whole_mib = sum(each.numel() * 4 for each in large_clip.model.parameters()) / 2**20

@@ -16,7 +16,8 @@ from cliploc_ros.models.files import fingerprint_file
 
 
 def options(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:
-    return ClipOptions(model, str(file), device='cpu', cache_dir=str(tmp_path), **changes)
+    return ClipOptions(model, str(file), device='cpu', cache_dir=str(tmp_path),
+                       inference='pytorch', **changes)
 
 
 def refusal(clip_options: ClipOptions) -> str:

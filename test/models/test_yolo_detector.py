@@ -164,7 +164,8 @@ sys.addaudithook(watch)
 
 import numpy as np
 from cliploc_ros.models import YoloDetector, YoloOptions
-detector = YoloDetector(YoloOptions(sys.argv[1], device='cpu'))
+detector = YoloDetector(YoloOptions(sys.argv[1], device='cpu', cache_dir=sys.argv[2]))
+assert detector.inference == 'openvino'
 for _ in range(3):
     detector.detect(np.full((480, 640, 3), 99, np.uint8))
 
@@ -187,8 +188,9 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
                    if not name.startswith(('PYTEST', 'YOLO', 'XDG', 'OMP', 'ULTRALYTICS'))}
     environment |= {'HOME': str(home), 'PYTHONPATH': str(PROJECT), 'TMPDIR': str(temporary),
                     'TORCHINDUCTOR_CACHE_DIR': str(tmp_path / 'torch')}
-    done = subprocess.run([sys.executable, '-c', WATCHED_RUN, str(weights)], cwd=here,
-                          env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, '-c', WATCHED_RUN, str(weights), str(tmp_path / 'cache')], cwd=here,
+        env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     # One line: ultralytics printed nothing.
     assert json.loads(done.stdout) == {

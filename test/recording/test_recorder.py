@@ -172,11 +172,29 @@ def test_a_bag_says_the_same_and_asks_where_its_poses_are(walk, recorded, tmp_pa
     from_bag, from_folder = load_recorded(file).detections, load_recorded(recorded).detections
     np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
     np.testing.assert_allclose(from_bag.map_from_camera, from_folder.map_from_camera, atol=1e-6)
+    assert from_bag.odom_from_camera is None
+    # odometry is added to what the networks said before
+    linked = (*command, '--pose-topic', '/ground_truth', '--odometry-topic')
+    assert main(arguments(*linked, '/wheels')) == 1
+    assert 'no topic /wheels' in capsys.readouterr().err
+    assert main(arguments(*linked, '/ground_truth')) == 0
+    assert 'odometry is not used: the poses are taken as they are' in capsys.readouterr().out
+    again = load_recorded(file).detections
+    assert (again.odom_from_camera == again.map_from_camera).all()
+    assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
+    assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,
+                          '--odometry-noise', 0.02, 1)) == 0
+    assert 'odometry joins 14 of 14 pairs of frames' in capsys.readouterr().out
+    stamp = file.stat().st_mtime_ns
+    assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
+    assert 'odometry' not in capsys.readouterr().out
+    assert file.stat().st_mtime_ns == stamp
 
 
 @pytest.mark.parametrize(('options', 'expected'), [
     (('--bag', 'none'), 'none: no such recording'),
     (('--tum', '{walk}', '--pose-topic', '/pose'), 'are for --bag'),
+    (('--tum', '{walk}', '--odometry-topic', '/odom'), '--odometry-frame are for --bag'),
     (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap; one of them uses another'),
     (('--tum', '{walk}', '--workers', '0'), '--workers 0: give 1 or more'),
     (('--tum', '{walk}', '--keyframes', '-1', '5'), 'give 0 or more'),

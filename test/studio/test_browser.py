@@ -4,119 +4,21 @@
 
 import os
 import re
-import shutil
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from browser import TIMEOUT_S, Person, value_of, wait_for
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
 from cliploc_ros.studio.picture import project
-from cliploc_ros.studio.recording import Recording
-from cliploc_ros.studio.studio import Studio
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
 
 ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
-# WebGL without a GPU. The sandbox needs privileges that root in a container lacks.
-OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
-           '--enable-unsafe-swiftshader')
-# Software rendering on a busy machine takes seconds a frame.
-TIMEOUT_S = 60.0
-
-
-def wait_for(condition, what):
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline, f'timed out: {what}'
-        time.sleep(0.05)
-
-
-@pytest.fixture(scope='module')
-def chromium():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which('chromium'),
-                                              args=list(OPTIONS))
-        yield browser
-        browser.close()
-
-
-@pytest.fixture
-def path(tmp_path):
-    path = tmp_path / 'map.yaml'
-    shutil.copy(ASSETS / 'map.yaml', path)
-    return path
-
-
-@pytest.fixture
-def studio(path):
-    from cliploc_ros.studio.server import serve_studio
-
-    folder = ASSETS / 'sequence'
-    studio = Studio(Document(path), Recording(views_of_folder(folder)),
-                    open_images(folder, None))
-    with serve_studio(studio, '127.0.0.1', 0) as (studio.url, studio.server):
-        yield studio
-    studio.document.close()
-
-
-class Person:
-    """Who looks at the page."""
-
-    def __init__(self, chromium, url):
-        self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
-        self.page.set_default_timeout(TIMEOUT_S * 1000)
-        self.foreign = []
-        self.page.on('request', self.note)
-        self.page.goto(url)
-        self.page.get_by_text('landmarks in map').wait_for()
-
-    def note(self, request):
-        if not re.match(r'(http|ws)://127\.0\.0\.1:|data:|blob:', request.url):
-            self.foreign.append(request.url)
-
-    def click(self, name):
-        self.page.get_by_role('button', name=name).first.click()
-
-    def field(self, label, number=0):
-        """Return an input of the row with a label."""
-        row = self.page.get_by_text(label, exact=True).locator('xpath=../../..')
-        return row.locator('input:not([type=hidden])').nth(number)
-
-    def type(self, label, text, number=0):
-        field = self.field(label, number)
-        field.fill(text)
-        field.press('Enter')
-
-    def find(self, text):
-        self.field('Find').fill(text)
-
-    def picture(self, name):
-        """Keep a picture of the page where the environment names a folder for it."""
-        if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
-            self.page.screenshot(path=Path(folder) / f'{name}.png', timeout=TIMEOUT_S * 1000)
-
-
-def value_of(server, label):
-    """Return what the studio knows of a field."""
-    return next(handle.value for handle in server.gui._gui_input_handle_from_uuid.values()
-                if getattr(handle, 'label', '') == label)
-
-
-@pytest.fixture
-def person(chromium, studio):
-    person = Person(chromium, studio.url)
-    yield person
-    person.page.close()
-    assert person.foreign == [], 'no request leaves the machine'
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):

@@ -21,7 +21,7 @@ from cliploc_ros.mapping.checking.detector_model import (
     guess_detector,
     measure_detector,
 )
-from cliploc_ros.mapping.checking.grid import make_grid
+from cliploc_ros.mapping.checking.grid import Grid, make_grid
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
     check_landmarks,
@@ -32,6 +32,7 @@ from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.checking.relocalization import (
     PosedObservation,
+    Trial,
     sample_frames,
     try_observations,
     try_poses,
@@ -126,11 +127,29 @@ def _check_grid(landmark_map: LandmarkMap, model: DetectorModel,
     grid = make_grid(landmark_map, recorded, options)
     trials = try_poses(model, landmark_map, grid.poses, options,
                        lambda share: tell('relocalizing on the grid', share))
-    verdicts = np.array([one.verdict for one in trials]).reshape(-1, options.headings)
-    visible = np.array([model.expected_detections(pose) for pose in grid.poses])
-    return GridCheck(grid.positions, grid.is_near, (verdicts == 'accepted').sum(axis=1),
-                     (verdicts == 'misled').sum(axis=1), visible.reshape(-1, options.headings),
-                     grid.spacing_m, tuple(trials))
+    return judge_grid(grid, model, trials, options.headings)
+
+
+def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
+               ) -> GridCheck:
+    """Return what trials say of a grid, or of its first positions.
+
+    Parameters
+    ----------
+    grid : Grid
+    model : DetectorModel
+        That the trials were made with.
+    trials : sequence of Trial
+        Heading by heading of each position.
+    headings : int
+    """
+    count = len(trials) // headings
+    trials = trials[:count * headings]
+    verdicts = np.array([one.verdict for one in trials]).reshape(count, headings)
+    visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
+    return GridCheck(grid.positions[:count], grid.is_near[:count],
+                     (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
+                     visible.reshape(count, headings), grid.spacing_m, tuple(trials))
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,

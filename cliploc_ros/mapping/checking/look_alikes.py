@@ -135,10 +135,10 @@ def _candidates(centers: NDArray[np.float64], pairs: NDArray[np.int64],
     _, cell_of, votes = np.unique(cells.astype(np.int64), axis=0, return_inverse=True,
                                   return_counts=True)
     order = np.argsort(cell_of.ravel(), kind='stable')
-    groups = np.split(order, np.cumsum(votes)[:-1])
+    begins = np.cumsum(votes) - votes
     return [(float(turns[row]), middles[first[row]], middles[second[row]])
             for number in np.argsort(-votes, kind='stable')[:_VERIFIED]
-            for row in groups[number][:_MEMBERS_TRIED]]
+            for row in order[begins[number]:][:min(votes[number], _MEMBERS_TRIED)]]
 
 
 def _verified(landmark_map: LandmarkMap, classes: NDArray[np.int64], tree: cKDTree, turn: float,

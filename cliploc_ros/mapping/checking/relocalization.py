@@ -114,7 +114,17 @@ def sample_frames(count: int, limit: int) -> NDArray[np.int64]:
 
 def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
               options: CheckOptions, tell: Tell) -> list[Trial]:
-    """Relocalize simulated frames.
+    """Relocalize simulated frames, see each_pose; tell is told the share that is done."""
+    trials = []
+    for trial in each_pose(model, landmark_map, poses, options):
+        trials.append(trial)
+        tell(len(trials) / len(poses))
+    return trials
+
+
+def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
+              options: CheckOptions) -> Iterator[Trial]:
+    """Relocalize simulated frames, one at each step.
 
     Parameters
     ----------
@@ -125,20 +135,15 @@ def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
     poses : ndarray (k, 4, 4)
         True poses map_from_camera.
     options : CheckOptions
-    tell : callable
-        Told the share that is done.
     """
     labels, relocalizer = LabelModel.of(landmark_map), _relocalizer(landmark_map, options)
-    trials = []
     for number, pose in enumerate(poses):
         rng = np.random.default_rng([options.random_seed, number])
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
-        trials.append(_try(relocalizer, model.camera, detections, similarities, pose,
-                           int((shown >= 0).sum()), options))
-        tell((number + 1) / len(poses))
-    return trials
+        yield _try(relocalizer, model.camera, detections, similarities, pose,
+                   int((shown >= 0).sum()), options)
 
 
 def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],

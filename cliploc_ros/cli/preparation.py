@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Load both nodes as on the robot, answer a request, and say what it costs and what to carry."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from llvmlite.binding import get_host_cpu_name
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from cliploc_ros.core.landmark_embeddings import embeddings_path
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.errors import ImageError, OptionsError
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.nodes.detector import DetectorNode
+from cliploc_ros.nodes.relocalizer import RelocalizerNode
+from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.localizer import Localizer, load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.parameters import Value
+
+# A request is measured with as many boxes as a picture of a furnished room has.
+_BOXES = 12
+_ROWS, _COLUMNS = 3, 4
+_REQUESTS = 3
+# Parameters that name files of the user, which are not copied.
+_FILES = ('model', 'map_file', 'clip_model', 'clip_pretrained', 'clip_checkpoint_path')
+
+
+@dataclass(frozen=True)
+class Request:
+    """What one request cost.
+
+    Parameters
+    ----------
+    stage_ms : dict
+        Stage to its time [ms].
+    detected, boxes : int
+        How many boxes the detector found, and how many the search had.
+    reason : str
+        The verdict in words.
+    """
+
+    stage_ms: dict[str, float]
+    detected: int
+    boxes: int
+    reason: str
+
+
+def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bool) -> None:
+    """Prepare both nodes, whose parameters rclpy got, and print progress and costs.
+
+    Parameters
+    ----------
+    picture : Path or None
+        Picture for the request; None: one of the demo.
+    cache_dir : Path or None
+        The folder to carry; None: the one that the parameters name.
+    has_detector : bool
+        Whether the robot runs this package's detector.
+
+    Raises
+    ------
+    CliplocError
+        Names the file, parameter or download to mend.
+    """
+    image_rgb = read_picture(picture)
+    used: list[Mapping[str, Value]] = []
+    detector = None
+    if has_detector:
+        with _step('detector: weights and network'), _node(DetectorNode(), cache_dir) as node:
+            used.append(node.settings.snapshot())
+            node.load()
+            detector = node.detector
+    with (_step('relocalizer: map, weights, labels, network, kernels'),
+          _node(RelocalizerNode(), cache_dir) as node):
+        values = node.settings.snapshot()
+        used.append(values)
+        localizer = load_localizer(node, values)
+    with _step(f'{_REQUESTS} requests for {picture or "a picture of the demo"}'):
+        requests = [answer(image_rgb, detector, localizer, values) for _ in range(_REQUESTS)]
+    print(cost_table(requests), flush=True)
+    print('ready: with these parameters, start and requests need neither network nor compiler')
+    if cache_dir is not None:
+        print('\n'.join(carrying(cache_dir, used)))
+
+
+def read_picture(file: Path | None) -> NDArray[np.uint8]:
+    """Return a picture (h, w, 3) uint8, red first; that of the demo if no file is named.
+
+    Raises
+    ------
+    ImageError
+        The file is no picture.
+    """
+    file = file or min((ASSETS / 'sequence' / 'rgb').iterdir())
+    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise ImageError(f'{file} cannot be read as a picture: name a JPEG or PNG file')
+    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+
+
+def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: Localizer,
+           values: Mapping[str, Value]) -> Request:
+    """Answer a request for a picture as the nodes do, and measure it."""
+    start = time.monotonic()
+    found = _NOTHING if detector is None else detector.detect(image_rgb)
+    detection_ms = (time.monotonic() - start) * 1e3
+    height, width = image_rgb.shape[:2]
+    boxes = with_drawn_boxes(found, localizer.landmark_map, (width, height))
+    header = Header(frame_id='camera')
+    image = Image(header=header, width=width, height=height, encoding='rgb8', step=3 * width,
+                  data=image_rgb.tobytes())
+    # The time does not depend on the lens: 53 degrees wide.
+    lens = [float(width), 0.0, width / 2, 0.0, float(width), height / 2, 0.0, 0.0, 1.0]
+    info = CameraInfo(header=header, width=width, height=height, k=lens,
+                      p=[*lens[:3], 0.0, *lens[3:6], 0.0, *lens[6:], 0.0])
+    now = time.monotonic()
+    times = StageTimes('waiting', now)
+    # what a request costs at most
+    localized = localizer.localize(
+        Frame(image, info, detections_to_msg(boxes, header), now, now), {**values, 'crops': 'all'},
+        RobotState(np.eye(4)), times)
+    stage_ms = {'detection': detection_ms} if detector is not None else {}
+    return Request(stage_ms | times.ms, len(found), len(boxes),
+                   localized.found.reason or 'accepted')
+
+
+def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[int, int]
+                     ) -> Detections:
+    """Return detections, and as many drawn boxes as a usual picture has more."""
+    missing = range(len(found), _BOXES)
+    cell = np.array(size) / (_COLUMNS, _ROWS)
+    corners = np.array([divmod(number, _COLUMNS)[::-1] for number in missing]).reshape(-1, 2)
+    drawn = np.concatenate([(corners + 0.25) * cell, (corners + 0.75) * cell], axis=1)
+    classes = landmark_map.class_ids
+    return Detections(np.concatenate([found.bboxes_xyxy.reshape(-1, 4), drawn]),
+                      (*found.class_ids, *(classes[number % len(classes)] for number in missing)),
+                      np.concatenate([found.scores, np.full(len(missing), 0.5)]))
+
+
+def cost_table(requests: list[Request]) -> str:
+    """Return a table of what the requests cost, by stage."""
+    first, last = requests[0], requests[-1]
+    drawn = last.boxes - last.detected
+    lines = [f'what a request costs here, with {last.boxes} boxes'
+             + (f' ({drawn} of them drawn to measure with)' if drawn else ''),
+             f'{"stage":<12} {"first ms":>9} {"later ms":>9}']
+    rows = [(stage, first.stage_ms[stage],
+             float(np.median([each.stage_ms[stage] for each in requests[1:]])))
+            for stage in last.stage_ms if stage != 'waiting']
+    rows.append(('in all', sum(row[1] for row in rows), sum(row[2] for row in rows)))
+    lines += [f'{stage:<12} {once:>9.0f} {later:>9.0f}' for stage, once, later in rows]
+    lines.append(f'the verdict on this picture: {last.reason}')
+    return '\n'.join(lines)
+
+
+def carrying(cache_dir: Path, used: list[Mapping[str, Value]]) -> list[str]:
+    """Return what to do with a folder to carry, in lines."""
+    size = sum(file.stat().st_size for file in cache_dir.rglob('*') if file.is_file()
+               and not file.is_symlink())
+    lines = [f'carry {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '
+             'path there',
+             f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another "
+             'one compiles them at its first start']
+    names = {str(values[name]) for values in used for name in _FILES if values.get(name)}
+    names |= {str(embeddings_path(str(values['map_file']))) for values in used
+              if values.get('map_file')}
+    files = sorted({Path(name).expanduser().absolute() for name in names})
+    return lines + [f'carry as well, for a parameter names it: {file}' for file in files
+                    if file.exists()]
+
+
+@contextmanager
+def _step(what: str) -> Iterator[None]:
+    """Print what begins, and how long it took."""
+    start = time.monotonic()
+    print(f'==> {what}', flush=True)
+    yield
+    print(f'    done after {time.monotonic() - start:.1f} s', flush=True)
+
+
+@contextmanager
+def _node[Node: ManagedNode](node: Node, cache_dir: Path | None) -> Iterator[Node]:
+    """Yield a node whose parameter cache_dir has the expected value; destroy it afterwards."""
+    try:
+        own = node.settings['cache_dir']
+        if cache_dir is not None and own != str(cache_dir):
+            raise OptionsError(f'the parameter file sets cache_dir of the {node.get_name()} to '
+                               f"'{own}': remove it there, or leave --cache-dir out")
+        yield node
+    finally:
+        node.worker.stop()
+        node.destroy_node()
+
+
+_NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))

@@ -1,0 +1,306 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Networks that OpenVINO runs on a CPU: converted once, kept on disk, checked at each start."""
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+import threading
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.devices import free_memory, import_openvino
+from cliploc_ros.models.download import first_line
+from cliploc_ros.models.files import fingerprint_file, resolve_cache_dir
+
+if TYPE_CHECKING:
+    import torch
+
+_FORMAT = 1
+# ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
+_MOST_NETWORKS = 8
+_STALE_S = 24 * 3600.0
+_XML, _WEIGHTS, _PROBE, _ABOUT = 'network.xml', 'network.bin', 'probe.npz', 'about.json'
+#: Precisions to try, the fastest first, and how far an output may be off, as a share of its
+#: length. None is the processor's own choice: bf16 where it multiplies matrices in it.
+FP32 = (('f32', 1e-3),)  # measured: 1e-5
+FASTEST = ((None, 0.03), *FP32)  # .03 is a cosine of .9995; measured in bf16: .99995
+Precisions = Sequence[tuple[str | None, float]]
+_MADV_DONTNEED = 4
+
+logger = logging.getLogger(__name__)
+
+
+class ConversionError(ModelError):
+    """OpenVINO cannot run a network, or gives other results than PyTorch."""
+
+
+class Conversion(NamedTuple):
+    """A network that was converted.
+
+    Parameters
+    ----------
+    network : openvino.Model
+    probe : ndarray float32
+        An input of another shape than the one that the network was traced with.
+    expected : ndarray float32
+        What PyTorch makes of the probe.
+    about : dict
+        What else the user of the network needs, as JSON.
+    """
+
+    network: Any
+    probe: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    about: dict[str, Any]
+
+
+class Network:
+    """A compiled network with one input and one output that is used.
+
+    Parameters
+    ----------
+    network : openvino.Model
+    about : dict
+        See Conversion.
+    precision : str, optional
+        'f32'; None is the processor's own choice.
+    """
+
+    def __init__(self, network: Any, about: dict[str, Any], precision: str | None = 'f32'
+                 ) -> None:
+        import torch
+
+        self.about = about
+        # Threads that are pinned to cores wait there for other processes; as many as PyTorch uses
+        # keep to its limits.
+        settings = {'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
+                    'INFERENCE_NUM_THREADS': torch.get_num_threads()}
+        if precision is not None:
+            settings['INFERENCE_PRECISION_HINT'] = precision
+        self._compiled = import_openvino().Core().compile_model(network, 'CPU', settings)
+        self._lock = threading.Lock()
+
+    def __call__(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the first output for some inputs."""
+        with self._lock:  # a compiled network runs one input at a time
+            return np.asarray(self._compiled(inputs)[0])
+
+
+def load_network(cache_dir: str, name: str, identity: Sequence[str],
+                 convert: Callable[[], Conversion], precisions: Precisions = FP32) -> Network:
+    """Return a network from the cache, or convert it, which takes seconds to minutes.
+
+    The name of a folder in the cache is the hash of everything that the network depends on. A
+    start runs a stored input and compares the output with PyTorch's, so that a damaged file, and
+    a CPU that calculates otherwise, are noticed. Folders are written under another name and
+    renamed: any number of processes may share the cache.
+
+    Parameters
+    ----------
+    cache_dir : str
+        See resolve_cache_dir.
+    name : str
+        For people.
+    identity : sequence of str
+        What the network depends on, besides OpenVINO's version.
+    convert : callable
+        Converts the network.
+    precisions : sequence of tuple
+        See FP32; the first in which the network runs as in PyTorch is taken.
+
+    Raises
+    ------
+    ConversionError
+        When OpenVINO cannot run the network as PyTorch does.
+    ModelError
+        From convert.
+    """
+    identity = [str(_FORMAT), import_openvino().__version__, *identity]
+    parent = resolve_cache_dir(cache_dir) / 'openvino'
+    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
+    folder = parent / f'{Path(name).name}-{digest[:32]}'
+    if folder.exists():
+        try:
+            network = _open(folder, identity, precisions)
+        except Exception as error:  # OpenVINO has no exceptions of its own
+            logger.warning('%s cannot be used (%s): converting %s again', folder,
+                           first_line(error), name)
+        else:
+            with contextlib.suppress(OSError):  # a read-only cache works too
+                os.utime(folder)
+            return network
+    return _convert(folder, name, identity, convert, precisions)
+
+
+def _convert(folder: Path, name: str, identity: Sequence[str],
+             convert: Callable[[], Conversion], precisions: Precisions) -> Network:
+    """Convert a network, and write it so that its weights are mapped from the file."""
+    started = time.monotonic()
+    logger.info('converting %s for OpenVINO: once, into %s', name, folder)
+    conversion = _converted(name, convert)
+    try:
+        network = _stored(folder, identity, conversion, precisions)
+    except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
+        network = _in_memory(name, conversion, precisions)
+        logger.warning('the converted network is not cached and the next start is slow again: '
+                       'cannot write %s (%s); make room, or choose a writable cache_dir', folder,
+                       first_line(error))
+    del conversion
+    free_memory()
+    logger.info('%s is converted after %.0f s', name, time.monotonic() - started)
+    return network
+
+
+def _converted(name: str, convert: Callable[[], Conversion]) -> Conversion:
+    try:
+        return convert()
+    except ModelError:
+        raise
+    except Exception as error:  # tracing and converting raise exceptions of all kinds
+        raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
+
+
+def _in_memory(name: str, conversion: Conversion, precisions: Precisions) -> Network:
+    try:
+        return _checked(conversion, precisions)
+    except Exception as error:
+        raise ConversionError(f'OpenVINO does not run {name} as PyTorch does: '
+                              f'{first_line(error)}') from error
+
+
+def _stored(folder: Path, identity: Sequence[str], conversion: Conversion,
+            precisions: Precisions) -> Network:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _prune(folder.parent)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
+                                     ignore_cleanup_errors=True) as desk:
+        whole = Path(desk) / folder.name
+        _write(whole, identity, conversion)
+        network = _open(whole, identity, precisions)
+        if folder.exists():  # damaged, or of another process
+            folder.rename(Path(desk) / 'old')
+        whole.rename(folder)
+    return network
+
+
+def _write(folder: Path, identity: Sequence[str], conversion: Conversion) -> None:
+    folder.mkdir()
+    import_openvino().save_model(conversion.network, folder / _XML, compress_to_fp16=False)
+    np.savez(folder / _PROBE, probe=conversion.probe, expected=conversion.expected)
+    prints = {name: fingerprint_file(folder / name) for name in (_XML, _WEIGHTS, _PROBE)}
+    (folder / _ABOUT).write_text(json.dumps(
+        {'identity': list(identity), 'files': prints, 'about': conversion.about}))
+    for file in folder.iterdir():
+        with file.open('rb+') as opened:
+            os.fsync(opened.fileno())
+
+
+def _open(folder: Path, identity: Sequence[str], precisions: Precisions) -> Network:
+    """Return the network in a folder; raise ValueError and others where it is not sound."""
+    stored = json.loads((folder / _ABOUT).read_text())
+    if stored['identity'] != list(identity):
+        raise ValueError('it belongs to another network')
+    for name in (_XML, _WEIGHTS, _PROBE):
+        if fingerprint_file(folder / name) != stored['files'][name]:
+            raise ValueError(f'{name} is damaged')
+    try:
+        with np.load(folder / _PROBE, allow_pickle=False) as arrays:
+            probe, expected = arrays['probe'], arrays['expected']
+    except zipfile.BadZipFile as error:
+        raise ValueError(f'{_PROBE} is damaged') from error
+    read = import_openvino().Core().read_model(folder / _XML)
+    network = _checked(Conversion(read, probe, expected, stored['about']), precisions)
+    release_pages(folder / _WEIGHTS)
+    return network
+
+
+def release_pages(file: Path) -> None:
+    """Release the memory of a mapped file; the system reads again what is used again.
+
+    The CPU's kernels have copies of the weights in layouts of their own, and read the file only
+    while they are compiled.
+    """
+    madvise = getattr(ctypes.CDLL(None), 'madvise', None)
+    if madvise is None:
+        return
+    # OpenVINO maps the file before its folder gets its name: look for the file itself.
+    inode = str(file.stat().st_ino)
+    with contextlib.suppress(OSError):  # only Linux has it
+        for line in Path('/proc/self/maps').read_text().splitlines():
+            fields = line.split(maxsplit=5)
+            if fields[4] == inode and fields[-1].endswith(file.name):
+                start, end = (int(bound, 16) for bound in fields[0].split('-'))
+                madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
+
+
+def _checked(conversion: Conversion, precisions: Precisions) -> Network:
+    """Return a network that gives PyTorch's output; raise ValueError where none does."""
+    expected = conversion.expected
+    for precision, tolerance in precisions:
+        network = Network(conversion.network, conversion.about, precision)
+        found = network(conversion.probe)
+        if found.shape != expected.shape:
+            raise ValueError(f'its output has the shape {found.shape}, not {expected.shape}')
+        rows = len(expected)
+        off = float(np.max(np.linalg.norm((found - expected).reshape(rows, -1), axis=1)
+                           / np.linalg.norm(expected.reshape(rows, -1), axis=1)))
+        if off <= tolerance:  # false of NaN
+            return network
+    raise ValueError(f'its output is off by {off:.2g} of its length, not by {tolerance:g} at most')
+
+
+def _prune(parent: Path) -> None:
+    """Remove the least recently used networks, and those of writers that were killed."""
+    def modified(folder: Path) -> float:
+        try:
+            return folder.stat().st_mtime
+        except OSError:  # another process has removed it
+            return 0.0
+
+    kept = sorted((folder for folder in parent.iterdir() if not folder.name.startswith('.')),
+                  key=modified, reverse=True)
+    stale = [folder for folder in parent.glob('.*.tmp')
+             if modified(folder) < time.time() - _STALE_S]
+    for folder in kept[_MOST_NETWORKS - 1:] + stale:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def convert_module(module: 'torch.nn.Module', example: 'torch.Tensor',
+                   shape: Sequence[int]) -> Any:
+    """Return an openvino.Model of a PyTorch module on a CPU.
+
+    Parameters
+    ----------
+    module : torch.nn.Module
+        In evaluation mode.
+    example : Tensor
+        An input to trace the module with.
+    shape : sequence of int
+        Of the inputs to come; -1 for what may vary.
+    """
+    import torch
+
+    fast = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)  # OpenVINO has no such operation
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter('ignore')  # of constants in the trace; the probe tests them
+            traced = torch.jit.trace(module, example, strict=False, check_trace=False)
+            return import_openvino().convert_model(traced, example_input=example,
+                                                   input=[list(shape)])
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast)

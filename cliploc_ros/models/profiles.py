@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Profiles: which detector and which encoder suit a device."""
+
+from dataclasses import dataclass, replace
+
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.devices import resolve_device
+from cliploc_ros.models.yolo_weights import YoloOptions
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A detector and an encoder.
+
+    Parameters
+    ----------
+    detector : str
+        A published YOLO model.
+    clip_model, clip_pretrained : str
+        See ClipOptions.
+    """
+
+    detector: str
+    clip_model: str
+    clip_pretrained: str
+
+
+#: doc/speed.md has their accuracy, time, memory and licences.
+PROFILES = {
+    'accurate': Profile('yolov8x.pt', 'ViT-L-14', 'openai'),  # the paper's
+    'balanced': Profile('yolov8m.pt', 'ViT-B-32-256', 'datacomp_s34b_b86k'),
+    'fast': Profile('yolov8n.pt', 'ViT-B-32', 'datacomp_xl_s13b_b90k'),
+}
+PROFILE_NAMES = ('auto', *PROFILES)
+
+
+def resolve_profile(profile: str, device: str) -> Profile:
+    """Return the profile of a name; 'auto' is accurate on a GPU and balanced on a CPU.
+
+    Raises
+    ------
+    OptionsError
+        For another name, or a device that is missing.
+    """
+    if profile not in PROFILE_NAMES:
+        raise OptionsError(f"profile '{profile}' is none of {', '.join(PROFILE_NAMES)}")
+    if profile == 'auto':
+        profile = 'accurate' if resolve_device(device).type == 'cuda' else 'balanced'
+    return PROFILES[profile]
+
+
+def with_detector(options: YoloOptions, profile: str) -> YoloOptions:
+    """Return options that name a detector: that of the profile where the model is ''."""
+    if options.model:
+        return options
+    return replace(options, model=resolve_profile(profile, options.device).detector)
+
+
+def with_encoder(options: ClipOptions, profile: str) -> ClipOptions:
+    """Return options that name an encoder: that of the profile where they name none.
+
+    Options that name a model, weights or a file keep them, and have the defaults of ClipOptions
+    for the rest: weights belong to a model.
+    """
+    if options.model or options.pretrained or options.checkpoint_path:
+        return replace(options, model=options.model or ClipOptions.model,
+                       pretrained=options.pretrained or ClipOptions.pretrained)
+    chosen = resolve_profile(profile, options.device)
+    return replace(options, model=chosen.clip_model, pretrained=chosen.clip_pretrained)

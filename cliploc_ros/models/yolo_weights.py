@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Weights of YOLO, and ultralytics without network requests, installations and files in the home.
+
+Ultralytics (AGPL-3.0) is imported by `import_ultralytics` first. It sets environment variables
+before the import.
+"""
+
+import atexit
+import difflib
+import logging
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.devices import check_inference, check_precision
+from cliploc_ros.models.download import download, first_line
+from cliploc_ros.models.files import check_weights_file, resolve_cache_dir
+
+_LEAST_STRIDE = 32
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class YoloOptions:
+    """Which YOLO to load, and how to run it. The names are ultralytics' own.
+
+    Parameters
+    ----------
+    model : str
+        Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
+        ``.pt`` file, which is then downloaded once.
+    conf : float
+        Least confidence of a detection, 0 to 1.
+    iou : float
+        IoU from which the weaker of two boxes of a class is dropped, 0 to 1.
+    imgsz : int
+        The network sees the image with its longer side scaled to this [px].
+    max_det : int
+        Greatest number of detections in an image; the most confident are kept.
+    device : str
+        'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
+    precision : str
+        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'.
+    cache_dir : str
+        Folder for downloads and converted networks; '' is the user's cache.
+    inference : str
+        'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'.
+
+    Raises
+    ------
+    OptionsError
+        For values out of range.
+    """
+
+    model: str = 'yolov8x.pt'
+    conf: float = 0.1
+    iou: float = 0.7
+    imgsz: int = 640
+    max_det: int = 300
+    device: str = 'auto'
+    precision: str = 'auto'
+    cache_dir: str = ''
+    inference: str = 'auto'
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_precision(self.precision)
+        check_inference(self.inference)
+        for name in ('conf', 'iou'):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
+        for name in ('imgsz', 'max_det'):
+            if getattr(self, name) < 1:
+                raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
+
+
+@cache
+def import_ultralytics() -> Any:
+    """Import ultralytics without network requests, installations and files in the home."""
+    import torch  # first: it reads OMP_NUM_THREADS, which ultralytics sets to 1
+
+    if 'ultralytics' in sys.modules:
+        logger.warning('ultralytics was imported before the detector: it may use the network')
+    folder = tempfile.mkdtemp(prefix='cliploc_ros_ultralytics_')
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    threads = os.environ.get('OMP_NUM_THREADS')
+    os.environ.update(
+        YOLO_OFFLINE='true',  # no look-ups of DNS servers, no analytics
+        YOLO_AUTOINSTALL='false',  # no pip
+        YOLO_CONFIG_DIR=folder,  # its settings.json, else in ~/.config
+        YOLO_VERBOSE='false',
+        ULTRALYTICS_SAFE_LOAD='true')
+    import ultralytics
+
+    if threads is None:
+        os.environ.pop('OMP_NUM_THREADS', None)
+    ultralytics.settings.update({'sync': False})
+    # It logs to the standard output instead of the loggers of the process.
+    ultralytics_logger = logging.getLogger('ultralytics')
+    ultralytics_logger.handlers.clear()
+    ultralytics_logger.propagate = True
+    ultralytics_logger.setLevel(logging.WARNING)
+    if not _is_restricted(ultralytics):
+        logger.warning('ultralytics %s with torch %s runs code in files of weights: load trusted '
+                       'files only', ultralytics.__version__, torch.__version__)
+    return ultralytics
+
+
+def _is_restricted(ultralytics: Any) -> bool:
+    """Return whether ultralytics reads weights only and refuses code in their files."""
+    import torch
+
+    return (getattr(ultralytics.utils, 'SAFE_LOAD', False)
+            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
+
+
+def resolve_yolo_weights(options: YoloOptions) -> Path:
+    """Return the file or folder that the options name; download the file if necessary.
+
+    Raises
+    ------
+    ModelError
+        When it is missing, damaged or unknown, or the download fails.
+    """
+    file = Path(options.model).expanduser().absolute()
+    if is_export(file):
+        return file
+    if file.exists() or Path(options.model).name != options.model:
+        check_weights_file(file)
+        return file
+    name = options.model if options.model.endswith('.pt') else f'{options.model}.pt'
+    folder = resolve_cache_dir(options.cache_dir) / 'weights'
+    if not _is_restricted(import_ultralytics()):
+        raise ModelError(f'this ultralytics or PyTorch would run code that {name} may hold: '
+                         'update them, or set the model to the path of a file that you trust')
+    if (folder / name).exists():
+        check_weights_file(folder / name)
+        return folder / name
+    from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
+
+    if name not in GITHUB_ASSETS_NAMES:
+        raise ModelError(f"'{options.model}' is neither a file here nor a published YOLO model"
+                         f'{_nearest(name, GITHUB_ASSETS_NAMES)}')
+
+    def fetch() -> Path:
+        # Ultralytics' early versions write to the final path: only a whole file is moved there.
+        with tempfile.TemporaryDirectory(dir=folder) as desk:
+            whole = attempt_download_asset(Path(desk) / name, progress=False)
+            return Path(whole).replace(folder / name)
+
+    return download(name, folder, (
+        f'Without a network: download {name} from https://github.com/ultralytics/assets/releases '
+        'on another machine and set the model to the path of the file'), fetch)
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=4, cutoff=0.5)
+    return f': did you mean {", ".join(near)}?' if near else ''
+
+
+def stride_of(model: Any) -> int:
+    """Return what height and width of an input must be multiples of, as ultralytics has it."""
+    return max(int(model.stride.max()), _LEAST_STRIDE)
+
+
+def is_export(path: Path) -> bool:
+    """Return whether a path is a folder with an OpenVINO export."""
+    return path.is_dir() and any(path.glob('*.xml'))
+
+
+def load_yolo(file: Path) -> Any:
+    """Return ultralytics' detection model of a ``.pt`` file.
+
+    Such a file is a pickle, which can run code. This function reads it in ultralytics' restricted
+    mode (``weights_only=True`` and a list of known classes), which refuses code. An ultralytics
+    without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only a file that
+    the options name by its path is loaded, with a warning to load trusted files only.
+
+    Raises
+    ------
+    ModelError
+        For a file that is damaged or no detection model.
+    """
+    ultralytics = import_ultralytics()
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
+        # Ultralytics rewrites some paths (quotes, yolov5) and requires the suffix.
+        neutral = Path(desk) / 'weights.pt'
+        neutral.symlink_to(file.resolve())
+        try:
+            model = ultralytics.YOLO(neutral)
+        except Exception as error:  # ultralytics has no exceptions of its own
+            reason = first_line(error).removeprefix('ERROR').strip()
+            raise ModelError(f'{file} is no detection model of YOLO: '
+                             f'{reason.replace(str(neutral), "it")}') from error
+    if model.task != 'detect':
+        raise ModelError(f"{file} is a YOLO model for the task '{model.task}': one for 'detect' "
+                         'is needed')
+    return model

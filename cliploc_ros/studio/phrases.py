@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Phrases that describe a landmark best, chosen by CLIP in a thread of its own.
+
+Loading CLIP takes seconds, and reading a vocabulary for the first time up to a minute. The page
+goes on meanwhile. Only the last question counts.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.mapping.labelling import best_phrases
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.phrase_embeddings import phrases_of_classes
+from cliploc_ros.studio.images import Images
+from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.vocabulary.vocabulary import Vocabulary, shipped_phrases
+
+_PHRASES = 5
+# Views in which a landmark without embeddings is looked at.
+_CROPS = 3
+_MOST_KEPT = 1000
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """Which phrases describe a landmark.
+
+    Parameters
+    ----------
+    landmark_id : str
+    landmarks : mapping of str to Landmark
+        Of the whole map.
+    """
+
+    landmark_id: str
+    landmarks: Mapping[str, Landmark]
+
+    @property
+    def landmark(self) -> Landmark:
+        """Return the landmark in question."""
+        return self.landmarks[self.landmark_id]
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Return all classes that the landmark was detected as."""
+        weights = self.landmark.details.class_weights or ()
+        return tuple(dict.fromkeys([self.landmark.class_id, *(name for name, _ in weights)]))
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Return what the answer depends on. Dragging a landmark asks nothing new."""
+        look = self.landmark.look
+        return self.landmark_id, self.class_names, None if look is None else look.key
+
+
+class FoundPhrases(NamedTuple):
+    """The best phrases, the best one first, and what a person should know; '' for nothing."""
+
+    phrases: tuple[str, ...]
+    note: str
+
+
+def _nothing(reason: object) -> FoundPhrases:
+    return FoundPhrases((), f'CLIP offers no phrases: {reason}')
+
+
+_PENDING = FoundPhrases((), 'CLIP looks for phrases; the map offers its own until then')
+
+
+class PhraseFinder:
+    """Answers questions one at a time.
+
+    Parameters
+    ----------
+    clip : ClipOptions
+    vocabulary : Vocabulary
+    recording : Recording, optional
+        Its embeddings or views show what landmarks without a look are.
+    images : Images, optional
+        Of the recording.
+    """
+
+    def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None,
+                 images: Images | None):
+        self._clip, self._vocabulary = clip, vocabulary
+        self._recording, self._images = recording, images
+        self._weights: ClipWeights | None = None
+        self._encoder: ClipEncoder | None = None
+        self._answers: dict[tuple[object, ...], FoundPhrases] = {}
+        self._fault: FoundPhrases | None = None
+        self._wanted: Question | None = None
+        self._condition = threading.Condition()
+        self._listener: Callable[[], None] = lambda: None
+        self._thread: threading.Thread | None = None
+        self._is_closed = False
+
+    def subscribe(self, listener: Callable[[], None]) -> None:
+        """Call a function after each answer."""
+        self._listener = listener
+
+    def answer(self, question: Question) -> FoundPhrases:
+        """Return the answer, or that it is not known yet."""
+        with self._condition:
+            found = self._answers.get(question.key, self._fault)
+            if found is not None:
+                return found
+            if self._wanted is None or self._wanted.key != question.key:
+                self._wanted = question
+                self._condition.notify()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, daemon=True)
+                self._thread.start()
+            return _PENDING
+
+    def close(self) -> None:
+        """Answer nothing more."""
+        with self._condition:
+            self._is_closed = True
+            self._condition.notify()
+
+    # ---- in the thread --------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while (question := self._next()) is not None:
+            try:
+                found = self._find(question)
+            except CliplocError as error:
+                found = _nothing(error)
+            except Exception as error:  # of torch, open_clip: the page shows it and goes on
+                logger.exception('CLIP finds no phrases for %s', question.landmark_id)
+                found = _nothing(f'{type(error).__name__}: {error}')
+            with self._condition:
+                if len(self._answers) >= _MOST_KEPT:
+                    self._answers.clear()
+                self._answers[question.key] = found
+                self._fault = found if self._weights is None else None
+            self._listener()
+
+    def _next(self) -> Question | None:
+        with self._condition:
+            while not self._is_closed and (
+                    self._wanted is None or self._wanted.key in self._answers):
+                self._condition.wait()
+            return None if self._is_closed else self._wanted
+
+    def _find(self, question: Question) -> FoundPhrases:
+        if self._weights is None:
+            self._weights = resolve_clip_weights(self._clip)
+        mean = self._mean(question, self._weights)
+        if mean is None:
+            return _nothing('neither embeddings nor images show all of this landmark')
+        names = question.class_names
+        phrases = phrases_of_classes(
+            self._weights, self._clip,
+            [{name: shipped_phrases(name) for name in names},
+             {name: texts for name, texts in self._vocabulary.added.items() if name in names}])
+        best = best_phrases(mean, [part for name in names for part in phrases[name]])
+        return FoundPhrases(tuple(text for text, _ in best[:_PHRASES]), '')
+
+    def _mean(self, question: Question, weights: ClipWeights) -> NDArray[np.float32] | None:
+        """Return the mean embedding (d,) of a landmark's crops; None where nothing shows it."""
+        look = question.landmark.look
+        if look is not None and look.encoder_key != weights.key:
+            look = None
+        if look is None and self._recording is not None:
+            rows = self._recording.boxes_of(question.landmarks)[question.landmark_id]
+            look = self._recording.look_of(rows, weights.key)
+        if look is not None and len(look.mean) == weights.embed_dim:
+            return look.mean.astype(np.float32)
+        return self._mean_of_crops(question.landmark, weights)
+
+    def _mean_of_crops(self, landmark: Landmark, weights: ClipWeights
+                       ) -> NDArray[np.float32] | None:
+        if self._recording is None or self._images is None:
+            return None
+        rows = []
+        for view, box in self._recording.best_views(landmark)[:_CROPS]:
+            image = self._images.near(float(self._recording.detections.stamps_s[view]))
+            if image is not None:
+                if self._encoder is None:
+                    self._encoder = ClipEncoder(weights, self._clip)
+                rows.append(self._encoder.encode_crops(image, box[None])[0])
+        mean = np.sum(rows, axis=0)
+        length = float(np.linalg.norm(mean))
+        return np.asarray(mean / length, dtype=np.float32) if length > 0.0 else None

@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry between frames, in maps of a simulated walk whose poses have errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from walk import look_at, make_table, see, walk_around
+
+from cliploc_ros.benchmark.pose_errors import (
+    aligned_offsets_m,
+    disturb,
+    draw_errors,
+    with_odometry,
+)
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.joint import State
+from cliploc_ros.mapping.landmarks import landmarks_of_map
+from cliploc_ros.mapping.odometry import link_frames
+from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
+from cliploc_ros.mapping.pose_prior import Prior, pose_bands
+from cliploc_ros.mapping.views import make_views
+
+POSE_ERRORS = PoseErrors(0.05, 1.0, 3.0)
+NOISE = OdometryErrors(0.005, 0.2)
+OPTIONS = MappingOptions(pose_errors=POSE_ERRORS, odometry_errors=NOISE)
+
+
+@pytest.fixture(scope='module')
+def truth():
+    """Few objects and poor boxes: odometry tells more than they do."""
+    return see(make_table(4), walk_around(frames=120), noise_px=6.0, missed=0.3)
+
+
+@pytest.fixture(scope='module')
+def disturbed(truth):
+    return disturb(truth, draw_errors('correlated', truth.stamps_s, POSE_ERRORS,
+                                      np.random.default_rng(1)))
+
+
+@pytest.fixture(scope='module')
+def without(disturbed):
+    return build_map(disturbed, OPTIONS)
+
+
+@pytest.fixture(scope='module')
+def linked(truth, disturbed):
+    return with_odometry(disturbed, truth, np.random.default_rng(2), NOISE)
+
+
+def moved_odometry(detections, change):
+    """Return the detections after a function has changed their odometry in place."""
+    poses = detections.odom_from_camera.copy()
+    change(poses)
+    return replace(detections, odom_from_camera=poses)
+
+
+def slip(poses):
+    poses[60:, :3, 3] += [0.3, 0.2, 0.0]
+
+
+def note_on(built):
+    note, = [one for one in built.report.notes if one.startswith('odometry')]
+    return note
+
+
+def pose_error_m(built, truth):
+    """Return how far the motions over 10 frames are off: root mean square [m]."""
+    one, other = (np.linalg.inv(poses[:-10]) @ poses[10:]
+                  for poses in (built.map_from_camera, truth.map_from_camera))
+    return float(np.sqrt(np.square(one - other)[:, :3, 3].sum(axis=1).mean()))
+
+
+def test_the_gradient_is_that_of_the_cost(linked):
+    few = moved_odometry(linked, slip).select_frames(range(56, 64))
+    views = make_views(few, MappingOptions())
+    steps, _ = link_frames(views, few.odom_from_camera, PoseErrors(0.5, 2.0), OdometryErrors())
+    assert steps.frames.tolist() == list(range(7))
+    landmarks = landmarks_of_map(make_table(4), few.class_names)
+    state = State(views, landmarks, np.zeros((8, 6)))
+
+    def cost(pose_steps):
+        return steps.linearize(state.moved(np.zeros((4, 9)), pose_steps.reshape(8, 6)).views).cost
+
+    expected = [(cost(step) - cost(-step)) / 2e-5 for step in 1e-5 * np.eye(48)]
+    np.testing.assert_allclose(steps.linearize(views).gradient.ravel(), expected, atol=1e-4)
+
+
+def test_bands_are_those_of_the_matrix():
+    rng, frames = np.random.default_rng(0), 5
+    blocks, below = rng.normal(size=(2, frames, 6, 6))
+    blocks += blocks.transpose(0, 2, 1)
+    below[-1] = 0.0
+    prior = Prior.of(np.arange(5.0), POSE_ERRORS)
+    matrix = np.zeros((30, 30))
+    for frame in range(frames):
+        rows = slice(6 * frame, 6 * frame + 6)
+        matrix[rows, rows] = blocks[frame] + np.diag(prior.diagonal[frame])
+        if frame + 1 < frames:
+            matrix[6 * frame + 6:6 * frame + 12, rows] = below[frame] + np.diag(
+                prior.beside[frame])
+    bands = pose_bands(blocks, prior, below)
+    assert bands.shape == (12, 30)
+    for number, band in enumerate(bands):
+        assert band[:30 - number] == pytest.approx(np.diag(matrix, -number))
+        assert (band[30 - number:] == 0.0).all()
+
+
+def test_odometry_betters_poses_and_map(truth, linked, without):
+    built = build_map(linked, OPTIONS)
+    assert note_on(built) == 'odometry joins 119 of 119 pairs of frames'
+    assert pose_error_m(built, truth) < 0.6 * pose_error_m(without, truth)
+    assert (np.median(aligned_offsets_m(built.landmark_map, make_table(4)))
+            < 0.8 * np.median(aligned_offsets_m(without.landmark_map, make_table(4))))
+
+
+def test_a_slip_is_left_out(truth, linked, without):
+    built = build_map(moved_odometry(linked, slip), OPTIONS)
+    assert note_on(built) == ('odometry joins 118 of 119 pairs of frames; it jumps 1 times, first '
+                              'at 11.80 s, which is left out')
+    assert pose_error_m(built, truth) < 0.6 * pose_error_m(without, truth)
+
+
+def test_a_slip_that_the_poses_hide_does_little_harm(truth, linked, without):
+    def slip_a_little(poses):
+        poses[60:, :3, 3] += [0.05, 0.05, 0.0]
+
+    built = build_map(moved_odometry(linked, slip_a_little), OPTIONS)
+    assert note_on(built) == 'odometry joins 119 of 119 pairs of frames'
+    assert pose_error_m(built, truth) < pose_error_m(without, truth)
+
+
+def millimetres(poses):
+    poses[:, :3, 3] *= 1000.0
+
+
+def half_as_far(poses):
+    poses[:, :3, 3] *= 0.5
+
+
+def a_fourth_too_far(poses):
+    poses[:, :3, 3] *= 1.25
+
+
+def standing(poses):
+    poses[:] = np.eye(4)
+
+
+def two_seconds_late(poses):
+    poses[10:] = poses[:-10].copy()
+
+
+def another_camera(poses):
+    poses @= look_at(np.array([1.0, 0.0, 0.8]))
+
+
+def huge(poses):
+    poses[:, :3, 3] *= 1e300
+
+
+@pytest.mark.parametrize('change', [
+    millimetres, half_as_far, a_fourth_too_far, standing, two_seconds_late, another_camera, huge])
+def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
+    built = build_map(moved_odometry(linked, change), OPTIONS)
+    assert 'odometry is left out: it contradicts the poses in ' in note_on(built)
+    assert (built.landmark_map.centers == without.landmark_map.centers).all()
+
+
+def test_frames_without_odometry_are_not_joined(linked, without):
+    def lose(poses):
+        poses[::3] = np.nan
+
+    built = build_map(moved_odometry(linked, lose), OPTIONS)
+    assert note_on(built) == 'odometry joins 40 of 119 pairs of frames'
+
+    def lose_all(poses):
+        poses[:] = np.nan
+
+    built = build_map(moved_odometry(linked, lose_all), OPTIONS)
+    assert note_on(built) == 'odometry is left out: no two successive frames have it'
+    assert (built.landmark_map.centers == without.landmark_map.centers).all()
+
+
+def test_poses_that_are_taken_as_they_are_need_no_odometry(linked):
+    built = build_map(linked)
+    assert note_on(built) == 'odometry is not used: the poses are taken as they are'
+    assert (built.map_from_camera == build_map(linked.select_frames(range(120))).map_from_camera
+            ).all()
+
+
+def test_selected_frames_keep_their_odometry(linked):
+    chosen = linked.select_frames([3, 5])
+    assert (chosen.odom_from_camera == linked.odom_from_camera[[3, 5]]).all()

@@ -1,0 +1,348 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""OpenVINO gives what PyTorch gives, from a cache that may be damaged, full or read-only."""
+
+import gc
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open_clip
+import pytest
+import torch
+import yaml
+from clip_reference import SMALL_CONFIG, Reference
+from disks import small_disk
+
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models import ClipOptions, YoloDetector, YoloOptions
+from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.models.yolo_weights import load_yolo
+
+PROJECT = Path(__file__).resolve().parents[2]
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+rng = np.random.default_rng(2)
+CORNERS = rng.uniform(0, 400, (12, 2))
+BBOXES = np.hstack([CORNERS, CORNERS + rng.uniform(5, 230, (12, 2))])
+
+
+def load(reference, cache, **changes) -> ClipEncoder:
+    options = ClipOptions(**{
+        'model': reference.name, 'pretrained': str(reference.file), 'device': 'cpu',
+        'cache_dir': str(cache), 'inference': 'openvino', 'precision': 'fp32', **changes})
+    return ClipEncoder(resolve_clip_weights(options), options)
+
+
+@pytest.fixture(scope='session')
+def demo_clip() -> Reference:
+    open_clip.add_model_config(ASSETS / 'clip.json')
+    model, _, preprocess = open_clip.create_model_and_transforms(
+        'clip', pretrained=str(ASSETS / 'clip.safetensors'), force_custom_text=True)
+    return Reference('clip', ASSETS / 'clip.safetensors', model.eval(), preprocess, None)
+
+
+@pytest.fixture(scope='session')
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp('cache')
+
+
+@pytest.fixture(scope='session')
+def demo_rgb() -> list[np.ndarray]:
+    files = sorted((ASSETS / 'sequence/rgb').iterdir())[::24]
+    return [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files]
+
+
+@pytest.mark.parametrize('precision', ['fp32', 'auto'])
+@pytest.mark.parametrize('name', ['demo_clip', 'large_clip'])
+def test_embeddings_equal_those_of_open_clip(name, precision, request, cache, image_rgb):
+    reference = request.getfixturevalue(name)
+    encoder = load(reference, cache, precision=precision)
+    assert encoder.inference == 'openvino' and encoder.device == 'cpu'
+    assert encoder.key == load(reference, cache, inference='pytorch').key
+    expected = reference.crops(image_rgb, crop_bounds(BBOXES, 640, 480))
+    crops = encoder.encode_crops(image_rgb, BBOXES)
+    cosine = (crops * expected).sum(axis=1).min()
+    print(f'\n{reference.name}, {precision}: least cosine to open_clip {cosine:.7f}')
+    assert cosine > (0.999999 if precision == 'fp32' else 0.999)
+    assert crops.dtype == np.float32 and crops.shape == expected.shape
+    # the size of a batch has no influence
+    alone = encoder.encode_crops(image_rgb, BBOXES[:1])
+    assert alone[0] @ crops[0] > (0.999999 if precision == 'fp32' else 0.999)
+    assert encoder.encode_crops(image_rgb, BBOXES[:0]).shape == (0, encoder.embed_dim)
+
+
+def test_batches_are_bounded(demo_clip, cache, image_rgb):
+    batched = load(demo_clip, cache, max_batch=5).encode_crops(image_rgb, BBOXES)
+    assert np.allclose(batched, load(demo_clip, cache).encode_crops(image_rgb, BBOXES), atol=1e-5)
+
+
+def test_a_second_start_neither_converts_nor_builds_the_tower_in_pytorch(
+        demo_clip, cache, caplog):
+    load(demo_clip, cache)
+    caplog.clear()
+    gc.collect()
+    kept = {id(thing) for thing in gc.get_objects() if issubclass(type(thing), torch.nn.Parameter)}
+    with caplog.at_level(logging.INFO):
+        encoder = load(demo_clip, cache)
+    made = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.nn.Parameter)
+            and id(thing) not in kept and not thing.is_meta]
+    assert encoder.inference == 'openvino' and made == [] and caplog.text == ''
+
+
+def test_as_many_threads_as_pytorch(demo_clip, cache):
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            compiled = load(demo_clip, cache)._tower._network._compiled
+            assert compiled.get_property('INFERENCE_NUM_THREADS') == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.fixture(scope='module')
+def small_cache(small_clip, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp('small_cache')
+    load(small_clip, folder)
+    return folder
+
+
+def cut_weights(folder):
+    os.truncate(folder / 'network.bin', 1000)
+
+
+def change_weights(folder):
+    with (folder / 'network.bin').open('r+b') as file:
+        file.seek(50_000)
+        file.write(bytes(5_000))
+
+
+def remove_network(folder):
+    (folder / 'network.xml').unlink()
+
+
+def empty_description(folder):
+    (folder / 'about.json').write_text('')
+
+
+def foreign_description(folder):
+    (folder / 'about.json').write_text('{"identity": ["another"]}')
+
+
+@pytest.mark.parametrize('damage', [
+    cut_weights, change_weights, remove_network, empty_description, foreign_description])
+def test_a_damaged_cache_is_made_anew(small_clip, small_cache, tmp_path, image_rgb, caplog,
+                                      damage):
+    shutil.copytree(small_cache, tmp_path, dirs_exist_ok=True)
+    before = load(small_clip, small_cache).encode_crops(image_rgb, BBOXES)
+    folder, = (tmp_path / 'openvino').iterdir()
+    damage(folder)
+    caplog.clear()
+    assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
+    warning, = caplog.records
+    assert 'cannot be used' in warning.getMessage() and str(folder) in warning.getMessage()
+    caplog.clear()
+    assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
+    assert caplog.records == [] and [*(tmp_path / 'openvino').iterdir()] == [folder]
+
+
+def test_other_weights_and_another_architecture_are_converted_again(small_clip, tmp_path):
+    other = tmp_path / 'other.pt'
+    state = {name: tensor.clone() for name, tensor in small_clip.model.state_dict().items()}
+    state['visual.proj'] += 1e-3
+    torch.save(state, other)
+    # the same weights in more heads give other numbers
+    config = SMALL_CONFIG | {'vision_cfg': SMALL_CONFIG['vision_cfg'] | {'head_width': 16}}
+    open_clip.factory._MODEL_CONFIGS['small-heads'] = config
+    load(small_clip, tmp_path)
+    load(small_clip, tmp_path, pretrained=str(other))
+    load(small_clip, tmp_path, model='small-heads')
+    assert len([*(tmp_path / 'openvino').iterdir()]) == 3
+
+
+FULL = f"""
+import json, logging, pathlib, subprocess, sys
+import numpy as np
+from cliploc_ros.models import ClipOptions
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+
+logging.basicConfig(format='%(levelname)s %(message)s')
+config = pathlib.Path(sys.argv[2]).with_suffix('.json')
+config.write_text(json.dumps({SMALL_CONFIG!r}))
+
+def crops(inference):
+    options = ClipOptions(model=str(config), pretrained=sys.argv[2], device='cpu',
+                          cache_dir=sys.argv[1], inference=inference, precision='fp32')
+    encoder = ClipEncoder(resolve_clip_weights(options), options)
+    assert encoder.inference == inference
+    image = np.random.default_rng(0).integers(0, 255, (99, 99, 3), dtype=np.uint8)
+    return encoder.encode_crops(image, np.array([[0.0, 0, 90, 90], [10, 20, 50, 70]]))
+
+expected = crops('pytorch')
+for _ in range(2):
+    assert np.abs(crops('openvino') - expected).max() < 1e-5
+    assert not any(pathlib.Path(sys.argv[1]).rglob('network.*'))
+    subprocess.run(['mount', '-o', 'remount,ro', sys.argv[1]], check=True)
+"""
+
+
+def test_on_a_full_disk_and_a_read_only_one_the_network_is_converted_in_memory(
+        small_clip, tmp_path):
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    weights = tmp_path / small_clip.file.name
+    weights.symlink_to(small_clip.file)
+    done = subprocess.run(
+        [*small_disk(disk), sys.executable, '-c', FULL, str(disk), str(weights)], cwd=PROJECT,
+        capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    full, read_only = (line for line in done.stderr.splitlines() if line.startswith('WARNING'))
+    for line in (full, read_only):
+        assert 'is not cached' in line and str(disk) in line and 'make room' in line
+    assert 'Read-only file system' in read_only
+
+
+MISSING = """
+import logging, sys
+sys.modules['openvino'] = None  # as where it is not installed
+logging.basicConfig(level=logging.INFO, format='%(levelname)s %(message)s')
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.models import YoloDetector, YoloOptions
+for _ in range(2):
+    assert YoloDetector(YoloOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
+try:
+    YoloDetector(YoloOptions(sys.argv[1], device='cpu', inference='openvino'))
+except OptionsError as error:
+    print(error)
+"""
+
+
+def test_without_openvino_pytorch_runs_and_one_line_says_so():
+    done = subprocess.run([sys.executable, '-c', MISSING, str(ASSETS / 'yolo.pt')], cwd=PROJECT,
+                          capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    line, = (line for line in done.stderr.splitlines() if 'OpenVINO' in line)
+    assert line.startswith('INFO PyTorch runs the networks') and 'pip install openvino' in line
+    assert 'is not installed' in done.stdout
+
+
+@pytest.mark.parametrize('change', [
+    {'inference': 'tensorrt'}, {'inference': 'openvino', 'precision': 'fp16'}])
+def test_an_impossible_inference_is_refused(change):
+    with pytest.raises(OptionsError, match='inference'):
+        YoloDetector(YoloOptions(str(ASSETS / 'yolo.pt'), device='cpu', **change))
+
+
+def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tmp_path, caplog):
+    state = {name: torch.full_like(tensor, float('nan'))
+             for name, tensor in small_clip.model.state_dict().items()}
+    torch.save(state, tmp_path / 'weights.pt')
+    changes = {'pretrained': str(tmp_path / 'weights.pt')}
+    with pytest.raises(ModelError, match='OpenVINO does not run small-clip as'):
+        load(small_clip, tmp_path, **changes)
+    with pytest.raises(ModelError, match='not finite'):  # says PyTorch
+        load(small_clip, tmp_path, inference='auto', **changes)
+    assert 'PyTorch runs it' in caplog.text
+    assert not any((tmp_path / 'openvino').iterdir())
+
+
+def test_labels_and_crops_are_comparable(demo_clip, cache, demo_rgb):
+    options = ClipOptions(model=str(ASSETS / 'clip.json'), pretrained=str(demo_clip.file),
+                          device='cpu', cache_dir=str(cache), precision='fp32')
+    loaded = load_encoder(options, ['a red mug', 'a keyboard'])
+    assert loaded.encoder.inference == 'openvino'
+    similarities = loaded.encoder.encode_crops(demo_rgb[0], BBOXES) @ np.asarray(
+        loaded.label_embeddings).T
+    expected = load(demo_clip, cache, inference='pytorch').encode_crops(
+        demo_rgb[0], BBOXES) @ np.asarray(loaded.label_embeddings).T
+    assert np.allclose(similarities, expected, atol=1e-5)
+
+
+def compare(first: YoloDetector, second: YoloDetector, images: list[np.ndarray]) -> float:
+    """Return the largest difference of two detectors' boxes [px]."""
+    differences = [0.0]
+    for image in images:
+        found, again = first.detect(image), second.detect(image)
+        assert found.class_ids == again.class_ids
+        assert np.allclose(found.scores, again.scores, atol=1e-3)
+        differences += np.abs(found.bboxes_xyxy - again.bboxes_xyxy).ravel().tolist()
+    assert len(differences) > 4 * 20
+    return max(differences)
+
+
+def detector(model: object, cache: Path, **changes) -> YoloDetector:
+    return YoloDetector(YoloOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
+
+
+@pytest.mark.parametrize('imgsz', [640, 300])
+def test_boxes_in_the_demo_equal_those_of_pytorch(cache, demo_rgb, imgsz):
+    openvino, pytorch = (detector(ASSETS / 'yolo.pt', cache, inference=inference, imgsz=imgsz)
+                         for inference in ('auto', 'pytorch'))
+    assert (openvino.inference, pytorch.inference) == ('openvino', 'pytorch')
+    assert openvino.class_names == pytorch.class_names
+    # images of several sizes, one after another
+    images = [*demo_rgb, *(cv2.resize(image, (400, 500)) for image in demo_rgb[:2])]
+    assert compare(openvino, pytorch, images) < 0.5
+
+
+def test_boxes_in_real_images_equal_those_of_pytorch(shared_data, cache):
+    weights = shared_data / 'weights/yolov8n_coco.pt'
+    images = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+              for file in sorted((shared_data / 'tum_fr3_office/rgb').iterdir())[::3]]
+    largest = compare(detector(weights, cache), detector(weights, cache, inference='pytorch'),
+                      images)
+    print(f'\nlargest difference of a box: {largest:.5f} px')
+    assert largest < 0.5
+
+
+@pytest.fixture(scope='module')
+def export(tmp_path_factory) -> Path:
+    """Return what ``yolo export format=openvino dynamic=True`` makes."""
+    folder = tmp_path_factory.mktemp('export')
+    (folder / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
+    load_yolo(ASSETS / 'yolo.pt')
+    from ultralytics import YOLO
+
+    return Path(YOLO(folder / 'yolo.pt').export(format='openvino', dynamic=True, verbose=False))
+
+
+def test_an_export_of_ultralytics(export, cache, demo_rgb):
+    assert export.name == 'yolo_openvino_model'
+    exported = detector(export, cache)
+    assert compare(exported, detector(ASSETS / 'yolo.pt', cache, inference='pytorch'),
+                   demo_rgb) < 0.5
+    with pytest.raises(OptionsError, match='needs OpenVINO'):
+        detector(export, cache, inference='pytorch')
+
+
+@pytest.mark.parametrize(('field', 'value', 'reason'), [
+    ('task', 'segment', 'task'), ('names', None, 'names'), ('names', {3: 'mug'}, 'names'),
+    ('stride', 'x', 'stride'), ('stride', -32, 'stride'), ('names', {0: 'mug'}, 'of 1 classes')])
+def test_an_export_with_a_wrong_field(export, tmp_path, field, value, reason):
+    for file in export.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    metadata = yaml.safe_load((export / 'metadata.yaml').read_text()) | {field: value}
+    (tmp_path / 'metadata.yaml').unlink()
+    (tmp_path / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
+    with pytest.raises(ModelError, match=reason) as caught:
+        detector(tmp_path, tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_damaged_exports(export, tmp_path):
+    with pytest.raises(ModelError, match='is a folder'):
+        detector(tmp_path, tmp_path)
+    (tmp_path / 'model.xml').write_text('no network')
+    with pytest.raises(ModelError, match=r'metadata\.yaml cannot be read'):
+        detector(tmp_path, tmp_path)
+    (tmp_path / 'metadata.yaml').write_text((export / 'metadata.yaml').read_text())
+    with pytest.raises(ModelError, match=r'model\.xml cannot be run by OpenVINO'):
+        detector(tmp_path, tmp_path)

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What `prepare` makes is all that the nodes need on a machine without a network."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from processes import PROJECT
+
+from cliploc_ros.demo import ASSETS
+
+# A network of its own: the loopback interface and no route.
+OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up && exec "$@"',
+           'sh')
+ROBOT = f"""\
+detector:
+  ros__parameters:
+    model: {ASSETS}/yolo.pt
+relocalizer:
+  ros__parameters:
+    map_file: {ASSETS}/map.yaml
+    clip_model: {ASSETS}/clip.json
+    clip_pretrained: {ASSETS}/clip.safetensors
+    require_localizer: false
+"""
+
+
+@pytest.fixture(scope='module')
+def offline():
+    tried = subprocess.run([*OFFLINE, 'true'], capture_output=True, text=True, check=False)
+    if tried.returncode:
+        pytest.skip(f'no network namespaces here: {tried.stderr.strip()}')
+    return OFFLINE
+
+
+@pytest.fixture(scope='module')
+def robot(tmp_path_factory):
+    file = tmp_path_factory.mktemp('robot') / 'robot.yaml'
+    file.write_text(ROBOT)
+    return file
+
+
+def prepare(*arguments, within=(), **environment):
+    variables = {name: value for name, value in os.environ.items() if name != 'NUMBA_CACHE_DIR'}
+    return subprocess.run(
+        [*within, sys.executable, '-m', 'cliploc_ros.cli.prepare', *map(str, arguments)],
+        cwd=PROJECT, capture_output=True, text=True, timeout=300, check=False,
+        env=variables | environment)
+
+
+@pytest.fixture(scope='module')
+def prepared(robot, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('prepared') / 'carry'
+    done = prepare('--params-file', robot, '--cache-dir', folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def content(folder):
+    return sorted(str(file.relative_to(folder)) for file in folder.rglob('*'))
+
+
+def test_prepare_shows_progress_and_costs(prepared):
+    folder, output = prepared
+    for text in ('==> detector: weights and network', '==> relocalizer: map', 'done after',
+                 'what a request costs here', 'the verdict on this picture: accepted',
+                 'need neither network nor compiler', f'carry {folder}'):
+        assert text in output
+    stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
+    assert stages[-4:] == ['detection', 'decoding', 'CLIP', 'search']
+    for name in ('yolo.pt', 'clip.json', 'clip.safetensors', 'map.yaml'):
+        assert f'carry as well, for a parameter names it: {Path(ASSETS) / name}' in output
+
+
+def test_the_folder_is_all_that_the_nodes_need_without_a_network(
+        prepared, robot, offline, tmp_path):
+    carried = Path(shutil.copytree(prepared[0], tmp_path / 'carried'))
+    before = content(carried)
+    assert any('kernels/' in name for name in before)
+    assert any('labels/' in name for name in before)
+    variables = {name: value for name, value in os.environ.items()
+                 if name not in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME')}
+    done = subprocess.run(
+        [*offline, sys.executable, str(Path(__file__).with_name('offline.py')), str(tmp_path),
+         '--ros-args', '--params-file', str(robot), '-p', f'cache_dir:={carried}'],
+        env=variables | {'PYTHONPATH': str(PROJECT), 'HOME': str(tmp_path / 'home'),
+                         'ROS_LOG_DIR': str(tmp_path)},
+        capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('True accepted: x '), done.stdout
+    log = (tmp_path / 'relocalizer.log').read_text()
+    assert 'labels cached' in log and 'compiling' not in log
+    assert content(carried) == before, 'a node had to compute or fetch what the folder lacked'
+
+
+@pytest.mark.parametrize(('old', 'new', 'named'), [
+    (f'{ASSETS}/yolo.pt', 'yolov8n.pt', 'yolov8n.pt'),
+    (f'{ASSETS}/clip.json\n    clip_pretrained: {ASSETS}/clip.safetensors',
+     'ViT-B-32\n    clip_pretrained: openai', "the weights 'openai' of CLIP model 'ViT-B-32'")])
+def test_missing_weights_are_named_with_the_remedy(offline, tmp_path, old, new, named):
+    assert old in ROBOT
+    robot = tmp_path / 'robot.yaml'
+    robot.write_text(ROBOT.replace(old, new))
+    done = prepare('--params-file', robot, '--cache-dir', tmp_path / 'new', within=offline)
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    (error,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
+    assert f'cannot download {named}' in error and 'Without a network' in error
+    assert 'prepare --cache-dir' in error
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('relocalizer: [', 'not valid YAML'),
+    ('relocalizer:\n  ros__parameters:\n    k: -3\n', 'k: -3 must be 1 to 1000'),
+    ('relocalizer:\n  ros__parameters:\n    cache_dir: /elsewhere\n', 'remove it there')])
+def test_bad_parameters_are_named(tmp_path, text, message):
+    file = tmp_path / 'bad.yaml'
+    file.write_text(text)
+    done = prepare('--params-file', file, '--cache-dir', tmp_path / 'new', '--without-detector')
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert done.stderr.count('error:') == 1 and message in done.stderr

@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The studio's live view: real nodes, and the page in a real browser."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from browser import Person, running_chromium
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from processes import PROJECT, wait_for
+from tester import RELIABLE, make_frame
+
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import open_images, views_of_folder
+from cliploc_ros.studio.live import LiveError, follow_relocalizer
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+
+
+def in_a_browser(test):
+    return pytest.mark.clock(pytest.mark.needs('viser', 'playwright', 'chromium')(test))
+
+
+@pytest.fixture
+def live(ros):
+    with follow_relocalizer('relocalizer') as live:
+        yield live
+
+
+@pytest.fixture
+def person(live, tmp_path):
+    """A person at the page of a studio with the demo's map, who opened the tab of the robot."""
+    from cliploc_ros.studio.server import serve_studio
+
+    path = tmp_path / 'map.yaml'
+    shutil.copy(ASSETS / 'map.yaml', path)
+    folder = ASSETS / 'sequence'
+    studio = Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+    with (running_chromium() as chromium,
+          serve_studio(studio, '127.0.0.1', 0, live) as (url, _)):
+        person = Person(chromium, url)
+        person.page.get_by_role('tab', name='Robot').click()
+        yield person
+    studio.document.close()
+
+
+@contextmanager
+def in_a_thread(action):
+    """Do something in a thread; yield the list that its result or its error comes into."""
+    outcome = []
+
+    def run():
+        try:
+            outcome.append(action())
+        except LiveError as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield outcome
+    thread.join(60.0)
+
+
+@in_a_browser
+def test_the_robot_relocalizes_and_the_map_shows_where(person, live, tmp_path, start,
+                                                       monkeypatch):
+    walk = tmp_path / 'walk'
+    monkeypatch.setattr('sys.argv', ['tum_to_bag', str(ASSETS / 'sequence'), str(walk)])
+    assert tum_to_bag() == 0
+    start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
+        'ready after')
+    start('nodes.relocalizer', parameters={
+        'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid', 'require_localizer': False,
+        'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
+        'cache_dir': tmp_path}).wait_for_output('ready after')
+    start('cli.replay', walk, '--loop', '--rate', '0.5')
+    person.page.get_by_text('landmarks in frame').wait_for()
+    person.page.get_by_text('which is not the map of this studio').wait_for()
+    while not live.state.is_current:  # single frames are refused
+        count = person.page.get_by_text('last answer').count()
+        person.click('Relocalize the robot')
+        wait_for(lambda: live.state.verdict and not live.state.is_busy, 'an answer')
+        assert count <= 1
+    wait_for(lambda: live.state.pose is not None, 'the pose')
+    truth = read_tum(ASSETS / 'sequence').trajectory.positions_xyz
+    position = live.state.pose.map_from_body[:3, 3]
+    assert np.linalg.norm(truth - position, axis=1).min() < 0.5
+    person.click('Look at its pose')
+    person.page.get_by_text('pose of the camera').wait_for()
+    person.picture('live')
+    person.click('Let it reload its map')
+    person.page.get_by_text('loaded: 60 landmarks').wait_for()
+
+
+@in_a_browser
+def test_the_page_without_a_relocalizer_and_with_one_that_dies(person, own_relocalizer):
+    person.click('Relocalize the robot')
+    person.page.get_by_text('no relocalizer found at /relocalizer').wait_for()
+    process = own_relocalizer(timeout_s=60.0)
+    person.page.get_by_text('12 landmarks in frame').wait_for()
+    person.click('Relocalize the robot')
+    person.page.get_by_text('waiting for its answer').wait_for()
+    person.find('mug_2')
+    person.page.get_by_text('mug_2').first.wait_for()  # the page works on
+    process.stop(signal.SIGKILL)
+    person.page.get_by_text('see whether it still runs').wait_for()
+    person.page.get_by_text('nothing heard').wait_for()
+    person.picture('live_dead')
+
+
+def test_without_a_relocalizer(live):
+    for request in (live.relocalize, live.reload_map):
+        with pytest.raises(LiveError, match='no relocalizer found at /relocalizer: start it'):
+            request()
+
+
+def test_a_relocalizer_of_another_name_is_told(own_relocalizer):
+    own_relocalizer()
+    with follow_relocalizer('/robot_2/relocalizer') as live:
+        wait_for(lambda: '--relocalizer /relocalizer' in live._absent(), 'discovery')
+        with pytest.raises(LiveError, match='--relocalizer /relocalizer would find another'):
+            live.relocalize()
+
+
+def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
+    own_relocalizer()
+    wait_for(lambda: '12 landmarks' in live.state.map_text, 'diagnostics')
+    assert live.state.is_heard and live.state.base_frame == ''
+    with in_a_thread(live.relocalize) as outcome:
+        wait_for(lambda: live.state.is_busy, 'the request')
+        with pytest.raises(LiveError, match='a request waits'):
+            live.relocalize()
+        tester.feed_until(lambda: outcome, make_frame(stamp_s=31.5))
+    assert outcome[0].startswith('accepted: x 0.3')
+    wait_for(lambda: live.state.pose is not None and live.state.is_current, 'the pose')
+    assert live.state.pose.frame_id == 'map' and live.state.pose.stamp_s == 31.5
+    assert np.linalg.eigvalsh(live.state.pose.covariance).min() > 0
+    assert live.reload_map().startswith('loaded: 12 landmarks')
+
+
+def test_invalid_poses_are_left_out(live, tester):
+    publisher = tester.create_publisher(PoseWithCovarianceStamped, 'relocalizer/pose', RELIABLE)
+    msg = PoseWithCovarianceStamped()
+    msg.header.frame_id = 'map'
+    msg.pose.pose.orientation.w = 1.0
+    publisher_matched = lambda: publisher.get_subscription_count() >= 2  # noqa: E731
+    tester.wait(publisher_matched, 'discovery')
+    for change in ('position.x', 'orientation.w'):
+        part, name = change.split('.')
+        old = getattr(getattr(msg.pose.pose, part), name)
+        setattr(getattr(msg.pose.pose, part), name, float('nan'))
+        publisher.publish(msg)
+        setattr(getattr(msg.pose.pose, part), name, old)
+    msg.pose.pose.position.y = 2.5
+    publisher.publish(msg)
+    wait_for(lambda: live.state.pose is not None, 'the valid pose')
+    assert live.state.pose.map_from_body[1, 3] == 2.5
+    tester.destroy_publisher(publisher)
+
+
+def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relocalizer, tester):
+    for number, text in ((signal.SIGINT, None), (signal.SIGKILL, 'has not reported')):
+        process = own_relocalizer(timeout_s=60.0)
+        wait_for(live._relocalize.service_is_ready, 'the service')
+        with in_a_thread(live.relocalize) as outcome:
+            wait_for(lambda: live.state.is_busy, 'the request')
+            tester.wait(lambda: tester.listened_to() > 0, 'the request to arrive')
+            process.stop(number)
+        assert isinstance(outcome[0], LiveError)
+        assert text is None or text in str(outcome[0])
+    own_relocalizer()
+    with in_a_thread(live.relocalize) as outcome:
+        tester.feed_until(lambda: outcome, make_frame())
+    assert str(outcome[0]).startswith('accepted')
+
+
+def test_the_studio_ends_while_a_request_waits(own_relocalizer):
+    own_relocalizer(timeout_s=60.0)
+    with follow_relocalizer('relocalizer') as live:
+        wait_for(live._relocalize.service_is_ready, 'the service')
+        with in_a_thread(live.relocalize) as outcome:
+            wait_for(lambda: live.state.is_busy, 'the request')
+            live.close()
+    assert 'the studio ends' in str(outcome[0])
+
+
+@pytest.mark.parametrize('name', ['two words', '1st', 'a//b', ''])
+def test_names_that_are_none(name):
+    with pytest.raises(OptionsError, match='--ros'), follow_relocalizer(name):
+        pass
+
+
+@pytest.mark.needs('viser')
+def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_path):
+    own_relocalizer()
+    process = start('cli.studio', tmp_path / 'map.yaml', '--ros', '--no-browser', '--port', '0')
+    process.wait_for_output('studio: http')
+    code, seconds = process.stop(signal.SIGINT)
+    assert code == 130 and seconds < 10.0
+    assert 'Traceback' not in process.output() and 'error' not in process.output()
+
+
+@pytest.mark.needs('viser')
+def test_without_ros_the_studio_runs_and_says_what_is_missing(tmp_path):
+    """Its core imports no ROS; --ros names what to source."""
+    code = ('import sys\nsys.modules["rclpy"] = None\n'
+            'import cliploc_ros.studio.server\n'
+            'assert not [name for name in sys.modules if name.endswith("_msgs")]\n'
+            'from cliploc_ros.cli.studio import main\n'
+            f'sys.exit(main([{str(tmp_path / "map.yaml")!r}, "--ros", "--no-browser"]))')
+    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, capture_output=True,
+                          text=True, timeout=120)
+    assert done.returncode == 1 and done.stdout == ''
+    assert done.stderr.startswith('error: --ros needs ROS') and 'setup.bash' in done.stderr

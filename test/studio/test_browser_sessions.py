@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keys, files that change, tokens, hostile maps and lost connections, in a real browser."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from browser import Person, wait_for
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.mapping.checking.detector_model import guess_detector
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
+
+PROJECT = Path(__file__).parents[2]
+
+
+def with_simulated_boxes(detections, landmark_map):
+    """Return views with the boxes that a detector might find in them."""
+    model, rng = guess_detector(landmark_map, MappingOptions()), np.random.default_rng(0)
+    names = tuple(sorted(set(landmark_map.class_ids)))
+    found = [model.detect(pose, rng)[0] for pose in detections.map_from_camera]
+    return PosedDetections(
+        detections.camera, detections.map_from_camera, detections.stamps_s,
+        np.cumsum([0, *(len(one) for one in found)]),
+        np.concatenate([one.bboxes_xyxy for one in found]), names,
+        np.array([names.index(name) for one in found for name in one.class_ids]),
+        np.concatenate([one.scores for one in found]))
+
+
+def test_the_worst_landmarks_by_keys(person, studio):
+    """N, A and Delete walk through the table; a person who types a label presses them, too."""
+    document, page = studio.document, person.page
+    studio.recording = Recording(with_simulated_boxes(studio.recording.detections,
+                                                      document.to_map()))
+    document.apply(edits.move(document.landmarks, 'mug_2',
+                              document.landmarks['mug_2'].center + np.array([0.0, 0.5, 0.0])))
+    person.click('Check against the recording')
+    page.get_by_text(re.compile('checked 60 landmarks')).wait_for()
+    worst = [row.landmark_id for row in studio.rows()]
+    assert 'mug_2' in worst[:5]
+    for count in (1, 2):
+        page.keyboard.press('n')
+        wait_for(lambda count=count: document.selection == (worst[count - 1],), 'N')
+    person.picture('worst')
+    page.keyboard.press('a')
+    wait_for(lambda: worst[1] in studio.accepted, 'A')
+    wait_for(lambda: document.selection == (worst[2],), 'the next one')
+    camera = next(iter(studio.server.get_clients().values())).camera
+    wait_for(lambda: np.allclose(camera.look_at, document.landmarks[worst[2]].center, atol=0.01),
+             'the camera to orbit it')
+    label = person.field('Label')
+    label.fill('')
+    label.press_sequentially('a new can', delay=20)
+    label.press('Delete')
+    wait_for(lambda: document.landmarks[worst[2]].label == 'a new can', 'the label')
+    assert document.selection == (worst[2],) and len(document.landmarks) == 60
+    label.blur()
+    page.keyboard.press('Delete')
+    wait_for(lambda: worst[2] not in document.landmarks, 'Delete')
+    page.keyboard.press('n')
+    wait_for(lambda: document.selection == (worst[3],), 'N after Delete')
+    page.keyboard.press('Control+z')
+    wait_for(lambda: worst[2] in document.landmarks, 'undo')
+
+
+def test_another_program_changes_the_file(person, studio, path):
+    """Saving asks; overwriting keeps this map, reloading takes the other one; undo takes back."""
+    document, page = studio.document, person.page
+    document.apply(edits.relabel(document.landmarks, ['mug_2'], 'mine'))
+    theirs = path.read_text().replace('a green mug with brown dots', 'theirs')
+    for button, label in (('Overwrite it', 'mine'), ('Reload it', 'theirs')):
+        path.write_text(theirs)
+        person.click('Save')
+        page.get_by_text('another program changed').first.wait_for()
+        assert path.read_text() == theirs
+        person.picture(f'conflict_{label}')
+        person.click(re.compile(f'^{button}'))
+        wait_for(lambda label=label: document.landmarks['mug_2'].label == label
+                 and document.is_saved, button)
+        page.get_by_role('button', name=button).wait_for(state='hidden')
+        assert LandmarkMap.from_file(path).labels[1] == label
+    person.click(re.compile('^Undo'))
+    wait_for(lambda: document.landmarks['mug_2'].label == 'mine', 'undo')
+
+
+def test_a_token_opens_the_page_from_elsewhere(chromium, path):
+    from cliploc_ros.studio.server import serve_studio
+
+    document = Document(path)
+    with serve_studio(Studio(document), '0.0.0.0', 0) as (url, _):
+        url = url.replace('0.0.0.0', '127.0.0.1')
+        base, token = url.rstrip('/').rsplit('/', 1)
+        page = chromium.new_page()
+        for wrong in (base, f'{base}/{token[:-1]}x/', f'{base}/{"x" * 1000}/'):
+            answer = page.goto(wrong)
+            assert answer.status >= 400 and page.locator('canvas').count() == 0
+        page.close()
+        person = Person(chromium, url)
+        person.click(re.compile('^mug_1 '))
+        wait_for(lambda: document.selection == ('mug_1',), 'the selection')
+        person.page.close()
+    document.close()
+
+
+def test_a_hostile_map_is_shown_as_text(chromium, path):
+    """Ids, labels, classes, unknown fields and the coordinate frame hold HTML and long texts."""
+    from cliploc_ros.studio.server import serve_studio
+
+    # an id holds no dots
+    attack = '<img src=x onerror="self[`hacked`]=1"><script>self[`hacked`]=1</script>'
+    tree = yaml.safe_load(path.read_text())
+    one = tree['/**']['ros__parameters']['map']
+    one['frame_id'] = f'map{attack}'
+    landmarks = one['landmarks']
+    landmarks[attack] = {**landmarks.pop('mug_1'), 'label': attack, 'class_id': attack}
+    landmarks['long'] = {**landmarks.pop('mug_2'), 'label': 'long ' * 199, 'class_id': 'c' * 999,
+                         attack: attack}
+    landmarks['i' * 100_000] = landmarks.pop('can_1')
+    path.write_text(yaml.safe_dump(tree))
+    studio = Studio(Document(path))
+    with serve_studio(studio, '127.0.0.1', 0) as (url, _):
+        person = Person(chromium, url)
+        for text in ('<img', 'long', 'iiiiiiii'):
+            person.find(text)
+            person.click(re.compile(f'^{text}'))
+            wait_for(lambda text=text: studio.document.selection
+                     and studio.document.selection[0].startswith(text), text)
+        person.find('long')
+        person.click(re.compile('^long'))
+        wait_for(lambda: studio.document.selection == ('long',), 'the long label')
+        person.type('Label', 'x' * 100_000)
+        person.page.get_by_text('longer than 1000 characters').wait_for()
+        person.type('Label', 'short')
+        wait_for(lambda: studio.document.landmarks['long'].label == 'short', 'the label')
+        person.picture('hostile')
+        assert person.page.evaluate('window.hacked') is None
+        assert person.page.locator('img[src=x]').count() == 0
+        person.page.close()
+    studio.document.close()
+
+
+def test_a_killed_studio_comes_back_with_the_edits(chromium, path, tmp_path):
+    """The page that stays open connects to the studio that starts again."""
+    def start():
+        log = tmp_path / 'studio.log'
+        with log.open('w') as output:
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'cliploc_ros.cli.studio', path, '--no-browser', '--port',
+                 str(port)], stdout=output, stderr=subprocess.STDOUT, cwd=PROJECT)
+        wait_for(lambda: 'studio: http' in log.read_text() or process.poll() is not None,
+                 'the studio')
+        return process, re.search(r'studio: (\S+)', log.read_text())[1]
+
+    port = 8100 + os.getpid() % 800
+    process, url = start()
+    try:
+        port = int(url.rstrip('/').rsplit(':', 1)[1])
+        person = Person(chromium, url)
+        person.find('mug_2')
+        person.click(re.compile('^mug_2 '))
+        person.type('Label', 'typed before the kill')
+        person.page.get_by_text('unsaved edits').wait_for()
+        process.kill()
+        process.wait()
+        person.page.get_by_text('Connecting').first.wait_for()
+        process, url = start()
+        person.page.get_by_text('restored 1 edits').wait_for()
+        person.page.get_by_text('typed before the kill').first.wait_for()
+        person.click('Save')
+        wait_for(lambda: 'typed before the kill' in path.read_text(), 'saving')
+        person.page.close()
+        os.kill(process.pid, signal.SIGINT)
+        assert process.wait(20) == 130
+    finally:
+        process.kill()

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Coverage and look-alike places of the studio, without a browser."""
+
+import re
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+from two_rooms import write_two_rooms
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.errors import MapError
+from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.changes import EditError
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.places import PlacesSearch, find_places
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+
+@pytest.fixture
+def studio(tmp_path):
+    write_two_rooms(tmp_path / 'map.yaml')
+    studio = Studio(Document(tmp_path / 'map.yaml'))
+    yield studio
+    studio.document.close()
+
+
+def silent(share):
+    pass
+
+
+def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
+    document = studio.document
+    before = find_places(document.landmarks, None, None, silent)
+    assert len(before.look_alikes) == 1 and len(before.look_alikes[0].matched) == 5
+    assert before.figures['pairs of places that look alike'] == '1'
+    second_room = [key for key, one in document.landmarks.items() if one.center[0] > 3.5]
+    document.apply(edits.move(document.landmarks, second_room[1], [8.6, 1.3, 0.2]))
+    document.apply(edits.move(document.landmarks, second_room[2], [6.6, -0.3, 0.9]))
+    after = find_places(document.landmarks, None, before, silent)
+    assert not after.look_alikes
+    assert np.array_equal(after.grid.positions, before.grid.positions)
+    lines = after.lines(before)
+    assert 'pairs of places that look alike: 0 (was 1)' in lines
+    assert any(re.match(r'views accepted: \d+ of \d+ \(was \d+ of \d+\)', line)
+               for line in lines)
+    again = find_places(document.landmarks, None, after, silent)
+    assert again.figures == after.figures, 'equal maps, equal figures'
+
+
+def test_a_map_that_grew_gets_other_positions(studio):
+    document = studio.document
+    before = find_places(document.landmarks, None, None, silent, limit_s=0.0)
+    document.apply(edits.move(document.landmarks, 'cup_0', [-9.0, 0.0, 0.4]))
+    document.apply(edits.move(document.landmarks, 'book_1', [-9.0, 1.0, 0.4]))
+    after = find_places(document.landmarks, None, before, silent, limit_s=0.0)
+    assert after.grid.positions[:, 0].min() < before.grid.positions[:, 0].min() - 1.0
+
+
+def test_the_time_is_bounded(studio):
+    places = find_places(studio.document.landmarks, None, None, silent, limit_s=0.0)
+    assert len(places.check.positions) == 1 < len(places.grid.positions)
+    assert len(places.check.trials) == places.check.headings
+    assert any(line.startswith('time ran out') for line in places.lines(None))
+
+
+def test_a_search_runs_beside_edits_and_is_stopped(studio):
+    """The first share that is told comes from the search's thread; then it waits for the test."""
+    changed = threading.Event()
+    search = PlacesSearch(studio, changed.set)
+    search.start()
+    with pytest.raises(EditError, match='under way'):
+        search.start()
+    document = studio.document
+    document.apply(edits.relabel(document.landmarks, ['cup_0'], 'a red cup'))
+    search.stop()
+    assert not search.is_running
+    assert search.last is None and search.failure == 'stopped'
+    search.start()
+    search._thread.join()
+    assert search.failure == '' and not search.is_stale()
+    document.apply(edits.delete(document.landmarks, ['cup_0']))
+    assert search.is_stale()
+    document.undo()
+    assert not search.is_stale(), 'the map is as it was'
+    document.apply(edits.lock(document.landmarks, ['cup_0']))
+    assert not search.is_stale(), 'a lock changes nothing'
+
+
+def test_without_landmarks(tmp_path):
+    studio = Studio(Document(tmp_path / 'none.yaml'))
+    with pytest.raises(EditError, match='empty'):
+        PlacesSearch(studio, lambda: None).start()
+    with pytest.raises(MapError):
+        find_places({}, None, None, silent)
+    studio.document.close()
+
+
+@pytest.mark.needs('viser')
+def test_colours_of_positions():
+    from cliploc_ros.studio.places_panel import tile_colors
+
+    check = GridCheck(np.zeros((4, 3)), np.ones(4, dtype=bool), np.array([4, 0, 0, 3]),
+                      np.array([0, 0, 0, 1]), np.array([[5.0] * 4, [5.0] * 4, [1.0] * 4,
+                                                        [5.0] * 4]), 0.5, ())
+    assert tile_colors(check).tolist() == [[0, 62, 107], [230, 159, 0], [120, 120, 120],
+                                           [213, 94, 0]]
+
+
+def test_a_large_map_takes_no_longer_than_it_may(tmp_path):
+    """Prints the processor time: 5,000 landmarks in a hall of 60 m."""
+    rng, count = np.random.default_rng(0), 5000
+    words = rng.choice(['red', 'blue', 'green', 'small'], count)
+    classes = tuple(rng.choice(['cup', 'book', 'tv', 'plant'], count))
+    write_map(tmp_path / 'map.yaml', LandmarkMap(
+        'map', tuple(f'id_{row}' for row in range(count)),
+        tuple(f'a {word} {name}' for word, name in zip(words, classes, strict=True)), classes,
+        rng.uniform(-30.0, 30.0, (count, 3)) * (1.0, 1.0, 0.05), np.full((count, 3), 0.1),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    document = Document(tmp_path / 'map.yaml')
+    begin_s, limit_s = time.process_time(), 2.0
+    places = find_places(document.landmarks, None, None, silent, limit_s)
+    tried = len(places.check.positions)
+    print(f'\n{count} landmarks: {tried} of {len(places.grid.positions)} positions in '
+          f'{limit_s:g} s, {time.process_time() - begin_s:.1f} s of processor time with '
+          'look-alikes and all')
+    assert 0 < tried < len(places.grid.positions)
+    document.close()
+
+
+def test_the_shared_office(shared_data, tmp_path):
+    """Prints the processor time, and what the figures are."""
+    folder = shared_data / 'tum_fr3_office'
+    shutil.copy(folder / 'map.yaml', tmp_path)
+    detections = load_observations(folder / 'observations.npz')
+    recording = Recording(detections.select_frames(range(0, len(detections), 20)))
+    document = Document(tmp_path / 'map.yaml')
+    begin_s = time.process_time()
+    places = find_places(document.landmarks, recording, None, silent)
+    print(f'\nfr3: {time.process_time() - begin_s:.1f} s of processor time',
+          *places.lines(None), sep='\n')
+    assert places.detector == 'the detector is as in the recording'
+    assert (places.check.accepted > 0).mean() > 0.3
+    document.close()

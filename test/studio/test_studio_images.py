@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The images of a recording, in any order."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
+from cliploc_ros.datasets.rosbag import BagWriter
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.studio.images import open_images
+
+CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+COUNT = 20
+
+
+@pytest.fixture(params=['sqlite3', 'mcap'])
+def bag(request, tmp_path):
+    """Images that are recorded 0.4 s after they were taken, the last two at once."""
+    path = tmp_path / 'bag'
+    with BagWriter(path, request.param) as writer:
+        writer.add_topic('/camera_info', bag_messages.CAMERA_INFO)
+        writer.add_topic('/image', bag_messages.IMAGE)
+        writer.write('/camera_info', START_NS, bag_messages.camera_info_message(
+            START_NS, 'camera', CAMERA))
+        for number in range(COUNT):
+            taken_ns = START_NS + number * STEP_NS
+            recorded_ns = START_NS + min(number, COUNT - 2) * STEP_NS + 4 * STEP_NS
+            writer.write('/image', recorded_ns, bag_messages.image_message(
+                taken_ns, 'camera', np.full((48, 64, 3), number, dtype=np.uint8)))
+    return path
+
+
+def test_each_view_gets_its_image(bag):
+    images = open_images(bag, BagTopics())
+    for number in (0, COUNT - 1, 7, COUNT - 2):
+        image = images.near((START_NS + number * STEP_NS) / 1e9)
+        assert image.shape == (48, 64, 3) and (image == number).all()
+    assert images.near((START_NS + STEP_NS // 2) / 1e9) is None
+
+
+def test_a_recording_that_is_gone_is_named(bag):
+    images = bag_images(bag, BagTopics())
+    shutil.rmtree(bag)
+    with pytest.raises(DatasetError, match='no such recording'):
+        images.read(3)

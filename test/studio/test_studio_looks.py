@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The image embeddings next to a map follow their landmarks through edits, undo and a kill."""
+
+import json
+
+import numpy as np
+import pytest
+from studio_map import TEXT
+
+from cliploc_ros.core.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    load_embeddings_of_map,
+    load_landmark_embeddings,
+    save_landmark_embeddings,
+)
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+
+IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, and one too many
+SIZE = 16
+
+
+def unit(rows):
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float16)
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / 'office.yaml'
+    path.write_text(TEXT.replace('position_sigma: 0.01', 'support: 3'))
+    rng = np.random.default_rng(0)
+    save_landmark_embeddings(embeddings_path(path), LandmarkEmbeddings(
+        'demo:key', IDS, unit(rng.normal(size=(4, SIZE))), unit(rng.normal(size=(16, SIZE))),
+        np.array([0, 5, 7, 12, 16])))
+    return path
+
+
+@pytest.fixture
+def rows(path):
+    """Mean and medoids by landmark, as they were at first."""
+    return rows_of(path)
+
+
+def rows_of(path):
+    found = load_landmark_embeddings(embeddings_path(path))
+    return {key: (found.means[row], found.medoids[slice(*found.medoid_offsets[row:row + 2])])
+            for row, key in enumerate(found.landmark_ids)}
+
+
+def is_equal(first, second):
+    return all(np.array_equal(one, other) for one, other in zip(first, second, strict=True))
+
+
+def change_all(document):
+    document.apply(edits.merge(document.landmarks, ['cup_1', 'book_1']))
+    document.apply(edits.split(document.landmarks, 'plant_1'))
+    document.apply(edits.create(document.landmarks, 'new', 'book', np.ones(3), np.eye(3)))
+
+
+def check_all(path, rows):
+    """A merged landmark has the mean by support, each half the whole's rows, a new one none."""
+    found = rows_of(path)
+    assert sorted(found) == ['book_1', 'cup_1', 'plant_1', 'plant_2']
+    mean = rows['cup_1'][0].astype(float) + 3.0 * rows['book_1'][0].astype(float)
+    np.testing.assert_allclose(found['cup_1'][0], mean / np.linalg.norm(mean), atol=2e-3)
+    both = np.concatenate([rows['cup_1'][1], rows['book_1'][1]])
+    assert len(found['cup_1'][1]) == 5
+    assert all((both == one).all(axis=1).any() for one in found['cup_1'][1])
+    assert is_equal(found['plant_1'], rows['plant_1'])
+    assert is_equal(found['plant_2'], rows['plant_1'])
+    assert not found['book_1'][0].any() and not len(found['book_1'][1]), 'not the old book'
+    known = load_embeddings_of_map(path, sorted(found)).is_known
+    assert known.tolist() == [False, True, True, True]
+
+
+def test_rows_follow_their_landmarks(path, rows):
+    document = Document(path)
+    change_all(document)
+    assert is_equal(rows_of(path)['cup_1'], rows['cup_1']), 'only saving writes'
+    document.save()
+    check_all(path, rows)
+    for _ in range(3):
+        document.undo()
+    document.save()
+    found = rows_of(path)
+    assert set(found) == {'cup_1', 'book_1', 'plant_1'}
+    assert all(is_equal(found[key], rows[key]) for key in found)
+    for _ in range(3):
+        document.redo()
+    document.save()
+    check_all(path, rows)
+    document.close()
+
+
+def test_saving_without_new_landmarks_leaves_the_file(path):
+    document = Document(path)
+    document.apply(edits.delete(document.landmarks, ['cup_1']))
+    document.save()
+    written = embeddings_path(path).stat().st_mtime_ns
+    document.apply(edits.relabel(document.landmarks, ['book_1'], 'a novel'))
+    document.save()
+    document.close()
+    assert embeddings_path(path).stat().st_mtime_ns == written
+
+
+def test_a_killed_studio_restores_them(path, rows):
+    killed = Document(path)
+    change_all(killed)
+    killed._journal.close()
+    document = Document(path)
+    assert any('restored 3 edits' in note for note in document.notes)
+    document.save()
+    check_all(path, rows)
+    # what was undone after saving is known after a kill, too
+    document.undo()
+    document.undo()
+    document.undo()
+    document._journal.close()
+    again = Document(path)
+    again.save()
+    again.close()
+    assert all(is_equal(found, rows[key]) for key, found in rows_of(path).items())
+
+
+def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows):
+    document = Document(path)
+    change_all(document)
+    journal, old = document._journal.path, embeddings_path(path).read_bytes()
+    kept, looks = journal.read_text(), document._changed_looks()
+    document.save()
+    document._journal.close()
+    # as a kill leaves it after the map was written
+    embeddings_path(path).write_bytes(old)
+    journal.write_text(kept + json.dumps({'writing': document._source.digest, 'looks': looks})
+                       + '\n')
+    Document(path).close()
+    check_all(path, rows)
+
+
+def test_what_another_program_wrote_stays(path):
+    document = Document(path)
+    document.apply(edits.delete(document.landmarks, ['cup_1']))
+    embeddings_path(path).write_bytes(b'of another program')
+    document.save()
+    assert any('another program changed this file' in note for note in document.notes)
+    document.close()
+    broken = Document(path)
+    assert any('no complete npz file' in note for note in broken.notes)
+    broken.apply(edits.delete(broken.landmarks, ['book_1']))
+    broken.save()
+    broken.close()
+    assert embeddings_path(path).read_bytes() == b'of another program'
+
+
+def test_edits_of_another_encoder_are_not_mixed_in(path):
+    """The file was made anew with another CLIP after a studio was killed."""
+    killed = Document(path)
+    change_all(killed)
+    killed._journal.close()
+    means = unit(np.random.default_rng(1).normal(size=(1, 2 * SIZE)))
+    save_landmark_embeddings(embeddings_path(path), LandmarkEmbeddings(
+        'other:key', ('plant_1',), means, means, np.array([0, 1])))
+    document = Document(path)
+    assert len(document.landmarks) == 4
+    document.save()
+    document.close()
+    found = load_landmark_embeddings(embeddings_path(path))
+    assert found.encoder_key == 'other:key' and found.means.shape == (4, 2 * SIZE)
+    assert not found.means.any(), 'the edits were made on looks of the first encoder'
+
+
+def test_a_map_without_the_file_gets_none(path):
+    embeddings_path(path).unlink()
+    document = Document(path)
+    document.take_encoder('demo:key')
+    change_all(document)
+    document.save()
+    document.close()
+    assert not embeddings_path(path).exists()

@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Phrases that the demo's CLIP chooses for landmarks, and what it saw of a new one."""
+
+import re
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Person, wait_for
+
+from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.landmark_embeddings import embeddings_path, load_landmark_embeddings
+from cliploc_ros.datasets.observations import save_observations
+from cliploc_ros.demo.truth import read_frames
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.images import open_images, views_of_folder
+
+ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+WALK = ASSETS / 'mapping'
+CLIP = ('--clip-model', str(ASSETS / 'clip.json'),
+        '--clip-pretrained', str(ASSETS / 'clip.safetensors'))
+PATIENCE_S = 120.0
+
+
+def opened(*arguments):
+    return open_studio(make_parser().parse_args(list(map(str, arguments))))
+
+
+def wait_for_phrases(studio):
+    """Return what is offered in the end, and the notes until then."""
+    deadline, notes = time.monotonic() + PATIENCE_S, set()
+    while True:
+        found = studio.phrases()
+        notes.add(studio.phrase_note)
+        if studio.finder._answers:
+            return studio.phrases(), notes
+        assert time.monotonic() < deadline, f'no answer to {found}'
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def path(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    path = tmp_path / 'map.yaml'
+    shutil.copy(ASSETS / 'map.yaml', path)
+    return path
+
+
+def test_clip_offers_phrases_for_what_the_images_show(path):
+    studio = opened(path, '--images', WALK, *CLIP)
+    truth = studio.document.landmarks['bowl_1'].label
+    studio.document.apply(edits.relabel(studio.document.landmarks, ['bowl_1'], 'something'))
+    studio.document.select(['bowl_1'])
+    assert studio.phrases()[0] != truth, "the class's labels as long as CLIP loads"
+    found, notes = wait_for_phrases(studio)
+    print(f'{truth}: {found}')
+    assert len(found) == 5 and truth in found
+    assert any('CLIP looks' in note for note in notes) and studio.phrase_note == ''
+    studio.document.apply(edits.move(studio.document.landmarks, 'bowl_1', [1, 1, 1]))
+    assert studio.phrases() == found, 'a drag asks nothing'
+    studio.finder.close()
+    studio.document.close()
+
+
+@pytest.mark.clock
+@pytest.mark.needs('viser', 'playwright', 'chromium')
+def test_a_person_chooses_a_phrase(chromium, path):
+    """The page goes on while CLIP loads."""
+    from cliploc_ros.studio.server import serve_studio
+
+    studio = opened(path, '--images', WALK, *CLIP)
+    document, truth = studio.document, studio.document.landmarks['bowl_1'].label
+    document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
+    with serve_studio(studio, '127.0.0.1', 0) as (url, _):
+        person = Person(chromium, url)
+        person.find('bowl_1')
+        person.click(re.compile('^bowl_1 '))
+        wait_for(lambda: truth in studio.phrases(), 'the phrases of CLIP')
+        person.field('Phrases').click()
+        person.picture('phrases')
+        person.page.get_by_role('option', name=truth).click()
+        wait_for(lambda: document.landmarks['bowl_1'].label == truth, 'the label')
+        person.page.close()
+    studio.finder.close()
+    document.close()
+
+
+def observed(tmp_path, object_id):
+    """Write an observation file: the true boxes of one object, with their embeddings."""
+    options = ClipOptions(model=CLIP[1], pretrained=CLIP[3])
+    encoder = ClipEncoder(resolve_clip_weights(options), options)
+    views, images = views_of_folder(WALK), open_images(WALK, None)
+    boxes = [[box.bbox_xyxy for box in frame.boxes if box.object_id == object_id]
+             for frame in read_frames(WALK)]
+    rows = [encoder.encode_crops(images.near(float(stamp_s)), np.array(seen))
+            for stamp_s, seen in zip(views.stamps_s, boxes, strict=True) if seen]
+    embeddings, count = np.concatenate(rows).astype(np.float16), sum(map(len, boxes))
+    file = tmp_path / 'walk.npz'
+    save_observations(file, PosedDetections(
+        views.camera, views.map_from_camera, views.stamps_s,
+        np.cumsum([0, *map(len, boxes)]), np.concatenate([one for one in boxes if one]),
+        ('bowl',), np.zeros(count, dtype=np.int64), np.ones(count), embeddings=embeddings,
+        encoder_key=encoder.key))
+    return file, embeddings
+
+
+def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
+    """And CLIP offers phrases for it, without its images."""
+    file, embeddings = observed(tmp_path, 'bowl_1')
+    new = tmp_path / 'new.yaml'
+    studio = opened(new, '--observations', file, *CLIP)
+    for view in np.flatnonzero(np.diff(studio.recording.detections.frame_offsets)):
+        studio.show_view(view)
+        box = studio.boxes_in_view()[0]
+        studio.draw_box(box[:2], box[2:])
+    studio.create('something', 'bowl')
+    found, _ = wait_for_phrases(studio)
+    assert len(found) == 5
+    studio.document.save()
+    stored = load_landmark_embeddings(embeddings_path(new))
+    assert stored.landmark_ids == ('bowl_1',) and 1 <= len(stored.medoids) <= 5
+    mean = embeddings.astype(float).mean(axis=0)
+    assert stored.means[0] @ mean / np.linalg.norm(mean) > 0.99
+    studio.finder.close()
+    studio.document.close()
+
+
+def test_weights_that_are_missing_are_named(path, tmp_path):
+    studio = opened(path, '--images', WALK, '--clip-model', ASSETS / 'clip.json',
+                    '--clip-pretrained', tmp_path / 'none.pt')
+    studio.document.select(['bowl_1'])
+    found, _ = wait_for_phrases(studio)
+    assert 'CLIP offers no phrases' in studio.phrase_note and 'none.pt' in studio.phrase_note
+    assert found, "the map's own are offered"
+    studio.document.close()
+
+
+def test_options_that_miss_each_other(path):
+    with pytest.raises(OptionsError, match='both --clip-model and'):
+        opened(path, '--clip-model', 'ViT-L-14')
+    with pytest.raises(OptionsError, match='CLIP chooses'):
+        opened(path, '--vocabulary', path)
