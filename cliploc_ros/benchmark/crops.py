@@ -10,9 +10,8 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -119,14 +118,6 @@ def describe(answers: Sequence[Answer]) -> str:
             f'{cpu.mean() * 1e3:6.0f}')
 
 
-def _with_inference(clip: ClipOptions, inference: str) -> ClipOptions | None:
-    """Return options for an inference engine; None where only PyTorch is supported."""
-    if any(field.name == 'inference' for field in fields(ClipOptions)):
-        changes: dict[str, Any] = {'inference': inference}
-        return replace(clip, **changes)
-    return clip if inference == 'pytorch' else None
-
-
 def run(args: Sequence[str] | None = None) -> int:
     """Measure and print; return the exit code."""
     parser = argparse.ArgumentParser(prog='crops', description=__doc__,
@@ -151,11 +142,8 @@ def run(args: Sequence[str] | None = None) -> int:
           f'{"engine":<9} {"crops":<10} {"success .25/.5/1":<20} accepted false precision recall '
           f'encoded detect   median   mean    max    cpu')
     for inference in options.inference:
-        clip = _with_inference(ClipOptions(model=options.clip_model,
-                                           pretrained=options.clip_pretrained), inference)
-        if clip is None:
-            print(f'{inference:<9} is not supported by this version')
-            continue
+        clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                           inference=inference)
         robot = Robot(landmark_map, YoloDetector(YoloOptions(model=options.model)), clip,
                       str(options.map), method)
         robot.answer(frames[0], 'all')  # warm

@@ -25,7 +25,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.observer import ObservedCrops, Observer
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import (
     detections_from_msg,
@@ -184,8 +184,9 @@ class Localizer:
             seen = observer.observe(image, observation.camera, detections, observation.stamp_ns)
             times.begin('search')
             return iter([replace(observation, similarities=seen.similarities)])
-        crops = observer.crops(image, detections.bboxes_xyxy)
         on_demand = options.crops == 'on_demand'
+        crops = observer.crops(image, detections.bboxes_xyxy) if on_demand \
+            else ObservedCrops(observer, image, detections.bboxes_xyxy, {})
         end = deadline - _ANSWER_S - min(_SEARCHES * options.time_budget_s,
                                          _MOST_SHARE * (deadline - time.monotonic()))
 
