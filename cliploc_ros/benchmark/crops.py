@@ -30,7 +30,8 @@ from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import load_encoder_for_map
 from cliploc_ros.models.observer import Observer
-from cliploc_ros.models.yolo_detector import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 
 _ASSETS = Path(cliploc_ros.__file__).parent / 'demo' / 'assets'
 _INFERENCES = ('pytorch', 'openvino')
