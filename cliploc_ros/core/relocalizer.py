@@ -228,7 +228,9 @@ class Relocalizer:
         coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
         elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
         rivals = likely[elsewhere]
-        twins = elsewhere[look_alike(self._map, compared.poses[0], compared.poses[elsewhere])]
+        matched = np.unique([one.landmark for found in compared.matches[0] for one in found])
+        twins = elsewhere[look_alike(self._map, compared.poses[0], matched,
+                                     compared.poses[elsewhere])]
         return Evidence(
             supports[0].inliers, likely[0],
             min(max(rivals, default=0.0), 1.0 - likely[0]),

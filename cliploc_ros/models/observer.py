@@ -52,7 +52,7 @@ class Observer:
         """Return how many crops there is time for [s], from the time of the newest batch."""
         if self._crop_s is None:
             return 1
-        count = int(min(left_s / max(_SLOWER * self._crop_s, 1e-6), _MOST_CROPS))
+        count = int(np.clip(left_s / max(_SLOWER * self._crop_s, 1e-6), 0, _MOST_CROPS))
         if count < 1:
             self._crop_s *= _FADING
         return max(0, count)

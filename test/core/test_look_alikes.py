@@ -41,8 +41,9 @@ def two_rooms(turn_deg=0.0, missing=0, noise_m=0.0, seed=1):
 def test_two_equal_rooms_look_alike_from_both(turn_deg, missing):
     rooms, move = two_rooms(turn_deg, missing, noise_m=0.03)
     here = np.eye(4)
-    assert look_alike(rooms, here, move[None]).tolist() == [True]
-    assert look_alike(rooms, move, here[None]).tolist() == [True]
+    matched = np.arange(missing, 12)
+    assert look_alike(rooms, here, matched, move[None]).tolist() == [True]
+    assert look_alike(rooms, move, matched + 12 - missing, here[None]).tolist() == [True]
 
 
 def test_other_poses_do_not_look_alike():
@@ -51,19 +52,28 @@ def test_other_poses_do_not_look_alike():
     beside = move.copy()
     beside[0, 3] += 1.0
     others = np.stack([move, beside, flat, make_transform(np.eye(3), np.array([50.0, 0, 0]))])
-    assert look_alike(rooms, np.eye(4), others).tolist() == [True, False, False, False]
+    found = look_alike(rooms, np.eye(4), np.arange(12), others)
+    assert found.tolist() == [True, False, False, False]
+
+
+def test_what_was_matched_must_look_alike_too():
+    """Half a room has a twin; the camera saw the other half."""
+    rooms, move = two_rooms(missing=6)
+    assert look_alike(rooms, np.eye(4), np.arange(6, 12), move[None]).tolist() == [True]
+    assert look_alike(rooms, np.eye(4), np.arange(6), move[None]).tolist() == [False]
 
 
 def test_the_same_objects_of_other_classes_do_not_look_alike():
     rooms, move = two_rooms()
     other = make_map(rooms.centers, [*rooms.class_ids[:12], *['bottle'] * 12])
-    assert look_alike(other, np.eye(4), move[None]).tolist() == [False]
+    assert look_alike(other, np.eye(4), np.arange(12), move[None]).tolist() == [False]
 
 
 def test_a_map_of_fewer_landmarks_than_are_compared():
     few = make_map([[1.0, 0, 0]], ['chair'])
-    assert look_alike(few, np.eye(4), np.eye(4)[None]).tolist() == [False]
-    assert look_alike(few, np.eye(4), np.empty((0, 4, 4))).tolist() == []
+    seen = np.array([0])
+    assert look_alike(few, np.eye(4), seen, np.eye(4)[None]).tolist() == [False]
+    assert look_alike(few, np.eye(4), seen, np.empty((0, 4, 4))).tolist() == []
 
 
 def test_only_labels_tell_places_apart():
@@ -90,10 +100,10 @@ def test_a_large_map_costs_little(record_property):
     prepared = time.process_time() - start
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, :3, 3] = rng.uniform(20, 180, (12, 3))
-    look_alike(large, poses[0], poses[1:])
+    look_alike(large, poses[0], np.arange(12), poses[1:])
     start = time.process_time()
     for _ in range(10):
-        look_alike(large, poses[0], poses[1:])
+        look_alike(large, poses[0], np.arange(12), poses[1:])
     took = (time.process_time() - start) / 10
     record_property('figures', f'100,000 landmarks: prepared in {prepared:.2f} s, 11 other '
                                f'places compared in {1e3 * took:.1f} ms')

@@ -25,6 +25,7 @@ _PLACE_M, _MOST_LANDMARKS = 4.0, 200
 # the other.
 _SAME_M = 0.3
 _LEAST_SHARE, _LEAST_LANDMARKS = 0.4, 4
+_LEAST_MATCHED = 0.5
 # Both places are upright: one is moved onto the other by a turn about the vertical.
 _MOST_TILT = np.cos(np.radians(20.0))
 # Landmarks near a spot that are searched for one of the right class.
@@ -34,7 +35,7 @@ _LIKENESS, _UNLABELLED = 0.44, 0.5
 
 
 def look_alike(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
-               others: NDArray[np.float64]) -> NDArray[np.bool_]:
+               matched: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether the place of a pose looks like the places of other poses.
 
     Parameters
@@ -42,14 +43,16 @@ def look_alike(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     landmark_map : LandmarkMap
         L landmarks.
     map_from_camera : ndarray (4, 4)
+    matched : ndarray (n,) of int
+        Landmarks that the pose explains detections with.
     others : ndarray (m, 4, 4)
         Poses at other places, from which a camera would see the same.
 
     Returns
     -------
     ndarray (m,) of bool
-        A place looks like another one if at least four landmarks, and two fifths of those around
-        it, have one of their class at the same spot there.
+        A place looks like another one if at least four landmarks, two fifths of those around it,
+        and half of those matched have one of their class at the same spot there.
     """
     rows = _landmarks_around(landmark_map, map_from_camera[:3, 3])
     moves = others @ invert_transform(map_from_camera)
@@ -57,9 +60,10 @@ def look_alike(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     if len(rows) < _LEAST_LANDMARKS:
         return found
     for number in np.nonzero(moves[:, 2, 2] > _MOST_TILT)[0]:
-        moved = landmark_map.centers[rows] @ moves[number, :3, :3].T + moves[number, :3, 3]
-        same = int(_have_twins(landmark_map, rows, moved).sum())
-        found[number] = same >= max(_LEAST_LANDMARKS, _LEAST_SHARE * len(rows))
+        around = _have_twins(landmark_map, rows, moves[number])
+        found[number] = (around.sum() >= max(_LEAST_LANDMARKS, _LEAST_SHARE * len(rows))
+                         and _have_twins(landmark_map, matched, moves[number]).mean()
+                         >= _LEAST_MATCHED)
     return found
 
 
@@ -87,9 +91,10 @@ def _landmarks_around(landmark_map: LandmarkMap, position: NDArray[np.float64]
     return np.asarray(rows[np.isfinite(distances)])
 
 
-def _have_twins(landmark_map: LandmarkMap, rows: NDArray[np.int64],
-                moved: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which landmarks (r,), moved to other spots (r, 3), have one of their class there."""
+def _have_twins(landmark_map: LandmarkMap, rows: NDArray[np.int64], move: NDArray[np.float64]
+                ) -> NDArray[np.bool_]:
+    """Return which landmarks (r,), moved by a transform (4, 4), meet another of their class."""
+    moved = landmark_map.centers[rows] @ move[:3, :3].T + move[:3, 3]
     count = min(_NEIGHBOURS, len(landmark_map))
     distances, near = landmark_map.tree.query(moved, [*range(1, count + 1)],
                                               distance_upper_bound=_SAME_M)
