@@ -40,7 +40,8 @@ def clip_relocalizer(request, start_shared, room_map, tester, checkpoint, cache_
     """A relocalizer with CLIP, started twice: the second time its labels are encoded already."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(
         room_map, matching='hybrid', algorithm='b-prosac', k=12, iterations=30000, timeout_s=60.0,
-        clip_model='ViT-B-32', clip_pretrained=checkpoint, cache_dir=cache_dir))
+        crops='all', inference='pytorch', clip_model='ViT-B-32', clip_pretrained=checkpoint,
+        cache_dir=cache_dir))
     process.wait_for_output('ready after')
     assert ('encoded' if request.param == 'first start' else 'cached') in process.output()
     tester.connect()
