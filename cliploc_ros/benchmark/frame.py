@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.benchmark.startup import write_random_checkpoint
+from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -40,7 +41,6 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory
-from cliploc_ros.models.files import resolve_cache_dir
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.profiles import PROFILES
 from cliploc_ros.models.yolo_detector import YoloDetector

@@ -7,7 +7,6 @@ import struct
 import zipfile
 from pathlib import Path
 
-from cliploc_ros.cache_folder import resolve_cache_dir as resolve_cache_dir
 from cliploc_ros.errors import ModelError
 
 _BLOCK_BYTES = 64 * 1024

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.mapping.labelling import Phrases
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
 from cliploc_ros.models.devices import resolve_device
-from cliploc_ros.models.files import resolve_cache_dir
 from cliploc_ros.models.label_embeddings import LabelCache
 
 # The COCO classes and as many of a user; a file of ViT-L-14 takes 3 MB at most.

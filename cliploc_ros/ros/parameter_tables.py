@@ -42,8 +42,8 @@ _INFERENCE = ParameterRow(
     'inference', 'auto', "What runs the network: 'auto' (OpenVINO on a CPU where it is installed, "
     "else PyTorch), 'pytorch' or 'openvino'.", choices=INFERENCES, read_only=True)
 _CACHE_DIR = ParameterRow(
-    'cache_dir', '', 'Folder of downloads, label embeddings and converted networks; empty: '
-    '~/.cache/cliploc_ros.', read_only=True)
+    'cache_dir', '', 'Folder of downloads, label embeddings, converted networks and compiled '
+    'kernels; empty: ~/.cache/cliploc_ros.', read_only=True)
 
 DETECTOR = (
     ParameterRow('profile', 'auto', "Detector of a profile: 'accurate', 'balanced' or 'fast'; "

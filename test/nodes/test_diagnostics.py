@@ -89,9 +89,9 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         bad.encoding = 'yuv422'
         status.wait(WARN, "encoding 'yuv422' is none of", (bad,))
         status.wait(OK, 'active', (image,))
-    values = status.wait(OK, 'active', (image,),
-                         **{'listened to': 'False', 'image rate [Hz]': '0.0'})
-    assert values['detections rate [Hz]'] == '0.0', 'it rests while nobody asks'
+    # it rests while nobody asks, although images come
+    status.wait(OK, 'active', (image,), **{'listened to': 'False', 'image rate [Hz]': '0.0',
+                                           'detections rate [Hz]': '0.0'})
     tester.destroy_publisher(tester.images)
     status.wait(WARN, 'nobody publishes /image')
     tester.images = tester.create_publisher(type(image), 'image', 10)
