@@ -228,7 +228,8 @@ class Relocalizer:
         coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
         elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
         rivals = likely[elsewhere]
-        matched = np.unique([one.landmark for found in compared.matches[0] for one in found])
+        matched = np.array(sorted({one.landmark for found in compared.matches[0]
+                                   for one in found}), dtype=np.int64)
         twins = elsewhere[look_alike(self._map, compared.poses[0], matched,
                                      compared.poses[elsewhere])]
         return Evidence(

@@ -61,6 +61,8 @@ def test_what_was_matched_must_look_alike_too():
     rooms, move = two_rooms(missing=6)
     assert look_alike(rooms, np.eye(4), np.arange(6, 12), move[None]).tolist() == [True]
     assert look_alike(rooms, np.eye(4), np.arange(6), move[None]).tolist() == [False]
+    nothing = np.empty(0, dtype=np.int64)
+    assert look_alike(rooms, np.eye(4), nothing, move[None]).tolist() == [False]
 
 
 def test_the_same_objects_of_other_classes_do_not_look_alike():

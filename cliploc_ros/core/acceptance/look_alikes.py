@@ -57,7 +57,7 @@ def look_alike(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     rows = _landmarks_around(landmark_map, map_from_camera[:3, 3])
     moves = others @ invert_transform(map_from_camera)
     found = np.zeros(len(others), dtype=np.bool_)
-    if len(rows) < _LEAST_LANDMARKS:
+    if len(rows) < _LEAST_LANDMARKS or not len(matched):
         return found
     for number in np.nonzero(moves[:, 2, 2] > _MOST_TILT)[0]:
         around = _have_twins(landmark_map, rows, moves[number])
