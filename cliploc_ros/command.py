@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared by the executables: errors in one line, and a clean end on Ctrl-C or SIGTERM."""
 
+import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -40,6 +41,14 @@ def run_command(command: Callable[[], int]) -> int:
 def printable(text: str) -> str:
     """Return text for a terminal: ids in a map may hold any characters."""
     return ''.join(char if char.isprintable() else ' ' for char in text)
+
+
+def positive_int(text: str) -> int:
+    """Return a whole number above 0, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
+    return value
 
 
 def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:

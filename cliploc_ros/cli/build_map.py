@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cliploc_ros.cli.map_labels import Labeller, add_label_options, prepare_labels
 from cliploc_ros.cli.map_update import OldMap, read_old_map, update_old_map, with_usual_noise
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--report', type=Path, metavar='JSON',
                         help='also write what was found and left out, and why')
     parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
+    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
     add_label_options(parser)
@@ -79,7 +79,7 @@ def make_parser() -> argparse.ArgumentParser:
     poses.add_argument('--refine-mount', action='store_true',
                        help='correct a mount of the camera that is off by centimetres or degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
-    limits.add_argument('--min-viewpoints', type=_positive_int, default=3, metavar='N',
+    limits.add_argument('--min-viewpoints', type=positive_int, default=3, metavar='N',
                         help='10 cm or 5 degrees apart (%(default)s)')
     limits.add_argument('--min-baseline', type=float, default=20.0, metavar='DEG',
                         help='angle between two of its directions (%(default)s)')
@@ -222,13 +222,6 @@ class _ProgressBar:
         self._bar.set_description_str(stage)
         self._bar.n = round(100 * share)
         self._bar.refresh()
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
-    return value
 
 
 def _deviation(text: str) -> float:

@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.progress import StageBar
-from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, split_ros_args
+from cliploc_ros.command import (
+    interrupt_on_sigterm,
+    positive_int,
+    printable,
+    run_command,
+    split_ros_args,
+)
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -52,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='a query file of this map: frames with similarities')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR',
                         help='folder of check.html and check.json')
-    parser.add_argument('--every', type=_positive_int, default=1, metavar='N',
+    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame of the observations only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
     _add_relocalizer_options(parser)
@@ -62,15 +68,15 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    group.add_argument('--frames', type=_positive_int, default=100, metavar='N',
+    group.add_argument('--frames', type=positive_int, default=100, metavar='N',
                        help='the most recorded frames to relocalize (%(default)s)')
     group.add_argument('--folds', type=int, default=5, metavar='N',
                        help='of the cross-validation, 2 or more (%(default)s)')
     group.add_argument('--grid', type=_positive, default=0.5, metavar='METRES',
                        help='spacing of the camera positions, larger in large maps (%(default)s)')
-    group.add_argument('--positions', type=_positive_int, default=150, metavar='N',
+    group.add_argument('--positions', type=positive_int, default=150, metavar='N',
                        help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=_positive_int, default=12, metavar='N',
+    group.add_argument('--headings', type=positive_int, default=12, metavar='N',
                        help='directions at each position (%(default)s)')
     group.add_argument('--camera-height', type=float, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')
@@ -154,13 +160,6 @@ def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObserva
     found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
     return [PosedObservation(one.observation, one.map_from_camera,
                              one.observation.stamp_ns / NS_PER_S) for one in found]
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
-    return value
 
 
 def _count(text: str) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -58,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--map', type=Path, required=True, metavar='YAML')
     parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
                         help=f'default: {ALL}; see below')
-    parser.add_argument('--trials', type=_positive_int, default=5,
+    parser.add_argument('--trials', type=positive_int, default=5,
                         help="the paper's %(default)s by default")
     parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
@@ -67,7 +67,7 @@ def make_parser() -> argparse.ArgumentParser:
                         default=RelocalizerOptions.crops,
                         help=f"crops that '{AUTO}' compares with labels (%(default)s)")
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
-    parser.add_argument('--workers', type=_positive_int, metavar='N',
+    parser.add_argument('--workers', type=positive_int, metavar='N',
                         help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
     parser.add_argument('--scheduler', default='', metavar='ADDRESS',
                         help='of a Dask cluster, instead of local processes')
@@ -86,7 +86,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
     group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
                        help='limit of each search (none); with one, results vary')
-    group.add_argument('--sweep', type=_positive_int, nargs='*', metavar='N',
+    group.add_argument('--sweep', type=positive_int, nargs='*', metavar='N',
                        default=[50, 100, 200, 1000],
                        help='numbers of iterations to compare (50 100 200 1000)')
 
@@ -120,7 +120,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
-    group.add_argument('--every', type=_positive_int, default=1, metavar='N',
+    group.add_argument('--every', type=positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
     group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
@@ -237,13 +237,6 @@ def _angle(text: str) -> float:
     value = float(text)
     if not 0.0 <= value <= 45.0:
         raise argparse.ArgumentTypeError(f'{text} is outside 0 to 45 degrees')
-    return value
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
     return value
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.command import run_command
+from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -125,7 +125,8 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
     parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
                         help='of each query file')
-    parser.add_argument('--worlds', type=int, default=20, metavar='N', help='of each kind')
+    parser.add_argument('--worlds', type=positive_int, default=20, metavar='N',
+                        help='of each kind')
     options = parser.parse_args(arguments)
     if len(options.queries) != len(options.map):
         raise OptionsError('give as many maps as query files, in the same order')

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from cliploc_ros.command import run_command
+from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -113,16 +113,17 @@ def run(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog='judge', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS))
-    parser.add_argument('--worlds', type=int, default=50, metavar='N', help='of each kind')
+    parser.add_argument('--worlds', type=positive_int, default=50, metavar='N',
+                        help='of each kind')
     parser.add_argument('--first-seed', type=int, default=0, metavar='N')
     parser.add_argument('--matching', choices=('hybrid', 'class'), default='hybrid')
     parser.add_argument('--min-confidence', type=float,
                         default=RelocalizerOptions().min_confidence)
-    parser.add_argument('--workers', type=int, default=1, metavar='N')
+    parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
     parser.add_argument('--out', type=Path, metavar='DIR', help='draw reliability diagrams there')
     options = parser.parse_args(arguments)
-    if options.worlds < 1 or options.workers < 1:
-        raise OptionsError('--worlds and --workers must be at least 1')
+    if options.first_seed < 0:
+        raise OptionsError(f'--first-seed: {options.first_seed} is below 0')
     tasks = [(kind, options.first_seed + number) for kind in options.kinds
              for number in range(options.worlds)]
     found = {}
