@@ -165,7 +165,7 @@ def test_the_information_of_verticals_is_that_of_the_refinement(room, walk):
         rig = make_rig(scenes, cameras, known)
         pose = invert_transform(walk[-1])
         rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
-        inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
+        inliers = one_to_one(rig, verify_rig(rig, rotation, translation), rotation, translation)
         in_front, residuals = residuals_of_rig(inliers, rotation, translation)
         assert in_front
         information, _ = linearize_rig(inliers, rotation, translation, residuals)

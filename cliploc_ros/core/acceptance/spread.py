@@ -1,0 +1,38 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How far the hypotheses near the best one spread: one of them may be the right one.
+
+The confidence counts all hypotheses within 1 m as right, such as those that take each bottle of a
+shelf for its neighbour. The covariance must hold them too.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.confidence import agreeing_poses
+from cliploc_ros.core.geometry.transforms import pose_difference
+
+# Hypotheses near each other share landmarks and errors, so the difference of their supports says
+# less than between places. Chosen on simulated shops (seeds 0 to 24): 1 covers too little there.
+_SHARPNESS = 0.5
+
+
+def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean square of the differences between a pose and those that agree with it.
+
+    Parameters
+    ----------
+    poses : ndarray (m, 4, 4)
+        map_from_camera; the first one is the pose.
+    odds : ndarray (m,)
+        Logarithm of the odds of each, up to a constant.
+
+    Returns
+    -------
+    ndarray (6, 6)
+        Of position [m] and rotation about the map's axes [rad].
+    """
+    agreeing = agreeing_poses(poses)[0]
+    weights = np.exp(_SHARPNESS * (odds[agreeing] - odds[agreeing].max()))
+    steps = np.array([pose_difference(poses[0], one) for one in poses[agreeing]])
+    return np.asarray((steps.T * (weights / weights.sum())) @ steps)
