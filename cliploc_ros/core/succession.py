@@ -70,7 +70,7 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
         return covariance, Known(odom_from_camera, map_from_camera, covariance)
     before = _carried(known, odom_from_camera)
     innovation = pose_difference(before.map_from_camera, map_from_camera)
-    square = innovation @ np.linalg.solve(before.covariance + covariance, innovation)
+    square = float(innovation @ np.linalg.solve(before.covariance + covariance, innovation))
     doubt = max(1.0, square / _CONTRADICTION)
     prior, own = doubt * before.covariance, doubt * covariance
     given = _what_is_new(prior, own)
@@ -87,9 +87,10 @@ def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
     motion = invert_transform(known.odom_from_camera) @ odom_from_camera
     pose = known.map_from_camera @ motion
     covariance = move_covariance(known.covariance, pose[:3, 3] - known.map_from_camera[:3, 3])
-    ways = [np.linalg.norm(motion[:3, 3]), Rotation.from_matrix(motion[:3, :3]).magnitude()]
-    return Known(odom_from_camera, pose, covariance + np.diag(np.repeat(_DRIFT ** 2
-                                                                        * np.array(ways), 3)))
+    ways = [float(np.linalg.norm(motion[:3, 3])),
+            float(Rotation.from_matrix(motion[:3, :3]).magnitude())]
+    return Known(odom_from_camera, pose,
+                 covariance + np.diag(np.repeat(_DRIFT ** 2 * np.array(ways), 3)))
 
 
 def _what_is_new(prior: NDArray[np.float64], own: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 
 # Probability that an object is not where its match says. Chosen on simulated worlds (seeds 0 to
 # 59) together with the TUM frames.
-_WRONG_SHARE = 0.1
+_WRONG_SHARE = 0.07
 # Deviation of a pose that lost an object [m and rad]: the others are not arbitrarily far, since an
 # accepted pose is right to 1 m and 45 degrees.
 _WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
