@@ -100,8 +100,8 @@ def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
     """The reference first, last or between: steps add up outwards from it."""
     way = [MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([0.3 * step, 0.0, 0.0]))
            for step in (0, 1, 2, 1)]
-    middle = fitted(way[:3] + [way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1].matched
-    end = fitted(way[:3] + [way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1].matched
+    middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1].matched
+    end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1].matched
     assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
 
 

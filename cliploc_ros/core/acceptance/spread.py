@@ -8,9 +8,9 @@ shelf for its neighbour. The covariance must hold them too.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import agreeing_poses
-from cliploc_ros.core.geometry.transforms import pose_difference
 
 # Hypotheses near each other share landmarks and errors, so the difference of their supports says
 # less than between places. Chosen on simulated worlds (seeds 0 to 39): 1 covers too little in
@@ -38,7 +38,8 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
     """
     agreeing = agreeing_poses(poses)[0]
     weights = np.exp(_SHARPNESS * (odds[agreeing] - odds[agreeing].max()))
-    steps = np.array([pose_difference(poses[0], one) for one in poses[agreeing]])
+    turns = Rotation.from_matrix(poses[agreeing, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
+    steps = np.concatenate([poses[agreeing, :3, 3] - poses[0, :3, 3], turns], axis=1)
     squares = (steps.T * (weights / weights.sum())) @ steps
     anywhere = np.repeat([np.trace(squares[:3, :3]) / 3, np.trace(squares[3:, 3:]) / 3], 3)
     return np.asarray(squares + np.diag(anywhere))
