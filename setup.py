@@ -53,7 +53,11 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
+        # By name: evaluate and build_map put files of their own beside a recording.
+        f'{PACKAGE}.demo': [
+            'assets/clip.*', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
+            'assets/*/rgb/*.jpg',
+        ],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
