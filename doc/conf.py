@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 project = 'cliploc_ros'
 author = 'the cliploc_ros authors'
-copyright = '2026 the cliploc_ros authors'  # noqa: A001
+copyright = '2026 the cliploc_ros authors'
 release = version = '0.2.0'
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'sphinx_rtd_theme']
