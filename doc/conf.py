@@ -15,7 +15,6 @@ release = version = '0.2.0'
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'sphinx_rtd_theme']
 root_doc = 'index'
-exclude_patterns = ['README.md']
 
 # The anchors of GitHub, so that one link works in both places.
 myst_heading_anchors = 4
