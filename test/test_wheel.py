@@ -117,7 +117,7 @@ def test_ros_is_not_there(programs, tmp_path):
     assert run(programs / 'python', '-c', code, cwd=tmp_path).stdout == '[]\n'
 
 
-@pytest.mark.parametrize('name', sorted(COMMANDS))
+@pytest.mark.parametrize('name', sorted(COMMANDS - {'build_map', 'evaluate', 'studio'}))
 def test_help_is_printed(programs, name, tmp_path):
     assert 'usage: ' in run(programs / f'cliploc_{name}', '--help', cwd=tmp_path).stdout
 
