@@ -51,6 +51,9 @@ from cliploc_ros.errors import OptionsError
 #: time grows with the square; and the tenth view of the same objects adds little.
 MAX_FRAMES = 10
 _NO_LOOKS = Looks()
+# Factor on the covariance where it decides. On simulated worlds (seeds 0 to 39) a factor of 1
+# accepts 8 more of 241 single images, and 2 of these are wrong.
+_CAUTION = 1.35
 
 
 class Relocalizer:
@@ -241,7 +244,8 @@ class Relocalizer:
             distinct=chance_distinct(supports[0], [supports[row] for row in twins]),
             twin=_position(compared.poses[twins[0]]) if len(twins) else None,
             # the covariance of a minimal sample is too rough to decide
-            near=1.0 if best.information is None else share_within(RIGHT_M, covariance),
+            near=1.0 if best.information is None else share_within(
+                RIGHT_M, _CAUTION * covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
             coverage=coverage,
             tried=sum(one.known_tried for one in frames),
