@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
+from cliploc_ros.core.index.duplicates import objects_of
 from cliploc_ros.core.index.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.landmark_details import (
     OPTIONAL_FIELDS,
@@ -34,6 +35,8 @@ _MAX_COORDINATE_M = 1e7
 _MAX_QUATERNION_NORM_ERROR = 0.01
 # Distance of two classes in the tree that has the class as a fourth coordinate.
 _CLASS_DISTANCE_M = 10.0
+# A landmark is compared with so many of its class, nearer than this, to find duplicates.
+_COMPARED, _NEAR_M = 3, 0.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class LandmarkMap:
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
         _ = self.shapes, self.classes, self.sorted_landmarks, self.tree, self.pairs
-        _ = self._tree_of_classes
+        _ = self.objects
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -118,6 +121,19 @@ class LandmarkMap:
     def pairs(self) -> LandmarkPairs:
         """Return pairs of neighbours, to find what the map has more than once."""
         return make_pairs(self.centers, self.classes.of_landmarks, self.tree)
+
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """Return the number of each landmark's object (L,): duplicates share one."""
+        rows = np.arange(len(self))
+        ranks = [*range(2, min(_COMPARED + 1, len(self)) + 1)]
+        if not ranks:
+            return rows
+        near = self._tree_of_classes.query(self._with_class(self.centers, rows), ranks,
+                                           distance_upper_bound=_NEAR_M)[1]
+        first, column = np.nonzero(near < len(self))
+        return objects_of(self.centers, self.shapes,
+                          np.column_stack([first, near[first, column]]))
 
     @cached_property
     def _tree_of_classes(self) -> cKDTree:

@@ -20,7 +20,7 @@ from cliploc_ros.core.acceptance.confidence import (
     support,
     utilities,
 )
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins, leads
+from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
@@ -234,16 +234,15 @@ class Relocalizer:
         matched = np.array(sorted({one.landmark for found in compared.matches[0]
                                    for one in found}), dtype=np.int64)
         elsewhere = ~agreeing_poses(compared.poses)[0]
-        twins = find_twins(self._map, compared.poses[0], matched, compared.poses[elsewhere])
+        poses = find_twins(self._map, compared.poses[0], matched, compared.poses[elsewhere])
         low, high = self._options.height_range_m
-        within = (low <= twins.poses[:, 2, 3]) & (twins.poses[:, 2, 3] <= high)
-        if not within.any():
+        twins = [self._fitted(rig, pose) for pose in poses if low <= pose[2, 3] <= high]
+        if not twins:
             return 1.0, None
-        found = [self._fitted(rig, pose) for pose in twins.poses[within]]
-        poses = np.array([one.map_from_camera for one in found])
-        supports = self._supports(frames, cameras, poses, [matches_of(rig, one) for one in found])
-        log_odds = leads(compared.supports[0], supports, twins.shares[within])
-        return chance_distinct(log_odds), _position(poses[np.argmin(log_odds)])
+        poses = np.array([one.map_from_camera for one in twins])
+        supports = self._supports(frames, cameras, poses, [matches_of(rig, one) for one in twins])
+        chance, likeliest = chance_distinct(compared.supports[0], supports)
+        return chance, _position(poses[likeliest])
 
     def _fitted(self, rig: Rig, map_from_camera: NDArray[np.float64]) -> Finalist:
         """Return a pose (4, 4) that no search met, refined like those that it met."""

@@ -6,59 +6,45 @@ A camera sees the same at two places whose landmarks a turn about the vertical a
 each other. Such twins of the best pose are found in the map, so they count as rivals even if the
 search met one of the places only.
 
-Two poses at places that look alike explain the same detections. Which of them explains one object
-more then says little, since maps lack objects: only labels tell such places apart. The less alike
-the places are, the more does each object count.
+Two poses at places that look alike explain the same detections. Which of them matches one object
+more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
+places apart, and where there are none, the number of objects does to some degree. A conditional
+logit of its own, with these two terms only, weighs such poses.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.landmark_map import LandmarkMap
 
-# All constants are chosen on simulated worlds, see cliploc_ros.evaluation.worlds: kinds hall, two
-# rooms, corridor, room, office and shop, seeds 0 to 29.
+# All constants are chosen on simulated worlds, see cliploc_ros.evaluation.worlds: kinds room,
+# office, shop, corridor, hall and two rooms, seeds 0 to 59.
 # A place: what a pose matched, and what is nearer to it than this; at most so many landmarks.
 _PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
-# Landmarks whose repeats are looked up, and repeats that are compared.
-_LOOKED_UP, _COMPARED = 32, 256
+# Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
+_LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
 # Moves that lay a place within this of where another one does are the same.
 _SAME_M, _SAME_COSINE = 1.0, np.cos(np.radians(30.0))
 # The camera of a twin is elsewhere: as far away, or turned as far, as poses that do not agree.
-_ELSEWHERE_M, _ELSEWHERE_COSINE = 1.0, np.cos(np.radians(45.0))
-# Both places are upright.
+_ELSEWHERE_COSINE = np.cos(np.radians(45.0))
+# Both places are upright: one is moved onto the other by a turn about the vertical.
 _MOST_TILT = np.cos(np.radians(20.0))
 # How near a landmark must lie to one of its class, each time after the move is fitted [m].
 _NEAR_M = (0.6, 0.45, 0.3)
-_MOVES, _TWINS, _LEAST_LANDMARKS, _LEAST_SHARE = 8, 3, 4, 0.2
-# Log odds of a unit of likeness and of an object: between places that share nothing, and between
-# places that share all. A conditional logit, fitted on the twins of 1,886 poses.
-_LIKENESS, _OBJECT = (0.20, 0.89), (0.77, -1.46)
-
-
-class Twins(NamedTuple):
-    """Poses at places that look like that of another pose, the most alike first: m of them.
-
-    Parameters
-    ----------
-    poses : ndarray (m, 4, 4)
-        map_from_camera.
-    shares : ndarray (m,)
-        Share of the landmarks of the place that have one of their class at the same spot there.
-    """
-
-    poses: NDArray[np.float64]
-    shares: NDArray[np.float64]
+_LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.4, 0.3
+# The most twins of a pose.
+_TWINS = 3
+# Log odds of a unit of likeness, and of an object that was matched by class alone.
+_LIKENESS, _UNLABELLED = 0.44, 0.5
 
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
-               matched: NDArray[np.int64], others: NDArray[np.float64]) -> Twins:
+               matched: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return where a camera would be at the places that look most like that of a pose.
 
     Parameters
@@ -69,46 +55,47 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     matched : ndarray (n,) of int
         Landmarks that the pose explains detections with.
     others : ndarray (k, 4, 4)
-        Poses that a search met elsewhere; each is a twin if its place looks alike.
+        Poses that a search met elsewhere: their places are compared, too.
 
     Returns
     -------
-    Twins
-        At most 3. At least four landmarks of the place, a fifth of them, are there, too.
+    ndarray (m, 4, 4)
+        At most 3 poses, the place that is most alike first. A place looks like another one if at
+        least four landmarks, two fifths of those around it, and three tenths of those matched
+        have one of their class at the same spot there.
     """
     rows = _place(landmark_map, map_from_camera[:3, 3], matched)
+    if len(matched) == 0 or len(rows) < _LEAST_LANDMARKS:
+        return np.empty((0, 4, 4))
     moves = np.concatenate([_moves_of_map(landmark_map, rows),
                             _moves_of_poses(map_from_camera, others)])
     moves, found = _verified(landmark_map, rows, moves, map_from_camera[:3, 3])
-    shares = np.asarray(found.sum(axis=1) / max(1, len(rows)))
-    order = np.argsort(-shares, kind='stable')
-    order = order[shares[order] >= _LEAST_SHARE]
-    order = order[_distinct(moves[order], map_from_camera[:3, 3], _TWINS)]
-    return Twins(moves[order] @ map_from_camera, shares[order])
+    shares = found.mean(axis=1)
+    alike = (shares >= _LEAST_SHARE) & (found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
+    moves = moves[alike][np.argsort(-shares[alike], kind='stable')]
+    return moves[_distinct(moves, map_from_camera[:3, 3], _TWINS)] @ map_from_camera
 
 
-def leads(its: Support, supports: Sequence[Support], shares: NDArray[np.float64]
-          ) -> NDArray[np.float64]:
-    """Return the log odds (m,) that a pose is right rather than each of its twins.
+def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]:
+    """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
     Parameters
     ----------
     its : Support
         Of the pose.
-    supports : sequence of m Support
-        Of its twins.
-    shares : ndarray (m,)
-        How much the places are alike, see Twins.
+    twins : sequence of Support
+        Of the poses at places that look like its own, one at least.
+
+    Returns
+    -------
+    chance : float
+    likeliest : int
+        The twin that is likeliest.
     """
-    likeness = np.array([its.likeness - one.likeness for one in supports])
-    objects = np.array([its.inliers - one.inliers for one in supports])
-    return np.asarray((1.0 - shares) * (_LIKENESS[0] * likeness + _OBJECT[0] * objects)
-                      + shares * (_LIKENESS[1] * likeness + _OBJECT[1] * objects))
-
-
-def chance_distinct(log_odds: NDArray[np.float64]) -> float:
-    """Return the probability that a pose is right and none of its twins, from leads (m,)."""
-    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0)).sum()))
+    leads = np.array([_LIKENESS * (its.likeness - one.likeness)
+                      + _UNLABELLED * (its.unlabelled - one.unlabelled) for one in twins])
+    return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
+            int(np.argmin(leads)))
 
 
 def _place(landmark_map: LandmarkMap, position: NDArray[np.float64], matched: NDArray[np.int64]
@@ -186,7 +173,7 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
         if near_m > _NEAR_M[-1]:
             moves = _fitted(centers, landmark_map.centers[others], found)
     steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
-    elsewhere = ((np.linalg.norm(steps, axis=1) > _ELSEWHERE_M)
+    elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
                  | (moves[:, 0, 0] < _ELSEWHERE_COSINE))
     return moves[elsewhere], found[elsewhere]
 

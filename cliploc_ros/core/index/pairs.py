@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.compiled import compiled
 
 # Neighbours of a landmark that make pairs with it, and how far away they are [m]. Nearer ones do
-# not give the turn. 100,000 landmarks take 25 MB.
-_NEIGHBOURS = 12
+# not give the turn. 100,000 landmarks take 30 MB.
+_NEIGHBOURS = 10
 _LENGTH_M = (0.3, 3.0)
 # Pairs are alike if distance and height differ by less than this, also the side of a bin [m].
 _ALIKE_M = 0.25
@@ -40,7 +40,7 @@ class LandmarkPairs(NamedTuple):
 
     Parameters
     ----------
-    neighbours : ndarray (L, 12) of int
+    neighbours : ndarray (L, 10) of int
         Neighbours of each landmark; -1 for none.
     centers, classes : ndarray (L, 3), (L,)
         Of the landmarks.
