@@ -162,9 +162,9 @@ class Relocalizer:
         likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
         covariance = covariance_of(frames, rig, best, matches)
         distinct, twin = self._distinct(frames, rig, cameras, compared)
-        evidence = replace(self._evidence(frames, compared, likely, covariance,
-                                          looks.with_look(frames[-1].observation, poses[0])),
-                           distinct=distinct, twin=twin)
+        evidence = replace(self._evidence(frames, compared, likely, covariance),
+                           earlier=looks.confidences_in(frames[-1].observation, poses[0]),
+                           distinct=distinct, place=_position(poses[0]), twin=twin)
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
@@ -253,8 +253,7 @@ class Relocalizer:
         return start._replace(**refine_rig(rig, start.rotation, start.translation)._asdict())
 
     def _evidence(self, frames: Sequence[SearchedFrame], compared: '_Compared',
-                  likely: NDArray[np.float64], covariance: NDArray[np.float64], looks: Looks
-                  ) -> Evidence:
+                  likely: NDArray[np.float64], covariance: NDArray[np.float64]) -> Evidence:
         """Return the evidence for the best pose, the first of all."""
         coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
         elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
@@ -269,8 +268,7 @@ class Relocalizer:
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
             else meetings_of(frames, best, compared.matches[0]),
-            unexplained=supports[0].unexplained, looks=len(looks),
-            agreeing=looks.agreeing)
+            unexplained=supports[0].unexplained)
 
 
 class _Compared(NamedTuple):

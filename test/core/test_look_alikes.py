@@ -152,10 +152,11 @@ def test_only_labels_tell_places_apart():
     assert (chance < 1e-6, likeliest) == (True, 1)
 
 
-def test_a_refusal_names_the_other_place():
-    evidence = Evidence(6, 0.9999, distinct=0.6, twin=(9.0, 3.0, 1.234))
+def test_a_refusal_names_both_places():
+    evidence = Evidence(6, 0.9999, distinct=0.6, place=(1.0, -2.0, 0.5), twin=(9.0, 3.0, 1.234))
     reason = refusal(evidence, RelocalizerOptions())
-    assert reason.startswith('confidence 0.59 < 0.99; the place around x 9.00 y 3.00 z 1.23 m')
+    assert reason.startswith('confidence 0.59 < 0.99; around (1.00, -2.00, 0.50) and '
+                             '(9.00, 3.00, 1.23) m the map looks alike')
     assert 'turn the camera' in reason
 
 

@@ -37,8 +37,8 @@ _MOST_TILT = np.cos(np.radians(20.0))
 # How near a landmark must lie to one of its class, each time after the move is fitted [m].
 _NEAR_M = (0.6, 0.45, 0.3)
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.4, 0.3
-# The most twins of a pose.
-_TWINS = 3
+# The most twins of a pose, and poses of the search whose places are compared.
+_TWINS, _OTHERS = 3, 5
 # Log odds of a unit of likeness, and of an object that was matched by class alone.
 _LIKENESS, _UNLABELLED = 0.44, 0.5
 
@@ -55,7 +55,7 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     matched : ndarray (n,) of int
         Landmarks that the pose explains detections with.
     others : ndarray (k, 4, 4)
-        Poses that a search met elsewhere: their places are compared, too.
+        Poses that a search met elsewhere, best first: the places of five are compared, too.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     if len(matched) == 0 or len(rows) < _LEAST_LANDMARKS:
         return np.empty((0, 4, 4))
     moves = np.concatenate([_moves_of_map(landmark_map, rows),
-                            _moves_of_poses(map_from_camera, others)])
+                            _moves_of_poses(map_from_camera, others[:_OTHERS])])
     moves, found = _verified(landmark_map, rows, moves, map_from_camera[:3, 3])
     shares = found.mean(axis=1)
     alike = (shares >= _LEAST_SHARE) & (found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
