@@ -4,11 +4,11 @@
 
 Every retry is another chance of a false accept. Odometry carries the pose of each look to the
 newest frame. The looks of a standing robot show the same, so their confidences must not multiply.
-Their mean needs no independence: where looks are exchangeable, the mean ever reaches a limit with a
-probability of at most the mean of one look, divided by the limit, however often the robot looks
-(Ramdas and Manole, "Randomized and exchangeable improvements of Markov's, Chebyshev's and
-Chernoff's inequalities", 2023). So in a wrong map, a limit of .5 bounds the false accepts of all
-looks by twice the mean confidence of one.
+Their mean needs no independence. Where looks are exchangeable, their mean ever reaches a limit
+with a probability of at most the expected confidence of one look, divided by the limit, however
+often the robot looks (Ramdas and Manole, "Randomized and exchangeable improvements of Markov's,
+Chebyshev's and Chernoff's inequalities", 2023). So with a limit of .5, a robot that is nowhere in
+the map ever accepts a pose with at most twice the mean confidence of its looks.
 """
 
 from dataclasses import dataclass
