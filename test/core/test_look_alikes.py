@@ -3,9 +3,11 @@
 """Places that look alike, found in the map, and what tells them apart."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import Support
@@ -14,7 +16,9 @@ from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
 
 CLASSES = ('chair', 'cup', 'book', 'tv')
 NOWHERE = np.empty((0, 4, 4))
@@ -158,6 +162,61 @@ def test_a_refusal_names_both_places():
     assert reason.startswith('confidence 0.59 < 0.99; around (1.00, -2.00, 0.50) and '
                              '(9.00, 3.00, 1.23) m the map looks alike')
     assert 'turn the camera' in reason
+
+
+def doubled_room(offset):
+    room = make_room()
+    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{one}_2' for one in
+                                                            room.landmark_ids)),
+                   labels=room.labels * 2, class_ids=room.class_ids * 2,
+                   centers=np.concatenate([room.centers, room.centers + offset]),
+                   semi_axes=np.tile(room.semi_axes, (2, 1)),
+                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
+
+
+def seen(differing=0):
+    """What a camera sees in the first of two rooms, of which some labels differ."""
+    similarities = np.full((12, 24), 0.2, dtype=np.float32)
+    similarities[np.arange(12), np.arange(12)] = 0.3
+    similarities[np.arange(differing, 12), np.arange(12 + differing, 24)] = 0.3
+    return Observation(CAMERA, see_room(make_room()), similarities)
+
+
+def test_two_identical_rooms_are_refused_until_labels_differ():
+    relocalizer = Relocalizer(doubled_room(shift_along(10.0)), RelocalizerOptions())
+    found = [relocalizer.relocalize([seen(differing)]) for differing in (0, 1, 2, 6)]
+    assert [one.accepted for one in found] == [False, False, False, True]
+    first = found[0]
+    assert first.evidence.distinct == pytest.approx(0.5, abs=0.01)
+    places = sorted([first.evidence.place[0], first.evidence.twin[0]])
+    assert places == pytest.approx([0.3, 10.3], abs=0.05)
+    for x_m in places:
+        assert f'({x_m:.2f}, ' in first.reason
+    distinct = [one.evidence.distinct for one in found]
+    assert distinct == sorted(distinct)
+    for one in found[1:]:
+        assert pose_error(one.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+@pytest.mark.parametrize('offset_m', [0.0, 0.01])
+def test_a_room_with_every_landmark_doubled_is_still_accepted(offset_m):
+    """Duplicates count as one object, and a pose is not its own rival."""
+    doubled = doubled_room(shift_along(offset_m))
+    assert doubled.objects.max() == 11
+    found = Relocalizer(doubled, RelocalizerOptions()).relocalize([seen()])
+    assert found.accepted, found.reason
+    assert found.evidence.inliers == 12
+    assert found.evidence.twin is None
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+def test_duplicates_are_of_one_class_and_overlap():
+    boxes = make_map([[0, 0, 0], [0.05, 0, 0], [0.12, 0, 0], [1, 0, 0], [0, 0, 0]],
+                     ['book', 'book', 'book', 'book', 'cup'])
+    assert boxes.objects.tolist() == [0, 0, 0, 1, 2], 'duplicates of duplicates'
+    beside = make_map([[0, 0, 0], [0.2, 0, 0]], ['book', 'book'])
+    assert beside.objects.tolist() == [0, 1]
+    assert make_map([[0, 0, 0]], ['book']).objects.tolist() == [0]
 
 
 @pytest.mark.clock

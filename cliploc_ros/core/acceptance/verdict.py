@@ -133,8 +133,11 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.confidence >= options.min_confidence:
         return ''
     compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
+    # the rival holds most of the missing probability, or is likelier than the best score
+    is_ambiguous = evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely))
     others = evidence.likely * evidence.found * evidence.near
-    if evidence.twin is not None and others >= options.min_confidence:
+    if (evidence.twin is not None and evidence.distinct < options.min_confidence
+            and (is_ambiguous or others >= options.min_confidence)):
         return (f'{compared}; around {_point(evidence.place)} and {_point(evidence.twin)} m the '
                 'map looks alike; turn the camera to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
@@ -143,8 +146,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.likely >= options.min_confidence:
         return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
                 'samples; raise iterations or set algorithm to auto')
-    # the rival holds most of the missing probability, or is likelier than the best score
-    if evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely)):
+    if is_ambiguous:
         return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}; '
                 'turn the camera to objects that differ')
     return (f'{compared}; {evidence.inliers} objects matched, '
