@@ -138,8 +138,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     others = evidence.likely * evidence.found * evidence.near
     if (evidence.twin is not None and evidence.distinct < options.min_confidence
             and (is_ambiguous or others >= options.min_confidence)):
-        return (f'{compared}; around {_point(evidence.place)} and {_point(evidence.twin)} m the '
-                'map looks alike; turn the camera to objects that differ')
+        return (f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look alike; '
+                'turn the camera to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
         return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                 'turn the camera to more or nearer objects')
@@ -163,7 +163,7 @@ def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> str:
 
 
 def _point(position: tuple[float, float, float]) -> str:
-    return f'({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f})'
+    return f'({position[0]:.1f}, {position[1]:.1f}, {position[2]:.1f})'
 
 
 def _rounded_down(share: float) -> str:
