@@ -143,7 +143,7 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        cameras = _cameras_from_last([one.observation for one in frames])
+        cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
             return _nothing_found(frames, budget, f'{detections} detections give fewer than '
@@ -289,7 +289,7 @@ def _coverage(frames: Sequence[SearchedFrame]) -> float:
     return min(one.progress.coverage for one in frames)
 
 
-def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
     """Return each camera from the last (F, 4, 4), by odometry."""
     if not 1 <= len(observations) <= MAX_FRAMES:
         raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
