@@ -31,6 +31,7 @@ from cliploc_ros.core.fit.finalists import (
     Match,
     covariance_of,
     find_finalists,
+    first_of_each_place,
     matches_of,
     meetings_of,
 )
@@ -190,7 +191,7 @@ class Relocalizer:
 
     def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
                  finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
-        """Return the finalists with their supports, the likeliest first.
+        """Return the finalists with their supports, the likeliest first, one of each place.
 
         Poses that ignore the known vertical come last. Without refinement the greatest score is
         first, as in the paper.
@@ -202,7 +203,9 @@ class Relocalizer:
             else tilt_handicaps(poses, self._options.tilt_deviation_deg)
         order = list(range(len(finalists)))
         if self._options.refine:
-            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+            likeliest = np.argsort(handicaps - utilities(supports), kind='stable')
+            order = [row for known in (True, False) for row in first_of_each_place(
+                likeliest[is_upright[likeliest] == known].tolist(), finalists, MAX_DISTINCT)]
         return _Compared([finalists[row] for row in order], poses[order],
                          [matches[row] for row in order], [supports[row] for row in order],
                          handicaps[order])

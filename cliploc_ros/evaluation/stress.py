@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """False accepts in a list of troubles: ``python -m cliploc_ros.evaluation.stress --help``.
 
-Map, boxes or sensors are wrong, and the robot does not know. The table counts accepted poses that are
-wrong by more than 1 m, as a share of all requests, with the 95 % interval of Wilson; recall is
+Map, boxes or sensors are wrong, and the robot does not know. The table counts accepted poses that
+are wrong by more than 1 m, as a share of all requests, with the 95 % interval of Wilson; recall is
 the share of the right poses that is accepted.
 """
 
