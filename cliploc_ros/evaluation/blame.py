@@ -49,7 +49,7 @@ from cliploc_ros.evaluation.trials import Query, make_queries
 CAUSES = ('boxes', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}
 # Deviations of the simulated sensors, as in doc/results.md.
-_VERTICAL_NOISE_DEG, _ODOMETRY_NOISE, _HEIGHTS_M = 1.0, (0.01, 0.5), (0.8, 2.2)
+_VERTICAL_NOISE_DEG, _ODOMETRY_NOISE = 1.0, (0.01, 0.5)
 _MANY_BOXES = 5
 
 
@@ -154,8 +154,8 @@ def count_causes(landmark_map: LandmarkMap, known: Known, limit_m: float) -> lis
     return [blame(landmark_map, relocalizer, query, limit_m) for query in known.queries]
 
 
-def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool, matching: str
-                 ) -> Iterator[Known]:
+def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool, matching: str,
+                 heights_m: tuple[float, float]) -> Iterator[Known]:
     """Yield the queries of a file with more and more sensors.
 
     Parameters
@@ -166,6 +166,8 @@ def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool,
         Whether the neighbouring frames are queries, too.
     matching : str
         'hybrid', or 'class' for queries without similarities.
+    heights_m : tuple of float
+        Range of the camera's height where it is known.
     """
     frames = make_queries(queries, landmark_map, every_frame=True)
     if matching == 'class':
@@ -175,7 +177,7 @@ def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool,
     groups = [frame.group for frame in queries.frames]
     level = with_vertical(frames, _VERTICAL_NOISE_DEG)
     plain = RelocalizerOptions(matching=matching)
-    high = replace(plain, height_range_m=_HEIGHTS_M)
+    high = replace(plain, height_range_m=heights_m)
     several = len(set(groups)) < len(groups)
     for name, found, options in (
             ('one image', frames, plain), ('vertical', level, plain),
@@ -200,6 +202,8 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--limit', type=float, default=0.5, metavar='M',
                         help='error of a right pose (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main')
+    parser.add_argument('--height-range', type=float, nargs=2, default=(0.8, 2.2),
+                        metavar=('LOW', 'HIGH'), help='of the camera, where it is known [m]')
     options = parser.parse_args(arguments)
     landmark_map = LandmarkMap.from_file(options.map)
     files = [load_queries(path, landmark_map.landmark_ids) for path in options.queries]
@@ -207,8 +211,9 @@ def run(arguments: list[str]) -> int:
           + ' | '.join(CAUSES) + f' | fail with {_MANY_BOXES} candidates or more |')
     print('|---|---|' + '---|' * (len(CAUSES) + 3))
     for matching in options.matching:
-        by_mode = zip(*(with_sensors(file, landmark_map, options.frames == 'all', matching)
-                        for file in files), strict=True)
+        low, high = options.height_range
+        by_mode = zip(*(with_sensors(file, landmark_map, options.frames == 'all', matching,
+                                     (low, high)) for file in files), strict=True)
         for seeds in by_mode:
             found = [one for known in seeds
                      for one in count_causes(landmark_map, known, options.limit)]
