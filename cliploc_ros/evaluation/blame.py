@@ -5,14 +5,14 @@
 The true pose is refined on the boxes of its query like any hypothesis, and compared with what the
 search found. The first of these that holds is to blame:
 
-boxes       the true pose explains fewer boxes than a sample needs
+objects     the true pose explains fewer objects than a sample needs
 map         refinement leads the true pose away from the truth
 candidates  too few of the pairs that it explains are correspondence candidates
 choice      the search found a right pose, or the best one has more support than the true one
 search      the true pose has more support than any that the search found
 
-The last column counts failing queries with five or more boxes whose true landmark is a candidate:
-there association allows a right pose.
+The last column counts failing queries with five or more objects whose true landmark is a candidate
+of a box: there association allows a right pose. In several images an object counts once.
 """
 
 import argparse
@@ -46,11 +46,11 @@ from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
 
-CAUSES = ('boxes', 'map', 'candidates', 'search', 'choice')
+CAUSES = ('objects', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}
 # Deviations of the simulated sensors, as in doc/results.md.
 _VERTICAL_NOISE_DEG, _ODOMETRY_NOISE = 1.0, (0.01, 0.5)
-_MANY_BOXES = 5
+_MANY = 5
 
 
 class Blame(NamedTuple):
@@ -61,7 +61,7 @@ class Blame(NamedTuple):
     cause : str
         One of CAUSES; empty if the query does not fail.
     candidates : int
-        Number of its boxes, in all frames, whose true landmark is a correspondence candidate.
+        Number of landmarks that are correspondence candidates of a box that shows them.
     """
 
     cause: str
@@ -94,17 +94,17 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
     errors = [pose_error(one.map_from_camera, query.map_from_camera)[0]
               for one in found.hypotheses]
     true_pose, matches = _refined(frames, query.map_from_camera)
-    candidates = [len({(one.detection, one.landmark) for one in its}
-                      & set(map(tuple, frame.scene.pairs.tolist())))
+    candidates = [{one.landmark for one in its
+                   if [one.detection, one.landmark] in frame.scene.pairs.tolist()}
                   for frame, its in zip(frames, matches, strict=True)]
     least = frames[-1].sample_size
     if errors and errors[0] <= limit_m:
         cause = ''
-    elif sum(map(len, matches)) < least:
-        cause = 'boxes'
+    elif len({one.landmark for its in matches for one in its}) < least:
+        cause = 'objects'
     elif pose_error(true_pose, query.map_from_camera)[0] > limit_m:
         cause = 'map'
-    elif max(candidates) < least:
+    elif max(map(len, candidates)) < least:
         cause = 'candidates'
     elif any(error <= limit_m for error in errors):
         cause = 'choice'
@@ -113,7 +113,7 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
         best = [(one.support, one.map_from_camera) for one in found.hypotheses[:1]]
         leads = [_lead(*one, relocalizer.options) for one in ((its, true_pose), *best)]
         cause = 'search' if int(np.argmax(leads)) == 0 else 'choice'
-    return Blame(cause, sum(candidates))
+    return Blame(cause, len(set().union(*candidates)))
 
 
 def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float64]
@@ -208,7 +208,7 @@ def run(arguments: list[str]) -> int:
     landmark_map = LandmarkMap.from_file(options.map)
     files = [load_queries(path, landmark_map.landmark_ids) for path in options.queries]
     print(f'| by | known | queries | right within {options.limit:g} m | '
-          + ' | '.join(CAUSES) + f' | fail with {_MANY_BOXES} candidates or more |')
+          + ' | '.join(CAUSES) + f' | fail with {_MANY} candidates or more |')
     print('|---|---|' + '---|' * (len(CAUSES) + 3))
     for matching in options.matching:
         low, high = options.height_range
@@ -218,7 +218,7 @@ def run(arguments: list[str]) -> int:
             found = [one for known in seeds
                      for one in count_causes(landmark_map, known, options.limit)]
             counts = Counter(one.cause for one in found)
-            many = sum(bool(one.cause) and one.candidates >= _MANY_BOXES for one in found)
+            many = sum(bool(one.cause) and one.candidates >= _MANY for one in found)
             print(f'| {_MATCHINGS[matching]} | {seeds[0].name} | {len(found)} | {counts[""]} | '
                   + ' | '.join(str(counts[cause]) for cause in CAUSES) + f' | {many} |',
                   flush=True)

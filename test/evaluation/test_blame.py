@@ -52,14 +52,14 @@ def test_a_search_that_ends_at_once_is_to_blame(right):
     assert cause(landmark_map, query, algorithm='ransac', iterations=1) == 'search'
 
 
-def test_too_few_boxes_are_to_blame(right):
+def test_too_few_objects_are_to_blame(right):
     landmark_map, query = right
     observation = query.observation
     few = replace(query, observation=replace(
         observation, detections=observation.detections.select(np.arange(2)),
         similarities=observation.similarities[:2]))
     found = blame.blame(landmark_map, Relocalizer(landmark_map, RelocalizerOptions()), few, 0.5)
-    assert found.cause == 'boxes'
+    assert found.cause == 'objects'
     assert found.candidates <= 2
 
 
