@@ -32,6 +32,7 @@ from cliploc_ros.core.fit.finalists import (
     Match,
     covariance_of,
     find_finalists,
+    first_of_each_place,
     matches_of,
     meetings_of,
 )
@@ -149,7 +150,7 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        cameras = _cameras_from_last([one.observation for one in frames])
+        cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
             return _nothing_found(frames, budget, f'{detections} detections give fewer than '
@@ -200,7 +201,7 @@ class Relocalizer:
 
     def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
                  finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
-        """Return the finalists with their supports, the likeliest first.
+        """Return the finalists with their supports, the likeliest first, one of each place.
 
         Poses that ignore the known vertical come last. Without refinement the greatest score is
         first, as in the paper.
@@ -212,7 +213,9 @@ class Relocalizer:
             else tilt_handicaps(poses, self._options.tilt_deviation_deg)
         order = list(range(len(finalists)))
         if self._options.refine:
-            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+            likeliest = np.argsort(handicaps - utilities(supports), kind='stable')
+            order = [row for known in (True, False) for row in first_of_each_place(
+                likeliest[is_upright[likeliest] == known].tolist(), finalists, MAX_DISTINCT)]
         return _Compared([finalists[row] for row in order], poses[order],
                          [matches[row] for row in order], [supports[row] for row in order],
                          handicaps[order])
@@ -319,7 +322,7 @@ def _coverage(frames: Sequence[SearchedFrame]) -> float:
     return min(one.progress.coverage for one in frames)
 
 
-def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
     """Return each camera from the last (F, 4, 4), by odometry."""
     if not 1 <= len(observations) <= MAX_FRAMES:
         raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
