@@ -24,7 +24,6 @@ from cliploc_ros.core.acceptance.confidence import (
 )
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.search.leaders import MAX_DISTINCT
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.summary import wilson_interval
 
@@ -206,7 +205,7 @@ class _Arrays(NamedTuple):
 
 
 def _arrays(cases: Sequence[Case]) -> _Arrays:
-    shape = (len(cases), MAX_DISTINCT)
+    shape = (len(cases), max(len(case.supports) for case in cases))
     supports, handicaps = np.zeros((*shape, len(_FIELDS))), np.zeros(shape)
     given, right = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for row, case in enumerate(cases):

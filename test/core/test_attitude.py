@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import Support, confidences, utilities
+from cliploc_ros.core.acceptance.confidence import Setting, Support, confidences, utilities
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.options import RelocalizerOptions
@@ -43,10 +43,10 @@ def test_the_heading_does_not_matter_nor_a_deviation_of_zero():
 
 
 def test_a_handicap_takes_confidence_and_gives_it_to_the_rival():
-    supports, poses = [Support(4, 2.5, 6.0, 8.0, 3)] * 2, np.tile(np.eye(4), (2, 1, 1))
+    supports, poses = [Support(4, 2.5, 6.0, 8.0, 6.0)] * 2, np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 5.0
-    level = confidences(supports, poses)
-    upside_down = confidences(supports, poses, handicaps=np.array([WRONG_MOUNT, 0.0]))
+    level = confidences(supports, poses, Setting(40))
+    upside_down = confidences(supports, poses, Setting(40), handicaps=np.array([WRONG_MOUNT, 0.0]))
     assert level[0] == pytest.approx(level[1])
     assert upside_down[0] < 0.02 < level[1] < upside_down[1]
 
