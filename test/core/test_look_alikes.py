@@ -88,7 +88,7 @@ def test_only_labels_tell_places_apart():
 
 def test_a_refusal_names_the_other_place():
     evidence = Evidence(6, 0.9999, distinct=0.6, twin=(9.0, 3.0, 1.234))
-    reason = refusal(evidence, RelocalizerOptions())
+    reason = refusal(evidence, RelocalizerOptions(min_confidence=0.99))
     assert reason.startswith('confidence 0.59 < 0.99; the place around x 9.00 y 3.00 z 1.23 m')
     assert 'turn the camera' in reason
 

@@ -232,7 +232,7 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.995, looks=3, agreeing=2), {}, ''),
 ])
 def test_refusal_names_its_reason(evidence, options, reason):
-    answer = refusal(evidence, RelocalizerOptions(**options))
+    answer = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
     assert answer.startswith(reason)
     assert bool(answer) == bool(reason)
     assert len(f'refused: {answer}') <= 120
@@ -263,7 +263,7 @@ def test_an_ambiguous_scene_shares_its_confidence(office_map, queries, observe):
         given = [one.confidence for one in result.hypotheses]
         assert all(0 <= one <= 1 for one in given)
         assert result.confidence == (given[0] if given else 0)
-        assert result.accepted == (result.confidence >= 0.99)
+        assert result.accepted == (result.confidence >= relocalizer.options.min_confidence)
         assert result.accepted == (not result.reason)
 
 
