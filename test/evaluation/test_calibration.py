@@ -75,7 +75,7 @@ def test_places_elsewhere_lower_the_confidence_by_their_share():
     cases = make_cases(np.random.default_rng(4), 1000)
     wrong = [replace(case, is_elsewhere=True, right=np.zeros_like(case.right)) for case in cases]
     likely, right = outcomes(cases, fit([*cases, *wrong]))
-    assert likely.mean() == pytest.approx(right.mean() / 1.1, rel=0.05)
+    assert likely.mean() == pytest.approx(right.mean() / 1.1, rel=0.1)
 
 
 def test_best_recall_at_a_precision():
