@@ -133,9 +133,9 @@ def fit(cases: Sequence[Case]) -> Calibration:
     scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
     bounds = list(_SIGNS)
     start = np.append(np.zeros(len(_FIELDS)), [1.0, DEFAULT.map_size, DEFAULT.vertical])
-    for column in (0, 1):
+    for column in (1, 2):  # size of the map, vertical
         if np.ptp(data.settings[:, column]) == 0.0:
-            row = len(_FIELDS) + 1 + column
+            row = len(_FIELDS) + column
             bounds[row] = (start[row], start[row])
     solved = minimize(_loss, start, (data, scale), jac=True, method='L-BFGS-B', bounds=bounds)
     return _levelled(cases, Calibration(*map(float, [*solved.x / scale, 0.0, 0.0])))

@@ -20,7 +20,8 @@ from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.evaluation.trust import within_ellipsoid
 
-MADE_FROM = DEFAULT._replace(slope=0.0)
+# a fit begins at the installed influence of the map's size and the vertical
+MADE_FROM = DEFAULT._replace(none_right=3.0, map_size=0.8, vertical=-1.0, slope=0.0)
 
 
 def make_cases(rng, count):
@@ -54,8 +55,8 @@ def test_a_fit_finds_what_the_data_were_made_from():
     assert found.misfit == pytest.approx(MADE_FROM.misfit, rel=0.15)
     assert found.unexplained == pytest.approx(MADE_FROM.unexplained, rel=0.15)
     assert found.rarity == pytest.approx(MADE_FROM.rarity, rel=0.15)
-    assert found.map_size == pytest.approx(MADE_FROM.map_size, rel=0.25)
-    assert found.vertical == pytest.approx(MADE_FROM.vertical, rel=0.25)
+    assert found.map_size == pytest.approx(MADE_FROM.map_size, rel=0.3)
+    assert found.vertical == pytest.approx(MADE_FROM.vertical, rel=0.3)
     assert found.slope < 0.3
     likely, right = outcomes(cases[2000:], found)
     for low, high in ((0.0, 0.2), (0.2, 0.8), (0.8, 1.0)):
