@@ -62,6 +62,7 @@ setup(
             f'replay = {PACKAGE}.cli.replay:main',
             f'studio = {PACKAGE}.cli.studio:main',
             f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',
+            f'wake_up = {PACKAGE}.cli.wake_up:main',
         ],
     },
 )

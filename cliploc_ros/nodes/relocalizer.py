@@ -96,10 +96,19 @@ class RelocalizerNode(ManagedNode):
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           'map file': self.settings['map_file'],
-                          'base frame': self.settings['base_frame']}
+                          'base frame': self.settings['base_frame'],
+                          'time limit [s]': self.settings['timeout_s'],
+                          'missing': '; '.join(self._missing())}
         if self._pipeline.localizer is not None:
             health.values |= {'map': self._pipeline.localizer.description,
                               'device': self._pipeline.localizer.device}
+
+    def _missing(self) -> list[str]:
+        """Return what a request needs and does not find, one line each."""
+        missing = self._frames.missing()
+        if self.settings['require_localizer'] and (localizer := self._handoff.missing()):
+            missing.append(localizer)
+        return missing
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()

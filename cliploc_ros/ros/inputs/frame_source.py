@@ -155,6 +155,11 @@ class FrameSource:
                                    f'{self._why_none(after)}')
             return frame
 
+    def missing(self) -> list[str]:
+        """Return for each input that nothing publishes a line that says what to do."""
+        return [self._silence(name) for name in self._topics
+                if self._node.count_publishers(self._resolved(name)) == 0]
+
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
