@@ -2,17 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detections of yolo_ros: yolo_msgs where it is installed, a clear message where it is not."""
 
-import importlib.util
+import os
 from types import SimpleNamespace as Fields
 
 import pytest
 from processes import wait_for
 from rclpy.serialization import serialize_message
-from tester import RELIABLE, make_frame
+from tester import RELIABLE, class_matching, make_frame
 
 from cliploc_ros.ros.inputs.detection_types import from_yolo_msg
-
-INSTALLED = importlib.util.find_spec('yolo_msgs') is not None
 
 
 def as_yolo(msg, array=Fields, detection=Fields):
@@ -61,9 +59,12 @@ def test_a_request_with_detections_of_yolo_ros(own_relocalizer, tester):
         tester.destroy_publisher(publisher)
 
 
-@pytest.mark.skipif(INSTALLED, reason='yolo_msgs is installed')
-def test_without_yolo_msgs_the_node_says_so(own_relocalizer, tester):
-    process = own_relocalizer(expect='[ERROR]', detections_type='yolo_msgs')
+def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):
+    (tmp_path / 'yolo_msgs.py').write_text("raise ImportError('not here')")
+    process = start('nodes.relocalizer', parameters=class_matching(
+        room_map, detections_type='yolo_msgs'), PYTHONPATH=os.pathsep.join(
+            [str(tmp_path), os.environ.get('PYTHONPATH', '')]))
+    process.wait_for_output('[ERROR]')
     assert 'detections_type: yolo_msgs is not installed' in process.output()
     assert 'yolo_msgs is not installed' in tester.answer(tester.ask()).message
     assert 'Traceback' not in process.output()
