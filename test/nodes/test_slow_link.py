@@ -26,12 +26,14 @@ def test_every_request_over_a_slow_link_is_answered_once(room_map):
     done = subprocess.run(
         [sys.executable, here / 'slow_link.py', '--delay-ms', '50', '--loss', '0.05',
          '--rate-mbit', '10', '--left', sys.executable, here / 'remote_camera.py', str(REQUESTS),
-         'compressed', 'best_effort', '30',
+         'compressed', 'reliable', '90',
          '--right', sys.executable, '-m', 'cliploc_ros.nodes.relocalizer', '--ros-args',
          *parameters],
         capture_output=True, text=True, timeout=150, cwd=PROJECT, env=os.environ | {
             'PYTHONPATH': os.pathsep.join([str(PROJECT), str(here.parent), str(here),
-                                           os.environ.get('PYTHONPATH', '')])})
+                                           os.environ.get('PYTHONPATH', '')]),
+            'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROJECT / 'config/fastdds_slow_network.xml'),
+            'RMW_FASTRTPS_USE_QOS_FROM_XML': '1'})
     assert done.returncode == 0, done.stderr
     answers = [json.loads(line.removeprefix('ANSWER ')) for line in done.stdout.splitlines()
                if line.startswith('ANSWER ')]

@@ -65,6 +65,7 @@ def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):
         room_map, detections_type='yolo_msgs'), PYTHONPATH=os.pathsep.join(
             [str(tmp_path), os.environ.get('PYTHONPATH', '')]))
     process.wait_for_output('[ERROR]')
+    tester.connect()
     assert 'detections_type: yolo_msgs is not installed' in process.output()
     assert 'yolo_msgs is not installed' in tester.answer(tester.ask()).message
     assert 'Traceback' not in process.output()
