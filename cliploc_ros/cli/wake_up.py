@@ -4,10 +4,12 @@
 
 import argparse
 import math
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import run_command, split_ros_args
 from cliploc_ros.errors import OptionsError
 
 _NOT_READY = 2
@@ -25,8 +27,10 @@ def main(args: Sequence[str] | None = None) -> int:
     """Wake the robot up; return the exit code."""
     plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
     options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: wake_up(options, ros_args), failure=_NOT_READY)
+    interrupted = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: interrupted.set())
+    return run_command(lambda: wake_up(options, ros_args, interrupted), failure=_NOT_READY)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -46,7 +50,8 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def wake_up(options: argparse.Namespace, ros_args: list[str]) -> int:
+def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: threading.Event
+            ) -> int:
     """Wake the robot up with the options of the command line; return the exit code.
 
     Raises
@@ -73,7 +78,8 @@ def wake_up(options: argparse.Namespace, ros_args: list[str]) -> int:
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
         raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
     try:
-        node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg))
+        node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg),
+                      interrupted)
         try:
             return node.run()
         finally:

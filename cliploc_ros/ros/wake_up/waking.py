@@ -4,6 +4,7 @@
 
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -59,9 +60,12 @@ class WakeUp(Node):
     Parameters
     ----------
     options : WakeUpOptions
+    interrupted : threading.Event
+        Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
+        and nothing would cancel it.
     """
 
-    def __init__(self, options: WakeUpOptions) -> None:
+    def __init__(self, options: WakeUpOptions, interrupted: threading.Event) -> None:
         super().__init__('wake_up', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
@@ -71,13 +75,21 @@ class WakeUp(Node):
         self._turning = Turning(self, self._wait, math.radians(options.turn_deg))
         self._began_at = time.monotonic()
         self._options = options
+        self._interrupted = interrupted
         self._said: dict[str, str] = {}
 
     def run(self) -> Outcome:
-        """Look until a pose is accepted or time is up; end a turn under way in any case."""
+        """Look until a pose is accepted or time is up; end a turn under way in any case.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            The event is set; no turn is under way.
+        """
         try:
             return self._look_about()
         finally:
+            self._interrupted = threading.Event()  # this one is handled
             self._turning.stop()
 
     def _look_about(self) -> Outcome:
@@ -105,7 +117,7 @@ class WakeUp(Node):
                 self._say('waiting', problem)
             if not problem or self._is_time_up:
                 return problem
-            self._executor.spin_once(timeout_sec=_SPIN_S)
+            self._spin()
 
     def _problem(self) -> str:
         """Return why there can be no request now; empty if there can."""
@@ -166,8 +178,13 @@ class WakeUp(Node):
         while not condition():
             if time.monotonic() > end:
                 return False
-            self._executor.spin_once(timeout_sec=_SPIN_S)
+            self._spin()
         return True
+
+    def _spin(self) -> None:
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+        self._executor.spin_once(timeout_sec=_SPIN_S)
 
 
 def _verdict_of(message: str) -> Verdict:
