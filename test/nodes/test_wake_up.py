@@ -222,7 +222,8 @@ def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_
     relocalizer = start('nodes.relocalizer', '--ros-args', '-r', 'relocalizer:__node:=brief',
                         parameters=class_matching(room_map, timeout_s=60.0))
     process = start('cli.wake_up', '--timeout', 8, '--relocalizer', 'brief')
-    tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the request')
+    tester.wait(lambda: any(one.node_name == 'brief' for one in
+                            tester.get_subscriptions_info_by_topic('/image')), 'the request')
     relocalizer.stop(signal.SIGKILL)
     assert end(process) == NOT_READY
     assert re.search(r'look 1 \[\d+\.\d s\]: /brief has been silent for \d s: it died; start '
