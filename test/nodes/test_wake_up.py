@@ -137,14 +137,15 @@ def test_the_robot_turns_until_it_sees_enough(relocalizer, start, end, serve_spi
     steps = [math.degrees(goal.target_yaw) for goal in spinner.goals]
     # an image from before a turn may still be on its way: another turn
     assert steps[:4] == pytest.approx([30.0, 30.0, -30.0, -30.0])
-    assert len(looks(process)) == len(steps) + 1
+    turns = [turned for _, turned, _ in looks(process) if turned]
+    assert len(turns) == len(steps)
     assert all(goal.time_allowance.sec == 10 for goal in spinner.goals)
-    assert [turned for _, turned, _ in looks(process)][:5] == [
-        '', ', turned by 30 deg',
+    assert turns[:4] == [
+        ', turned by 30 deg',
         ', not turned by 30 deg (aborted: collision ahead, Collision Ahead, code 703)',
         ', turned by -30 deg', ', turned by -30 deg']
-    assert [answer.split(':')[0] for _, _, answer in looks(process)] == [
-        'refused'] * len(steps) + ['accepted']
+    *others, last = [answer.split(':')[0] for _, _, answer in looks(process)]
+    assert (set(others), last) == ({'refused'}, 'accepted')
 
 
 @pytest.mark.needs('nav2_msgs')

@@ -16,7 +16,7 @@ from rclpy.node import Node
 # Nav2's default limit of a turn, and what its answer may take beyond [s].
 _ALLOWANCE_S = 10.0
 _GRACE_S = 3.0
-_STOP_S = 2.0
+_STOP_S = 4.0
 _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'cancelled'}
 
 #: Spins the node until a condition holds or a number of seconds is over; returns whether it holds.
