@@ -36,6 +36,7 @@ from cliploc_ros.core.fit.finalists import (
 )
 from cliploc_ros.core.fit.rig import Rig, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
+from cliploc_ros.core.joined_map import place_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -232,11 +233,14 @@ class Relocalizer:
                                    for one in found}), dtype=np.int64)
         twins = elsewhere[look_alike(self._map, compared.poses[0], matched,
                                      compared.poses[elsewhere])]
+        twin = place_of(self._map, compared.poses[twins[0]]) if len(twins) else None
+        rival = elsewhere[np.argmax(rivals)] if len(elsewhere) else 0
         return Evidence(
             supports[0].inliers, likely[0],
             min(max(rivals, default=0.0), 1.0 - likely[0]),
             distinct=chance_distinct(supports[0], [supports[row] for row in twins]),
-            twin=_position(compared.poses[twins[0]]) if len(twins) else None,
+            twin=twin and twin.position, twin_map=twin.name if twin else '',
+            rival_map=place_of(self._map, compared.poses[rival]).name,
             # the covariance of a minimal sample is too rough to decide
             near=1.0 if best.information is None else share_within(RIGHT_M, covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
@@ -268,11 +272,6 @@ class _Compared(NamedTuple):
     matches: list[list[tuple[Match, ...]]]
     supports: list[Support]
     handicaps: NDArray[np.float64]
-
-
-def _position(pose: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = pose[:3, 3].tolist()
-    return x, y, z
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str

@@ -51,6 +51,8 @@ class Evidence:
         Number of successive looks, this one included.
     agreeing : int
         Number of these looks that lead to this pose.
+    rival_map, twin_map : str
+        Name of the map of the likeliest rival and of the twin, where there are several maps.
     """
 
     inliers: int
@@ -66,6 +68,8 @@ class Evidence:
     unexplained: float = 0.0
     looks: int = 1
     agreeing: int = 1
+    rival_map: str = ''
+    twin_map: str = ''
 
     @property
     def found(self) -> float:
@@ -128,20 +132,24 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     others = evidence.likely * evidence.found * evidence.near
     if evidence.twin is not None and others >= options.min_confidence:
         x, y, z = evidence.twin
-        return (f'{compared}; the place around x {x:.2f} y {y:.2f} z {z:.2f} m looks alike; '
-                'turn the camera to objects that differ')
+        return (f'{compared}; the place around x {x:.2f} y {y:.2f} z {z:.2f} m'
+                f'{_in(evidence.twin_map)} looks alike; turn the camera to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
         return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                 'turn the camera to more or nearer objects')
     if evidence.likely >= options.min_confidence:
         return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
                 'samples; raise iterations or set algorithm to auto')
-    # the rival holds most of the missing probability, or is likelier than the best score
-    if evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely)):
-        return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}; '
-                'turn the camera to objects that differ')
+    # the rival holds most of the missing probability, or is half as likely as the pose
+    if evidence.rival > 0.5 * min(evidence.likely, 1.0 - evidence.likely):
+        return (f'{compared}; ambiguous, another pose{_in(evidence.rival_map)} has '
+                f'{evidence.rival:.2g}; turn the camera to objects that differ')
     return (f'{compared}; {evidence.inliers} objects matched, '
             f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
+
+
+def _in(map_name: str) -> str:
+    return f' in {map_name}' if map_name else ''
 
 
 def _contradicted(evidence: Evidence) -> str:
