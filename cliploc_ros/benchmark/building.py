@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,11 +107,15 @@ def measure(options: argparse.Namespace) -> None:
         for one in queries])
     show('all floors', options, [(one, everything) for one in queries])
     if len(maps) > 2 and not options.alike:
-        others = [searched(*([*some[:floor], *some[floor + 1:]] for some in (maps, labels)),
-                           settings) for floor in range(min(3, len(maps)))]
+        others = [searched(_without(maps, floor), _without(labels, floor), settings)
+                  for floor in range(min(3, len(maps)))]
         show('all but its floor', options, [(one, others[one.floor]) for one in queries
                                             if one.floor < len(others)])
     print(f'peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB')
+
+
+def _without[T](some: Sequence[T], number: int) -> list[T]:
+    return [*some[:number], *some[number + 1:]]
 
 
 def show(name: str, options: argparse.Namespace, requests: Sequence[tuple[Query, Searched]]
@@ -195,7 +199,7 @@ def _units(rng: np.random.Generator, count: int, size: int) -> NDArray[np.float3
     return _unit(rng.standard_normal((count, size), dtype=np.float32))
 
 
-def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+def _unit(rows: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
 
 

@@ -118,7 +118,8 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         raise MapError(f'{len(maps)} maps: at most {MAX_MAPS} are searched at once')
     _check_frames(maps, sources)
     gap = _APART * max(float(one.semi_axes.max()) for one in maps)
-    parts, first, begin = [], 0, 0.0
+    parts: list[MapPart] = []
+    first, begin = 0, 0.0
     for one in maps:
         low, high = one.centers.min(axis=0), one.centers.max(axis=0)
         shift = np.zeros(3)

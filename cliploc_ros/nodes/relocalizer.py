@@ -14,6 +14,7 @@ from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.map_services import MapServices
 from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -48,10 +49,10 @@ class RelocalizerNode(ManagedNode):
         group = BoundedCallbackGroup(MAX_REQUESTS)
         for service_type, name, callback in (
                 (Trigger, '~/relocalize', self._on_relocalize),
-                (Trigger, '~/reload_map', self._on_reload_map),
                 (Empty, 'reinitialize_global_localization', self._on_reinitialize)):
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
                                 callback_group=group)
+        MapServices(self, self._pipeline, group)
 
     def load(self) -> str:
         """Load map and network."""
@@ -95,7 +96,8 @@ class RelocalizerNode(ManagedNode):
         self._frames.examine(health, self.settings['stale_after_s'])
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
-                          'map file': self.settings['map_file'],
+                          'map file': ', '.join(filter(None, [
+                              self.settings['map_file'], *self.settings['map_files']])),
                           'base frame': self.settings['base_frame']}
         if self._pipeline.localizer is not None:
             health.values |= {'map': self._pipeline.localizer.description,
@@ -109,16 +111,6 @@ class RelocalizerNode(ManagedNode):
 
     def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
         self._answer()
-        return response
-
-    def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Read the map again in the worker, never in the middle of a search."""
-        try:
-            response.message = f'loaded: {self.worker.run(self._pipeline.reload_map)}'
-            response.success = True
-        except CliplocError as error:
-            response.message = f'not loaded: {error}'
-        self.get_logger().info(f'map {response.message}')
         return response
 
     def _answer(self) -> Answer:

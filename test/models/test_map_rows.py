@@ -45,8 +45,8 @@ def test_labels_with_weights_are_mixed(clip, small_clip):
     described = replace(ROOM, details=(
         LandmarkDetails(labels=((ROOM.labels[0], 3.0), ('a red cup', 1.0))),
         *[LandmarkDetails()] * (len(ROOM) - 1)))
-    rows = np.asarray(embed_map(clip, described, '', 'both'))
-    plain = np.asarray(embed_map(clip, ROOM, '', 'both'))
+    rows = np.asarray(embed_map(clip, described, [], 'both'))
+    plain = np.asarray(embed_map(clip, ROOM, [], 'both'))
     assert np.array_equal(rows[1:], plain[1:])
     expected = np.array([3.0, 1.0]) @ small_clip.labels([ROOM.labels[0], 'a red cup'])
     assert rows[0] == pytest.approx(expected / np.linalg.norm(expected), abs=1e-5)
@@ -66,9 +66,9 @@ def test_each_label_is_in_the_cache_once(clip, tmp_path, caplog):
 def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     images = images_of(resolve_clip_weights(clip).key)
     save_landmark_embeddings(embeddings_path(map_file), images)
-    plain = np.asarray(embed_map(clip, ROOM, str(map_file), 'text'))
-    rows = np.asarray(load_encoder_for_map(clip, ROOM, str(map_file), compare).label_embeddings)
-    assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, '', compare)))
+    plain = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'text'))
+    rows = np.asarray(load_encoder_for_map(clip, ROOM, [str(map_file)], compare).label_embeddings)
+    assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, [], compare)))
     similar = np.sum(rows * images.means, axis=1)
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
     if compare == 'image':
@@ -76,7 +76,7 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     # the order is that of the map, and landmarks that were added have their label
     fewer = images_of(images.encoder_key).in_order(ROOM.landmark_ids[:0:-1])
     save_landmark_embeddings(embeddings_path(map_file), fewer)
-    again = np.asarray(embed_map(clip, ROOM, str(map_file), compare))
+    again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
     assert np.isfinite(again).all()
     assert np.argmax(again[1:] @ images.means[1:].T, axis=1).tolist() == list(range(len(ROOM) - 1))
 
@@ -99,12 +99,12 @@ def test_images_that_cannot_be_used_leave_the_labels(clip, map_file, images, cha
     save_landmark_embeddings(file, images)
     if change is not None:
         change(file)
-    rows = np.asarray(embed_map(clip, ROOM, str(map_file), 'both'))
-    assert np.array_equal(rows, np.asarray(embed_map(clip, ROOM, '', 'text')))
+    rows = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'both'))
+    assert np.array_equal(rows, np.asarray(embed_map(clip, ROOM, [], 'text')))
     warning, = (one for one in caplog.records if one.levelname == 'WARNING')
     assert message in warning.getMessage() and str(file) in warning.getMessage()
 
 
 def test_a_map_without_images_says_nothing(clip, map_file, caplog):
-    embed_map(clip, ROOM, str(map_file), 'both')
+    embed_map(clip, ROOM, [str(map_file)], 'both')
     assert not [one for one in caplog.records if one.levelname == 'WARNING']

@@ -57,14 +57,14 @@ def timer():
 
 def test_a_perfect_view_gives_the_true_pose(localizer, values):
     times = timer()
-    found, view, compared, is_cut = localizer.localize(make_frame(), values,
-                                                       RobotState(np.eye(4)), times)
+    found, landmark_map, view, compared, is_cut = localizer.localize(
+        make_frame(), values, RobotState(np.eye(4)), times)
     assert (compared, is_cut) == (0, False)
     assert view.image_rgb.shape == (CAMERA.height, CAMERA.width, 3)
     distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
     assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
     assert list(times.ms) == ['waiting', 'decoding', 'search']
-    assert localizer.map_frame == 'map'
+    assert landmark_map.frame_id == 'map'
     assert localizer.description == "12 landmarks in frame 'map', class_bf"
 
 

@@ -129,7 +129,7 @@ def split_similarities(similarities: Similarities, sizes: Sequence[int]) -> list
         Number of landmarks of each map, in order; L in all.
     """
     if not isinstance(similarities, CropSimilarities):
-        return np.split(similarities, np.cumsum(sizes)[:-1], axis=1)
+        return [*np.split(similarities, np.cumsum(sizes)[:-1], axis=1)]
     labels = similarities.labels
     parts = labels.parts or labels.in_parts(sizes).parts
     return [CropSimilarities(similarities.crops, part) for part in parts]
