@@ -13,6 +13,8 @@ _MIN_ITERATIONS = 500
 # the poses of likelihood .99 that 100 to 1,000 samples (ransac, b-prosac, auto) met once or never,
 # 9 of 813 were wrong on the 258 TUM frames, which also fitted the confidence.
 _MISSED_IS_RIGHT = 0.2
+# A refusal does not mention less likely rivals.
+_LEAST_RIVAL = 0.001
 _LOOK_ABOUT = 'turn the camera to more objects'
 
 
@@ -140,8 +142,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.likely >= options.min_confidence:
         return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
                 'samples; raise iterations or set algorithm to auto')
-    # the rival holds most of the missing probability, or is half as likely as the pose
-    if evidence.rival > 0.5 * min(evidence.likely, 1.0 - evidence.likely):
+    # the rival holds most of the missing probability, or is about as likely as the pose
+    if evidence.rival > max(_LEAST_RIVAL, min(0.9 * evidence.likely,
+                                              0.5 * (1.0 - evidence.likely))):
         return (f'{compared}; ambiguous, another pose{_in(evidence.rival_map)} has '
                 f'{evidence.rival:.2g}; turn the camera to objects that differ')
     return (f'{compared}; {evidence.inliers} objects matched, '
