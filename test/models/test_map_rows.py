@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scene import make_room
 
+from cliploc_ros.core.joined_map import join_maps
 from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_embeddings import (
     LandmarkEmbeddings,
@@ -108,3 +109,25 @@ def test_images_that_cannot_be_used_leave_the_labels(clip, map_file, images, cha
 def test_a_map_without_images_says_nothing(clip, map_file, caplog):
     embed_map(clip, ROOM, [str(map_file)], 'both')
     assert not [one for one in caplog.records if one.levelname == 'WARNING']
+
+
+def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_path, caplog):
+    """Each map keeps rows of its own; a map without images has all maps compared by labels."""
+    maps = [replace(ROOM, frame_id='hall'), replace(ROOM, frame_id='attic').select([2, 0, 1])]
+    files = [str(tmp_path / f'{one.frame_id}.yaml') for one in maps]
+    both = join_maps(maps, files)
+    for one, file in zip(maps, files, strict=True):
+        write_map(file, one)
+        save_landmark_embeddings(embeddings_path(file), images_of(
+            resolve_clip_weights(clip).key, one.landmark_ids))
+    rows = embed_map(clip, both, files, 'image')
+    expected = [images_of('', one.landmark_ids).means for one in maps]
+    assert np.array_equal(np.asarray(rows), np.concatenate(expected))
+    for part, own in zip(rows.parts, expected, strict=True):
+        assert np.array_equal(np.asarray(part), own)
+    embeddings_path(files[1]).unlink()
+    plain = np.asarray(embed_map(clip, ROOM, [], 'text'))
+    rows = embed_map(clip, both, files, 'image')
+    assert np.array_equal(np.asarray(rows), plain[[*range(len(ROOM)), 2, 0, 1]])
+    warning, = (one for one in caplog.records if one.levelname == 'WARNING')
+    assert f'{files[1]} has no images' in warning.getMessage()
