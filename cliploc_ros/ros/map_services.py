@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps at run time: ``~/reload_map``, and ``~/load_map`` where nav2_msgs is installed."""
 
+import importlib
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -33,10 +34,10 @@ class MapServices:
         node.create_service(Trigger, '~/reload_map', self._on_reload, qos_profile=qos.SERVICE,
                             callback_group=group)
         try:
-            from nav2_msgs.srv import LoadMap
+            load_map = importlib.import_module('nav2_msgs.srv').LoadMap
         except ImportError:
             return  # map_file and reload_map do the same
-        node.create_service(LoadMap, '~/load_map', self._on_load, qos_profile=qos.SERVICE,
+        node.create_service(load_map, '~/load_map', self._on_load, qos_profile=qos.SERVICE,
                             callback_group=group)
 
     def load(self, map_url: str) -> str:
