@@ -160,7 +160,7 @@ def simulate(options: argparse.Namespace
         seed = 0 if options.alike else number
         floor = make_floor(options.objects, seed)
         one = replace(floor.landmark_map, frame_id=f'floor_{number}')
-        own = _units(np.random.default_rng(seed), len(one), size)
+        own = _units(np.random.default_rng([1, seed]), len(one), size)
         maps.append(one)
         labels.append(_unit(own + _OF_CLASS * np.array([of_classes[name]
                                                         for name in one.class_ids])))
