@@ -92,6 +92,17 @@ def test_many_floors_get_equal_shares_of_the_candidates():
     assert found.confidence < 0.3
 
 
+def test_a_search_too_short_for_all_maps_is_refused():
+    """The least number of samples is that of each map: one map alone has enough of them."""
+    maps = [floor(f'floor_{number}', seed=number) for number in range(10)]
+    rows = np.full((12, 12), 0.2) + 0.2 * np.eye(12)
+    short = RelocalizerOptions(iterations=600)
+    found, _ = localize(maps[0], maps[0], short, rows)
+    assert found.accepted
+    found, _ = localize(join(*maps), maps[0], short, np.tile(rows, 10))
+    assert not found.accepted and 'in floor_0: search stopped after' in found.reason
+
+
 def test_a_joined_map_keeps_what_its_maps_hold():
     plain, detailed = floor('hall'), floor('attic', seed=3)
     detailed = replace(detailed, details=tuple(
