@@ -59,6 +59,9 @@ class Localized(NamedTuple):
         Number of crops that were compared with labels.
     is_cut : bool
         Whether there was no time for the other crops, which could have helped.
+    for_filter : ndarray (6, 6) or None
+        Covariance for a filter that fuses all accepted poses: in continuous mode, that of what is
+        new, see cliploc_ros.core.succession.
     """
 
     found: Relocalization
@@ -66,6 +69,7 @@ class Localized(NamedTuple):
     seen: SeenImage
     compared: int
     is_cut: bool
+    for_filter: NDArray[np.float64] | None
 
 
 class Localizer:
@@ -170,8 +174,10 @@ class Localizer:
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
+        for_filter = session.covariance_for_filter(found) \
+            if found.accepted and values['mode'] == 'continuous' else found.covariance
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
-        return Localized(found, landmark_map, SeenImage(image, seen), compared, is_cut)
+        return Localized(found, landmark_map, SeenImage(image, seen), compared, is_cut, for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float
