@@ -145,8 +145,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     # the rival holds most of the missing probability, or is about as likely as the pose
     if evidence.rival > max(_LEAST_RIVAL, min(0.9 * evidence.likely,
                                               0.5 * (1.0 - evidence.likely))):
-        return (f'{compared}; ambiguous, another pose{_in(evidence.rival_map)} has '
-                f'{evidence.rival:.2g}; turn the camera to objects that differ')
+        return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}'
+                f'{_in(evidence.rival_map)}; turn the camera to objects that differ')
     return (f'{compared}; {evidence.inliers} objects matched, '
             f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
 
