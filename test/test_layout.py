@@ -26,6 +26,7 @@ LAYERS = (
     ('core.geometry',),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
+    ('core.joined_map',),
     ('core.association',),
     ('core.search',),
     ('core.fit',),

@@ -70,7 +70,7 @@ class Robot:
     def __init__(self, landmark_map: LandmarkMap, detector: YoloDetector, clip: ClipOptions,
                  map_file: str, options: RelocalizerOptions) -> None:
         self._map, self._detector = landmark_map, detector
-        self._encoder, self._embeddings = load_encoder_for_map(clip, landmark_map, map_file,
+        self._encoder, self._embeddings = load_encoder_for_map(clip, landmark_map, [map_file],
                                                                'image')
         self._relocalizer = Relocalizer(landmark_map, options)
         self._relocalizer.warm_up()

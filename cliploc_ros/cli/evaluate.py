@@ -63,7 +63,8 @@ def make_parser() -> argparse.ArgumentParser:
                          help='recorded boxes and similarities')
     sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth')
     sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
-    parser.add_argument('--map', type=Path, required=True, metavar='YAML')
+    parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
+                        help='several maps are searched as one; true poses are in the first')
     parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
                         help=f'default: {ALL}; see below')
     parser.add_argument('--trials', type=positive_int, default=5,
@@ -143,6 +144,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
 def evaluate(options: argparse.Namespace) -> int:
     """Evaluate with the options of the command line; return the exit code."""
     # imported late, so that --help is fast
+    from cliploc_ros.core.joined_map import join_maps
     from cliploc_ros.core.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.evaluation import Evaluation
     from cliploc_ros.evaluation.methods import parse_methods
@@ -151,7 +153,8 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.evaluation.trials import make_queries
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
-    landmark_map = LandmarkMap.from_file(options.map)
+    landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
+                             [str(file) for file in options.map])
     if options.bag is not None and _is_case(options):
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
@@ -210,7 +213,8 @@ def _with_clip(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Obs
     from cliploc_ros.models.observer import Observer
 
     observer = Observer(*load_encoder_for_map(
-        clip_options(options), landmark_map, str(options.map), options.landmark_embeddings))
+        clip_options(options), landmark_map, [str(file) for file in options.map],
+        options.landmark_embeddings))
 
     def observe(image: 'NDArray[np.uint8]', seen: 'Observation') -> 'Observation':
         similarities = observer.observe(image, seen.camera, seen.detections,
@@ -249,7 +253,7 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
                     options.ground_truth, options.body_from_camera, options.rectified])
     recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,
                                  options.scheduler)
-    queries = recorded_queries(frames, landmark_map, recording, str(options.map),
+    queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     without = frames.count - len(queries)
     if without:

@@ -27,6 +27,7 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import Localizer, load_localizer
+from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.parameters import Value
@@ -176,8 +177,8 @@ def carrying(cache_dir: Path, used: list[Mapping[str, Value]]) -> list[str]:
              f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another "
              'one compiles them at its first start']
     names = {str(values[name]) for values in used for name in _FILES if values.get(name)}
-    names |= {str(embeddings_path(str(values['map_file']))) for values in used
-              if values.get('map_file')}
+    maps = {name for values in used if 'map_file' in values for name in map_files(values)}
+    names |= maps | {str(embeddings_path(name)) for name in maps}
     files = sorted({Path(name).expanduser().absolute() for name in names})
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files
                     if file.exists()]

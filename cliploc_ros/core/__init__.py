@@ -14,7 +14,7 @@ search
     Minimal samples to the best hypotheses of one frame.
 association
     Observation and map to candidates and the scene of one frame.
-landmark_map, observation, options
+landmark_map, joined_map, observation, options
     Inputs.
 index
     Landmarks by class, by similarity of labels, and by place.

@@ -84,6 +84,23 @@ class LandmarkEmbeddings:
         return LandmarkEmbeddings(self.encoder_key, tuple(landmark_ids), means, medoids, offsets)
 
 
+def concatenated(several: Sequence[LandmarkEmbeddings], landmark_ids: Sequence[str]
+                 ) -> LandmarkEmbeddings:
+    """Return the embeddings of several maps, of one encoder and in their order, as one.
+
+    Parameters
+    ----------
+    several : sequence of LandmarkEmbeddings
+    landmark_ids : sequence of str
+        New names of all landmarks, each once.
+    """
+    counts = np.concatenate([np.diff(one.medoid_offsets) for one in several])
+    return LandmarkEmbeddings(
+        several[0].encoder_key, tuple(landmark_ids),
+        np.concatenate([one.means for one in several]),
+        np.concatenate([one.medoids for one in several]), np.append(0, np.cumsum(counts)))
+
+
 def embeddings_path(map_path: str | os.PathLike[str]) -> Path:
     """Return the file of a map's embeddings: NAME.embeddings.npz next to NAME.yaml."""
     return Path(map_path).with_suffix('.embeddings.npz')

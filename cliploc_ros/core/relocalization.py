@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a relocalization."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.joined_map import MapPart, parts_of, place_of
+from cliploc_ros.core.landmark_map import LandmarkMap
 
 
 @dataclass(frozen=True)
@@ -98,3 +100,33 @@ class Relocalization:
     def score(self) -> float:
         """Return the best score; 0 when nothing was found."""
         return self.hypotheses[0].score if self.hypotheses else 0.0
+
+
+def in_its_map(found: Relocalization, landmark_map: LandmarkMap
+               ) -> tuple[Relocalization, MapPart]:
+    """Return a result in the coordinate frame of the map of its best pose, and this map.
+
+    Poses on other maps are left out: they have no place in this coordinate frame. The reason of a
+    refusal names the map. A result from a single map stays as it is.
+
+    Parameters
+    ----------
+    found : Relocalization
+        Found in landmark_map.
+    landmark_map : LandmarkMap
+        A JoinedMap, or a single map.
+    """
+    parts = parts_of(landmark_map)
+    if found.map_from_camera is None or len(parts) == 1:
+        return found, parts[0]
+    places = [place_of(landmark_map, one.map_from_camera) for one in found.hypotheses]
+    part, name = places[0].part, places[0].name
+    rows = range(part.first, part.first + len(part.landmark_map))
+    reason = found.reason and f'in {name}: {found.reason}'
+    return replace(
+        found, reason=reason,
+        hypotheses=tuple(replace(one, map_from_camera=place.map_from_camera)
+                         for one, place in zip(found.hypotheses, places, strict=True)
+                         if place.name == name),
+        matches=tuple(replace(one, landmark=one.landmark - part.first)
+                      for one in found.matches if one.landmark in rows)), part

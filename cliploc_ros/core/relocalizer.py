@@ -40,6 +40,7 @@ from cliploc_ros.core.fit.finalists import (
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
+from cliploc_ros.core.joined_map import Place, place_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -171,9 +172,12 @@ class Relocalizer:
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
         distinct, twin = self._distinct(frames, rig, cameras, compared)
-        evidence = replace(self._evidence(frames, compared, likely, covariance.matched),
-                           earlier=looks.confidences_in(frames[-1].observation, poses[0]),
-                           distinct=distinct, place=_position(poses[0]), twin=twin)
+        here = place_of(self._map, poses[0])
+        evidence = replace(
+            self._evidence(frames, compared, likely, covariance.matched),
+            earlier=looks.confidences_in(frames[-1].observation, poses[0]), distinct=distinct,
+            place=here.position, place_map=here.name, twin=twin and twin.position,
+            twin_map=twin.name if twin else '')
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
@@ -243,7 +247,7 @@ class Relocalizer:
                 for pose, found in zip(poses, matches, strict=True)]
 
     def _distinct(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
-                  compared: '_Compared') -> tuple[float, tuple[float, float, float] | None]:
+                  compared: '_Compared') -> tuple[float, Place | None]:
         """Return the probability that no place that looks alike has the best pose's camera.
 
         Next to it is where the camera would be at the likeliest of these places.
@@ -259,7 +263,7 @@ class Relocalizer:
         poses = np.array([one.map_from_camera for one in twins])
         supports = self._supports(frames, cameras, poses, [matches_of(rig, one) for one in twins])
         chance, likeliest = chance_distinct(compared.supports[0], supports)
-        return chance, _position(poses[likeliest])
+        return chance, place_of(self._map, poses[likeliest])
 
     def _fitted(self, rig: Rig, map_from_camera: NDArray[np.float64]) -> Finalist:
         """Return a pose (4, 4) that no search met, refined like those that it met."""
@@ -275,9 +279,11 @@ class Relocalizer:
         coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
         elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
         rivals = likely[elsewhere]
+        rival = elsewhere[np.argmax(rivals)] if len(elsewhere) else 0
         return Evidence(
             supports[0].inliers, likely[0],
             min(max(rivals, default=0.0), 1.0 - likely[0]),
+            rival_map=place_of(self._map, compared.poses[rival]).name,
             # the covariance of a minimal sample is too rough to decide
             near=1.0 if best.information is None else share_within(
                 RIGHT_M, _CAUTION * covariance),
@@ -309,11 +315,6 @@ class _Compared(NamedTuple):
     matches: list[list[tuple[Match, ...]]]
     supports: list[Support]
     handicaps: NDArray[np.float64]
-
-
-def _position(pose: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = pose[:3, 3].tolist()
-    return x, y, z
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str

@@ -104,7 +104,7 @@ def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):
         landmark_map = LandmarkMap.from_file(file)
         queries = make_queries_of(recorded, landmark_map, embed_map(
-            clip, landmark_map, str(file), options.values['landmark_embeddings']))
+            clip, landmark_map, [str(file)], options.values['landmark_embeddings']))
         summaries[name], = summarize(run_methods(
             landmark_map, [method], make_queries(queries, landmark_map), trials=1))
     return summaries

@@ -276,7 +276,7 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
         observe = Observer(*load_encoder_for_map(
             ClipOptions(model=str(values['clip_model']),
                         pretrained=str(values['clip_pretrained'])),
-            landmark_map, str(values['map_file']), values['landmark_embeddings'])).observe
+            landmark_map, [str(values['map_file'])], values['landmark_embeddings'])).observe
     relocalizer = Relocalizer(landmark_map, method)
 
     def relocalize(observation: Observation) -> Relocalization:

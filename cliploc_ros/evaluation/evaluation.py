@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from cliploc_ros.core.joined_map import parts_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import QueryFrame
 from cliploc_ros.errors import OptionsError
@@ -155,7 +156,8 @@ class Evaluation:
             return
         observing = {stage: np.array([getattr(frame, name) for frame in frames])
                      for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
-        draw_all(self.out, self.landmark_map, self.queries, results, summaries, sweep,
+        own = parts_of(self.landmark_map)[0].landmark_map  # that of the true poses
+        draw_all(self.out, own, self.queries, results, summaries, sweep,
                  {stage: float(np.nanmean(times)) for stage, times in observing.items()
                   if np.isfinite(times).any()})
 

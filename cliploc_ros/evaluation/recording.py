@@ -5,6 +5,7 @@
 import logging
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: RecordingOptions,
-                     map_file: str, compare: str) -> Queries:
+                     map_files: Sequence[str], compare: str) -> Queries:
     """Return the images with ground truth as queries; detector and CLIP run once.
 
     Parameters
@@ -30,7 +31,7 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     landmark_map : LandmarkMap
     options : RecordingOptions
         With CLIP.
-    map_file, compare : str
+    map_files, compare
         See load_encoder_for_map.
 
     Raises
@@ -40,7 +41,7 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
         warning only.
     """
     assert options.clip is not None
-    labels = embed_map(options.clip, landmark_map, map_file, compare)
+    labels = embed_map(options.clip, landmark_map, map_files, compare)
     file = observation_file(frames, options)
     if file.exists() or os.access(file.parent, os.W_OK):
         return make_queries_of(record_once(frames, options), landmark_map, labels)

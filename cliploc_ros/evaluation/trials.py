@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.joined_map import place_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import (
@@ -89,6 +90,9 @@ class Result:
         The only field that differs from run to run.
     crops_share : float
         Share of the crops of its frames that were compared with labels.
+    map : str
+        Of several maps, the one of the pose, which is in the coordinates of the first map: on
+        another map, it is far away. Empty for a single map.
     """
 
     method: str
@@ -111,6 +115,7 @@ class Result:
     reason: str
     search_ms: float
     crops_share: float = 1.0
+    map: str = ''
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -169,8 +174,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
     on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
     localize = _localize_on_demand if on_demand else _localize
-    return [_judge(method.name, trial, query, *localize(landmark_map, relocalizer, query))
-            for query in queries]
+    return [_judge(landmark_map, method.name, trial, query,
+                   *localize(landmark_map, relocalizer, query)) for query in queries]
 
 
 def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
@@ -193,8 +198,8 @@ def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, que
     return found, compared / max(crops, 1)
 
 
-def _judge(method: str, trial: int, query: Query, found: Relocalization, crops_share: float
-           ) -> Result:
+def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
+           found: Relocalization, crops_share: float) -> Result:
     pose = found.map_from_camera
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
@@ -210,4 +215,5 @@ def _judge(method: str, trial: int, query: Query, found: Relocalization, crops_s
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
-        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share)
+        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
+        map='' if pose is None else place_of(landmark_map, pose).name)

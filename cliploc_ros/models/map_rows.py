@@ -3,11 +3,14 @@
 """What crops are compared with: the labels of a map, its images, or both."""
 
 import logging
+from collections.abc import Sequence
 
 from cliploc_ros.core.index.image_rows import with_images
 from cliploc_ros.core.index.similarities import LabelEmbeddings
+from cliploc_ros.core.joined_map import JoinedMap, parts_of
 from cliploc_ros.core.landmark_embeddings import (
     LandmarkEmbeddings,
+    concatenated,
     embeddings_path,
     load_embeddings_of_map,
 )
@@ -19,18 +22,19 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 logger = logging.getLogger(__name__)
 
 
-def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap, map_file: str,
-                         compare: str) -> LoadedEncoder:
+def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
+                         map_files: Sequence[str], compare: str) -> LoadedEncoder:
     """Load CLIP and the embeddings that it compares crops with.
 
     Parameters
     ----------
     options : ClipOptions
     landmark_map : LandmarkMap
-    map_file : str
-        The map's file, which has its image embeddings next to it; '' for none.
+    map_files : sequence of str
+        The file of each map, which has its image embeddings next to it; empty for none.
     compare : str
-        One of COMPARED. Where the map has no images of this encoder, labels alone are compared.
+        One of COMPARED. Where one of the maps has no images of this encoder, labels alone are
+        compared: images and labels of different maps would not be rivals on equal terms.
 
     Raises
     ------
@@ -39,33 +43,51 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap, map_fi
     """
     loaded = load_encoder(options, landmark_map.weighted_labels)
     return loaded._replace(label_embeddings=_compared(
-        loaded.label_embeddings, loaded.encoder.key, landmark_map, map_file, compare))
+        loaded.label_embeddings, loaded.encoder.key, landmark_map, map_files, compare))
 
 
-def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_file: str, compare: str
-              ) -> LabelEmbeddings:
+def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequence[str],
+              compare: str) -> LabelEmbeddings:
     """Return the embeddings of another map for an encoder that stays, see load_encoder_for_map."""
     return _compared(embed_labels(options, landmark_map.weighted_labels),
-                     resolve_clip_weights(options).key, landmark_map, map_file, compare)
+                     resolve_clip_weights(options).key, landmark_map, map_files, compare)
 
 
-def _compared(labels: LabelEmbeddings, key: str, landmark_map: LandmarkMap, map_file: str,
-              compare: str) -> LabelEmbeddings:
-    if compare == 'text':
-        return labels
-    images = _images(key, labels.shape[1], landmark_map, map_file)
-    if images is None:
-        return labels
-    logger.info('%s: images of %d of %d landmarks', embeddings_path(map_file),
-                int(images.is_known.sum()), len(images))
-    return with_images(labels, images, compare)
+def _compared(labels: LabelEmbeddings, key: str, landmark_map: LandmarkMap,
+              map_files: Sequence[str], compare: str) -> LabelEmbeddings:
+    images = None if compare == 'text' else _images_of_all(key, labels.shape[1], landmark_map,
+                                                           map_files)
+    if images is not None:
+        labels = with_images(labels, images, compare)
+    if isinstance(landmark_map, JoinedMap):
+        return labels.in_parts([len(part.landmark_map) for part in landmark_map.parts])
+    return labels
+
+
+def _images_of_all(key: str, embed_dim: int, landmark_map: LandmarkMap, map_files: Sequence[str]
+                   ) -> LandmarkEmbeddings | None:
+    """Return the image embeddings of all maps, if each has some of this encoder."""
+    parts = parts_of(landmark_map)
+    if len(map_files) != len(parts):
+        return None
+    found = {file: _images(key, embed_dim, part.landmark_map, file)
+             for part, file in zip(parts, map_files, strict=True)}
+    known = [images for images in found.values() if images is not None]
+    if len(known) < len(parts):
+        if known:
+            without = next(file for file, images in found.items() if images is None)
+            logger.warning('only labels are compared: %s has no images of this encoder, other '
+                           'maps have; build it again with its images', without)
+        return None
+    for file, images in zip(map_files, known, strict=True):
+        logger.info('%s: images of %d of %d landmarks', embeddings_path(file),
+                    int(images.is_known.sum()), len(images))
+    return concatenated(known, landmark_map.landmark_ids)
 
 
 def _images(key: str, embed_dim: int, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
     """Return the image embeddings of a map, if there are some of this encoder."""
-    if not map_file:
-        return None
     try:
         images = load_embeddings_of_map(map_file, landmark_map.landmark_ids)
     except MapError as error:

@@ -18,6 +18,7 @@ from cliploc_ros.ros.counters import RequestCounters
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.map_services import MapServices
 from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -55,11 +56,11 @@ class RelocalizerNode(ManagedNode):
         group = BoundedCallbackGroup(MAX_REQUESTS)
         for service_type, name, callback in (
                 (Trigger, '~/relocalize', self._on_relocalize),
-                (Trigger, '~/reload_map', self._on_reload_map),
                 (Trigger, '~/record', self._on_record),
                 (Empty, 'reinitialize_global_localization', self._on_reinitialize)):
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
                                 callback_group=group)
+        MapServices(self, self._pipeline, group)
 
     def load(self) -> str:
         """Load map and network."""
@@ -104,7 +105,8 @@ class RelocalizerNode(ManagedNode):
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           **self._counters.values(),
-                          'map file': self.settings['map_file'],
+                          'map file': ', '.join(filter(None, [
+                              self.settings['map_file'], *self.settings['map_files']])),
                           'base frame': self.settings['base_frame'],
                           'time limit [s]': self.settings['timeout_s'],
                           'missing': '; '.join(self._missing())}
@@ -128,17 +130,6 @@ class RelocalizerNode(ManagedNode):
 
     def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
         self._answer()
-        return response
-
-    def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Read the map again in the worker, never in the middle of a search."""
-        try:
-            description = self.worker.run(self._pipeline.reload_map)
-            response.message = f'loaded: {description}; map {self._map_hash}'
-            response.success = True
-        except CliplocError as error:
-            response.message = f'not loaded: {error}'
-        self.get_logger().info(f'map {response.message}')
         return response
 
     def _on_record(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

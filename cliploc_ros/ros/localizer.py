@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros.cache_folder import resolve_cache_dir
-from cliploc_ros.core.index.similarities import Similarities
+from cliploc_ros.core.index.similarities import Similarities, split_similarities
+from cliploc_ros.core.joined_map import parts_of
 from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import BATCH, can_do_without_crops, crops_on_demand
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
 from cliploc_ros.messages import camera_from_msg, image_from_msg
@@ -34,6 +35,7 @@ from cliploc_ros.ros.conversions import (
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_hash import load_hashed_map
+from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
@@ -49,8 +51,11 @@ class Localized(NamedTuple):
     Parameters
     ----------
     found : Relocalization
+        In the coordinate frame of the map.
+    landmark_map : LandmarkMap
+        Of several maps, the one of the best pose.
     seen : SeenImage
-        With the crops that were compared.
+        With the crops that were compared, and their similarities to this map.
     compared : int
         Number of crops that were compared with labels.
     is_cut : bool
@@ -61,6 +66,7 @@ class Localized(NamedTuple):
     """
 
     found: Relocalization
+    landmark_map: LandmarkMap
     seen: SeenImage
     compared: int
     is_cut: bool
@@ -96,18 +102,16 @@ class Localizer:
 
     @property
     def landmark_map(self) -> LandmarkMap:
-        """Return the map."""
+        """Return the map, or all maps as one."""
         return self._map
-
-    @property
-    def map_frame(self) -> str:
-        """Return the coordinate frame of the poses."""
-        return self._map.frame_id
 
     @property
     def description(self) -> str:
         """Return what is loaded, in a line."""
-        return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', "
+        frames = [f"'{part.landmark_map.frame_id}'" for part in parts_of(self._map)]
+        where = f'frame {frames[0]}' if len(frames) == 1 else \
+            f'{len(frames)} maps, frames {", ".join(frames)}'
+        return (f'{len(self._map)} landmarks in {where}, '
                 f'{self._options.matching}_{self._options.algorithm}')
 
     def reloaded(self, node: Node, values: Mapping[str, Any]) -> 'Localizer':
@@ -119,16 +123,15 @@ class Localizer:
             Names what to fix in the map; this localizer stays as it was.
         """
         options = relocalizer_options(values)
-        landmark_map, map_hash = load_hashed_map(node, values['map_file'])
+        files = map_files(values)
+        landmark_map, map_hash = load_hashed_map(node, files)
         relocalizer = Relocalizer(landmark_map, options)
         observer = self._observer
         if observer is not None:
             from cliploc_ros.models.map_rows import embed_map
             observer = observer.with_labels(embed_map(
-                _clip_options(values), landmark_map, values['map_file'],
-                values['landmark_embeddings']))
-        return Localizer(landmark_map, observer, relocalizer, options, self.device,
-                         map_hash)
+                _clip_options(values), landmark_map, files, values['landmark_embeddings']))
+        return Localizer(landmark_map, observer, relocalizer, options, self.device, map_hash)
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -178,7 +181,8 @@ class Localizer:
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = session.covariance_for_filter(found) \
             if found.accepted and values['mode'] == 'continuous' else found.covariance
-        return Localized(found, SeenImage(image, seen), compared, is_cut, for_filter)
+        found, landmark_map, seen = _in_its_map(found, self._map, seen)
+        return Localized(found, landmark_map, SeenImage(image, seen), compared, is_cut, for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float
@@ -232,17 +236,29 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     if values['cache_dir']:
         KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
-    landmark_map, map_hash = load_hashed_map(node, values['map_file'])
+    files = map_files(values)
+    landmark_map, map_hash = load_hashed_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
         from cliploc_ros.models.map_rows import load_encoder_for_map
         encoder, embeddings = load_encoder_for_map(
-            _clip_options(values), landmark_map, values['map_file'],
-            values['landmark_embeddings'])
+            _clip_options(values), landmark_map, files, values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
     return Localizer(landmark_map, observer, relocalizer, options, device, map_hash)
+
+
+def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation
+                ) -> tuple[Relocalization, LandmarkMap, Observation]:
+    """Return result, map and observation of the one of several maps that has the best pose."""
+    found, own = in_its_map(found, landmark_map)
+    parts = parts_of(landmark_map)
+    if seen.similarities is None or len(parts) == 1:
+        return found, own.landmark_map, seen
+    pieces = split_similarities(seen.similarities, [len(part.landmark_map) for part in parts])
+    which = [part.first for part in parts].index(own.first)
+    return found, own.landmark_map, replace(seen, similarities=pieces[which])
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:

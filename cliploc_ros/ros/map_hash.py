@@ -3,6 +3,7 @@
 """The hash that names a map in answers and diagnostics: which one a robot of a fleet has."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from rclpy.node import Node
@@ -16,31 +17,32 @@ _DIGITS = 12
 _ATTEMPTS = 3
 
 
-def load_hashed_map(node: Node, map_file: str) -> tuple[LandmarkMap, str]:
-    """Load a map and return it with its hash.
+def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
+    """Load one map or several and return them with their hash.
 
-    The hash of a file is the beginning of what `sha256sum` prints. A map in parameters has the
-    hash of its landmarks.
+    The hash is the beginning of what `cat FILE... | sha256sum` prints. A map in parameters has
+    the hash of its landmarks.
 
     Raises
     ------
     MapError
-        See load_map; or the file changes again and again.
+        See load_map; or a file changes again and again.
     """
     for _ in range(_ATTEMPTS):
-        before = _file_hash(map_file)
-        landmark_map = load_map(node, map_file)
-        if not map_file:
+        before = _hash_of(files)
+        landmark_map = load_map(node, files)
+        if not files:
             return landmark_map, _hash(_content(landmark_map))
-        if before == _file_hash(map_file):
+        if before == _hash_of(files):
             return landmark_map, before
-    raise MapError(f'{map_file}: changes while it is read: write another file and rename it')
+    raise MapError(f'{", ".join(files)}: changes while it is read: write another file and '
+                   'rename it')
 
 
-def _file_hash(map_file: str) -> str:
-    """Return the hash of a file; empty where load_map says what is wrong."""
+def _hash_of(files: Sequence[str]) -> str:
+    """Return the hash of files; empty where load_map says what is wrong."""
     try:
-        return _hash(Path(map_file).read_bytes())
+        return _hash(b''.join(Path(file).read_bytes() for file in files))
     except (OSError, ValueError):
         return ''
 

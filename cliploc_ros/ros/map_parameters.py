@@ -1,27 +1,44 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map in a node's parameters, where `--params-file map.yaml` puts it."""
+"""The maps of a node: in files, or in its parameters, where `--params-file map.yaml` puts one."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rclpy.node import Node
 
+from cliploc_ros.core.joined_map import join_maps
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, OptionsError
 
 _PREFIX = 'map.'
 
 
-def load_map(node: Node, map_file: str) -> LandmarkMap:
-    """Return the map of a file, or of the node's own parameters where no file is given.
+def map_files(values: Mapping[str, Any]) -> list[str]:
+    """Return the files that the parameters map_file and map_files name.
+
+    Raises
+    ------
+    OptionsError
+        Both parameters name files.
+    """
+    several = [name for name in values['map_files'] if name]
+    if several and values['map_file']:
+        raise OptionsError("map_file and map_files both name files: set map_file to '' to search "
+                           'all of map_files')
+    return several or [name for name in [values['map_file']] if name]
+
+
+def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
+    """Return the map of files, or of the node's own parameters where no file is given.
 
     Raises
     ------
     MapError
         Names the source, the landmark and the field to fix.
     """
-    if map_file:
-        return LandmarkMap.from_file(map_file)
+    if files:
+        return join_maps([LandmarkMap.from_file(file) for file in files], files)
     parameters = node.get_parameters_by_prefix('map')
     if not parameters:
         raise MapError('no map: set map_file, or load a map with --params-file')

@@ -70,7 +70,10 @@ DETECTOR = (
 
 RELOCALIZER = (
     ParameterRow('map_file', '', "Map file, read when the node is configured and by reload_map; "
-                 "empty: the parameters below 'map' hold the map."),
+                 "empty: map_files, or the parameters below 'map', hold the map."),
+    ParameterRow('map_files', [''], 'Map files of floors and buildings instead of map_file: a '
+                 'request searches all of them. Each has a frame_id of its own, which names the '
+                 'map in answers and poses.'),
     ParameterRow('mode', 'on_request', 'Localize on request, or with every '
                  'frame.', choices=MODES, read_only=True),
     ParameterRow('timeout_s', 10.0, 'A request is answered within this time.', unit='s',
@@ -214,7 +217,7 @@ def parse_class_map(text: str) -> dict[str, str]:
 
 def _height_range(heights: Value) -> tuple[float, float]:
     assert isinstance(heights, list)
-    low, high = heights
+    low, high = map(float, heights)
     return (low, high) if low != high else (-math.inf, math.inf)
 
 

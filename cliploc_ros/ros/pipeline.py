@@ -109,11 +109,11 @@ class Pipeline:
         self._node.stages.add(stages_ms)
         self._node.check_active()
         self._jumps.check(image.stamp, frame.received_at)
-        header = Header(stamp=image.stamp, frame_id=localizer.map_frame)
+        header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
         answer = replace(
             self._answer(header, localized, state, frame.received_at, in_words(stages_ms)),
             is_cut=localized.is_cut, stages_ms=stages_ms, map_hash=localizer.map_hash)
-        self._show(image, header, localizer, localized, state, answer)
+        self._show(image, header, localized, state, answer)
         return answer
 
     def _use(self, localizer: Localizer) -> str:
@@ -145,15 +145,15 @@ class Pipeline:
         return Answer(Verdict.ACCEPTED, f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
                                         f'{summary}', pose, received_at, state)
 
-    def _show(self, image: Header, header: Header, localizer: Localizer, localized: Localized,
-              state: RobotState, answer: Answer) -> None:
+    def _show(self, image: Header, header: Header, localized: Localized, state: RobotState,
+              answer: Answer) -> None:
         """Publish hypotheses and matches, and queue the debug image behind the answer."""
-        self._visualization.show(header, localizer.landmark_map, localized.found,
+        self._visualization.show(header, localized.landmark_map, localized.found,
                                  state.camera_from_base)
         if self._visualization.wants_debug_image:
             self._node.worker.submit(partial(
                 self._visualization.show_debug_image, image, localized.seen,
-                localizer.landmark_map, localized.found, answer.message))
+                localized.landmark_map, localized.found, answer.message))
 
 
 def _summary(localized: Localized) -> str:

@@ -46,7 +46,7 @@ def similarities(walk, compare):
     folder, landmark_map, options = walk
     sequence = read_tum(folder / 'sequence').every(24)
     frames = tum_frames(sequence, find_camera(None, folder / 'sequence')[0])
-    queries = recorded_queries(frames, landmark_map, options, str(folder / 'map.yaml'), compare)
+    queries = recorded_queries(frames, landmark_map, options, [str(folder / 'map.yaml')], compare)
     assert len(queries) == 2
     return np.concatenate([frame.similarities for frame in queries])
 

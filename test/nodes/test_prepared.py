@@ -16,6 +16,9 @@ from cliploc_ros.demo import ASSETS
 # A network of its own: the loopback interface and no route.
 OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up && exec "$@"',
            'sh')
+# Mounts a folder on itself, read-only, as a robot of a fleet mounts the cache of all.
+READ_ONLY = ('unshare', '--mount', 'sh', '-c',
+             'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"')
 ROBOT = f"""\
 detector:
   ros__parameters:
@@ -77,7 +80,7 @@ def test_prepare_shows_progress_and_costs(prepared):
         assert f'carry as well, for a parameter names it: {Path(ASSETS) / name}' in output
 
 
-def test_the_folder_is_all_that_the_nodes_need_without_a_network(
+def test_the_folder_is_all_that_the_nodes_need_without_a_network_and_read_only(
         prepared, robot, offline, tmp_path):
     carried = Path(shutil.copytree(prepared[0], tmp_path / 'carried'))
     before = content(carried)
@@ -86,7 +89,8 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network(
     variables = {name: value for name, value in os.environ.items()
                  if name not in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME')}
     done = subprocess.run(
-        [*offline, sys.executable, str(Path(__file__).with_name('offline.py')), str(tmp_path),
+        [*offline, *READ_ONLY, str(carried), sys.executable,
+         str(Path(__file__).with_name('offline.py')), str(tmp_path),
          '--ros-args', '--params-file', str(robot), '-p', f'cache_dir:={carried}'],
         env=variables | {'PYTHONPATH': str(PROJECT), 'HOME': str(tmp_path / 'home'),
                          'ROS_LOG_DIR': str(tmp_path)},
@@ -94,7 +98,7 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network(
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith('True accepted: x '), done.stdout
     log = (tmp_path / 'relocalizer.log').read_text()
-    assert 'labels cached' in log and 'compiling' not in log
+    assert 'labels cached' in log and 'compiling' not in log and 'Read-only' not in log
     assert content(carried) == before, 'a node had to compute or fetch what the folder lacked'
 
 

@@ -10,8 +10,8 @@ from processes import PROJECT
 from tester import make_frame
 
 POLICY = PROJECT / 'config/security_policy.xml'
-# What tf2_ros brings, which is not installed everywhere the tests run.
-TF = {'/tf', '/tf_static'}
+# What tf2_ros and nav2_msgs bring, which are not installed everywhere the tests run.
+FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map'}
 GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',
@@ -33,8 +33,8 @@ def used(tester, node, kind, act):
 def check(tester, node, *absent):
     """Wait until a node does all that its policy allows but what is absent; it never does more."""
     for kind, act in GRAPH:
-        expected = allowed(node, kind, act) - TF - set(absent)
-        tester.wait(lambda k=kind, a=act, e=expected: used(tester, node, k, a) - TF == e,
+        expected = allowed(node, kind, act) - FOREIGN - set(absent)
+        tester.wait(lambda k=kind, a=act, e=expected: used(tester, node, k, a) - FOREIGN == e,
                     f'{node} to {act} {sorted(expected)}')
 
 

@@ -46,11 +46,11 @@ def test_counts_add_up():
 def test_the_hash_of_a_file_is_that_of_sha256sum(tmp_path):
     path = tmp_path / 'map.yaml'
     write_map(make_room(), path)
-    loaded, digest = load_hashed_map(None, str(path))
+    loaded, digest = load_hashed_map(None, [str(path)])
     assert len(loaded) == 12
     assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(digest)
     assert len(digest) == 12
     path.write_text(path.read_text() + '# another one\n')
-    assert load_hashed_map(None, str(path))[1] != digest
+    assert load_hashed_map(None, [str(path)])[1] != digest
     with pytest.raises(MapError, match='No such file'):
-        load_hashed_map(None, str(tmp_path / 'none.yaml'))
+        load_hashed_map(None, [str(tmp_path / 'none.yaml')])

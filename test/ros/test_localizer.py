@@ -57,7 +57,7 @@ def timer():
 
 def test_a_perfect_view_gives_the_true_pose(localizer, values):
     times = timer()
-    found, view, compared, is_cut, for_filter = localizer.localize(
+    found, landmark_map, view, compared, is_cut, for_filter = localizer.localize(
         make_frame(), values, RobotState(np.eye(4)), times)
     assert (compared, is_cut) == (0, False)
     np.testing.assert_array_equal(for_filter, found.covariance)
@@ -65,7 +65,7 @@ def test_a_perfect_view_gives_the_true_pose(localizer, values):
     distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
     assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
     assert list(times.ms) == ['waiting', 'decoding', 'search']
-    assert localizer.map_frame == 'map'
+    assert landmark_map.frame_id == 'map'
     assert localizer.description == "12 landmarks in frame 'map', class_bf"
 
 

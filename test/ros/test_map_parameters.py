@@ -31,14 +31,15 @@ def load(start_with, tmp_path):
     def run(tree):
         path = tmp_path / 'map.yaml'
         path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {'map': tree}}}))
-        return load_map(start_with(path), '')
+        return load_map(start_with(path), [])
     return run
 
 
 def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
     path = tmp_path / 'room.yaml'
     write_map(make_room(), path)
-    of_parameters, of_file = load_map(start_with(path), ''), load_map(start_with(path), str(path))
+    of_parameters = load_map(start_with(path), [])
+    of_file = load_map(start_with(path), [str(path)])
     # rclpy hands parameters over in an order of its own
     rows = [of_parameters.landmark_ids.index(name) for name in of_file.landmark_ids]
     assert of_parameters.frame_id == of_file.frame_id == 'map'
@@ -55,7 +56,7 @@ def test_weighted_labels_and_class_weights_come_both_ways(start_with, tmp_path):
     details = LandmarkDetails(labels=(('a red mug', 0.75), ('a cup: "hot"', 0.25)),
                               class_weights=(('a', 0.6), ('cell phone', 0.4)))
     write_whole_map(path, replace(room, details=(details,) * len(room)))
-    for loaded in (load_map(start_with(path), ''), load_map(start_with(path), str(path))):
+    for loaded in (load_map(start_with(path), []), load_map(start_with(path), [str(path)])):
         row = loaded.landmark_ids.index(room.landmark_ids[3])
         assert loaded.weighted_labels[row] == ((room.labels[3], 0.75), *details.labels)
         assert loaded.classes.sizes_of(loaded.classes.classes_of(['cell phone'])) == len(room)
@@ -77,14 +78,14 @@ def test_whole_numbers_are_numbers(load):
 
 def test_a_node_without_any_map_says_what_to_do(make_node):
     with pytest.raises(MapError, match=r'set map_file, or load a map with --params-file'):
-        load_map(make_node(), '')
+        load_map(make_node(), [])
 
 
 def test_a_file_goes_before_the_parameters(start_with, tmp_path):
     path, absent = tmp_path / 'room.yaml', tmp_path / 'absent.yaml'
     write_map(make_room(), path)
     with pytest.raises(MapError, match=r'absent\.yaml'):
-        load_map(start_with(path), str(absent))
+        load_map(start_with(path), [str(absent)])
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -117,4 +118,4 @@ def test_a_value_beside_its_own_fields_is_named(make_node):
     node.declare_parameter('map.frame_id', 'map')
     node.declare_parameter('map.frame_id.name', 'map')
     with pytest.raises(MapError, match="'frame_id' has both a value and fields"):
-        load_map(node, '')
+        load_map(node, [])

@@ -156,7 +156,7 @@ def wake_ups(maps):
     found = {}
     for name, landmark_map in maps.items():
         queries = make_queries_of(recorded, landmark_map,
-                                  embed_map(clip, landmark_map, '', 'text'))
+                                  embed_map(clip, landmark_map, [], 'text'))
         found[name], = summarize(run_methods(
             landmark_map, [Method(options.method, relocalizer_options(options.values))],
             make_queries(queries, landmark_map), trials=1))

@@ -18,6 +18,8 @@ _MISSED_IS_RIGHT = 0.2
 # where most looks had to lead to the pose, 21 with this mean. On the true map 44, 41 and 39 of 52
 # accepted.
 _MEAN_CONFIDENCE = 0.5
+# A refusal does not mention less likely rivals.
+_LEAST_RIVAL = 0.001
 _LOOK_ABOUT = 'turn the camera to more objects'
 
 
@@ -54,6 +56,9 @@ class Evidence:
         Number of other detected objects of the map's classes.
     earlier : tuple of float
         Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks.
+    place_map, rival_map, twin_map : str
+        Where there are several maps: the name of its own, and of those of the likeliest rival
+        and of the twin.
     """
 
     inliers: int
@@ -69,6 +74,9 @@ class Evidence:
     meetings: float = math.inf
     unexplained: float = 0.0
     earlier: tuple[float, ...] = ()
+    place_map: str = ''
+    rival_map: str = ''
+    twin_map: str = ''
 
     @property
     def found(self) -> float:
@@ -133,13 +141,15 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if evidence.confidence >= options.min_confidence:
         return ''
     compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
-    # the rival holds most of the missing probability, or is likelier than the best score
-    is_ambiguous = evidence.rival > min(evidence.likely, 0.5 * (1.0 - evidence.likely))
+    # the rival holds most of the missing probability, or is about as likely as the pose
+    is_ambiguous = evidence.rival > max(_LEAST_RIVAL, min(0.9 * evidence.likely,
+                                                          0.5 * (1.0 - evidence.likely)))
     others = evidence.likely * evidence.found * evidence.near
     if (evidence.twin is not None and evidence.distinct < options.min_confidence
             and (is_ambiguous or others >= options.min_confidence)):
-        return (f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look alike; '
-                'turn the camera to objects that differ')
+        return (f'{compared}; {_point(evidence.place)}{_in(evidence.place_map)} and '
+                f'{_point(evidence.twin)} m{_in(evidence.twin_map)} look alike; turn the camera '
+                'to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
         return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                 'turn the camera to more or nearer objects')
@@ -147,10 +157,14 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
         return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
                 'samples; raise iterations or set algorithm to auto')
     if is_ambiguous:
-        return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}; '
-                'turn the camera to objects that differ')
+        return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}'
+                f'{_in(evidence.rival_map)}; turn the camera to objects that differ')
     return (f'{compared}; {evidence.inliers} objects matched, '
             f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
+
+
+def _in(map_name: str) -> str:
+    return f' in {map_name}' if map_name else ''
 
 
 def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> str:

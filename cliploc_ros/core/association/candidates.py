@@ -7,7 +7,8 @@ each detection with the k landmarks whose labels are most similar to its crop, *
 from clip and verifies with both.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,10 @@ class Candidates:
         """Return some of the candidates."""
         return Candidates(self.detections[rows], self.landmarks[rows], self.ranks[rows],
                           self.similarities[rows])
+
+    def moved(self, first: int) -> 'Candidates':
+        """Return the candidates of a map whose landmarks begin at a row of several maps'."""
+        return replace(self, landmarks=self.landmarks + first)
 
     def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
         """Return the candidates sorted by keys, the first key first; ties keep their order."""
@@ -126,6 +131,14 @@ def balanced_order(candidates: Candidates) -> Candidates:
     return candidates.ordered(candidates.ranks, -candidates.similarities)
 
 
+def concatenated(some: Sequence[Candidates]) -> Candidates:
+    """Return the candidates of several lists, at least one, one list after the other."""
+    return Candidates(np.concatenate([one.detections for one in some]),
+                      np.concatenate([one.landmarks for one in some]),
+                      np.concatenate([one.ranks for one in some]),
+                      np.concatenate([one.similarities for one in some]))
+
+
 def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
     """Return the first candidates, followed by those of the second that are new.
 
@@ -137,7 +150,4 @@ def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candid
     """
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
-    return Candidates(np.concatenate([first.detections, second.detections[new]]),
-                      np.concatenate([first.landmarks, second.landmarks[new]]),
-                      np.concatenate([first.ranks, second.ranks[new]]),
-                      np.concatenate([first.similarities, second.similarities[new]]))
+    return concatenated([first, second.select(new)])

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an observation and a map to the scene that is searched: the association of one frame."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from cliploc_ros.core.association.candidates import (
     Candidates,
     balanced_order,
     class_candidates,
+    concatenated,
     joined,
     nearest_candidates,
     prosac_order,
@@ -18,6 +20,8 @@ from cliploc_ros.core.association.candidates import (
 )
 from cliploc_ros.core.association.scene import Scene, make_scene
 from cliploc_ros.core.index.culling import FEW, SortedLandmarks
+from cliploc_ros.core.index.similarities import split_similarities
+from cliploc_ros.core.joined_map import parts_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -60,7 +64,8 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     classes = landmark_map.classes.classes_of(observation.detections.class_ids)
     classes[~sound] = -1
     nearest = _nearest(landmark_map, observation, options, sound)
-    candidates, left_out = _candidates(landmark_map, classes, nearest, options)
+    candidates, left_out = _candidates(landmark_map, observation.detections.class_ids, classes,
+                                       nearest, options)
     by_class = classes if options.matching != 'clip' else np.full_like(classes, -1)
     single, sorted_landmarks = _potential(landmark_map, by_class, nearest)
     # no pair uses the placeholder of a box that is not sound
@@ -99,14 +104,20 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
-    nearest = nearest_candidates(similarities, options.k)
+    parts = parts_of(landmark_map)
+    sizes = [len(part.landmark_map) for part in parts]
+    # k of each map, so that the labels of one map do not hide the rivals on the others
+    nearest = concatenated([
+        nearest_candidates(some, min(options.k, size)).moved(part.first)
+        for part, size, some in zip(parts, sizes, split_similarities(similarities, sizes),
+                                    strict=True)])
     nearest = replace(nearest, detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
 
-def _candidates(landmark_map: LandmarkMap, classes: NDArray[np.int64],
-                nearest: Candidates | None, options: RelocalizerOptions
-                ) -> tuple[Candidates, int]:
+def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
+                classes: NDArray[np.int64], nearest: Candidates | None,
+                options: RelocalizerOptions) -> tuple[Candidates, int]:
     """Return the candidates in the order of the sampler, and how many are left out."""
     automatic = options.algorithm == 'auto'
     if nearest is not None:
@@ -119,6 +130,23 @@ def _candidates(landmark_map: LandmarkMap, classes: NDArray[np.int64],
     index = landmark_map.classes
     if not automatic:
         return class_candidates(index, classes), 0
-    of_class = rarest_class_candidates(index, classes, MAX_CANDIDATES)
+    of_class = _of_rarest_classes(landmark_map, class_ids, classes)
     left_out = int(index.sizes_of(classes).sum()) - len(of_class)
     return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out
+
+
+def _of_rarest_classes(landmark_map: LandmarkMap, class_ids: Sequence[str],
+                       classes: NDArray[np.int64]) -> Candidates:
+    """Return pairs of equal class, at most MAX_CANDIDATES.
+
+    Each of several maps gets an equal share, and they take turns: a search that is cut short has
+    looked for rivals on all of them.
+    """
+    parts, found = parts_of(landmark_map), []
+    for part in parts:
+        index = part.landmark_map.classes
+        own = np.where(classes >= 0, index.classes_of(class_ids), -1)
+        found.append(rarest_class_candidates(index, own, MAX_CANDIDATES // len(parts))
+                     .moved(part.first))
+    turns = np.concatenate([np.arange(len(some)) for some in found])
+    return concatenated(found).ordered(turns)

@@ -21,7 +21,8 @@ from cliploc_ros.core.geometry.projection import project
 FEW = 64
 # Children of each sphere of the tree.
 _BRANCHES = 8
-_MORTON_BITS = 16
+# All that 64 bits hold: joined maps are far apart.
+_MORTON_BITS = 21
 # Landmarks that appear larger than this half angle are never culled by depth.
 _NEAR_ANGLE = np.radians(10.0)
 

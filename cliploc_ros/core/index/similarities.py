@@ -8,7 +8,7 @@ labels take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB. Comparing 12 c
 more, whatever the map.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -32,10 +32,13 @@ class LabelEmbeddings:
         One row for each different label: of unit length, or a weighted mean of such rows.
     of_landmarks : ndarray (L,) of int
         The row of each landmark's label. Every row belongs to a landmark.
+    parts : tuple of LabelEmbeddings
+        Those of each of several maps, see in_parts; empty for a single map.
     """
 
     unique: NDArray[np.float32]
     of_landmarks: NDArray[np.int64]
+    parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
     def of(embeddings: 'LabelEmbeddings | NDArray[np.float32]') -> 'LabelEmbeddings':
@@ -43,6 +46,27 @@ class LabelEmbeddings:
         if isinstance(embeddings, LabelEmbeddings):
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
+
+    def in_parts(self, sizes: Sequence[int]) -> 'LabelEmbeddings':
+        """Return the same embeddings, those of each of several maps in rows of their own.
+
+        A label of two maps is stored twice.
+
+        Parameters
+        ----------
+        sizes : sequence of M int
+            Number of landmarks of each map, in order.
+        """
+        pieces = [np.unique(some, return_inverse=True)
+                  for some in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
+        ends = np.cumsum([len(rows) for rows, _ in pieces])
+        starts = [0, *ends[:-1].tolist()]
+        unique = self.unique[np.concatenate([rows for rows, _ in pieces])]
+        return LabelEmbeddings(
+            unique,
+            np.concatenate([own + start for start, (_, own) in zip(starts, pieces, strict=True)]),
+            tuple(LabelEmbeddings(unique[start:end], own) for start, end, (_, own)
+                  in zip(starts, ends, pieces, strict=True)))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,6 +117,22 @@ class CropSimilarities:
 
 
 Similarities = NDArray[np.float32] | CropSimilarities
+
+
+def split_similarities(similarities: Similarities, sizes: Sequence[int]) -> list[Similarities]:
+    """Return the similarities to the landmarks of each of several maps.
+
+    Parameters
+    ----------
+    similarities : ndarray (n, L) or CropSimilarities
+    sizes : sequence of M int
+        Number of landmarks of each map, in order; L in all.
+    """
+    if not isinstance(similarities, CropSimilarities):
+        return [*np.split(similarities, np.cumsum(sizes)[:-1], axis=1)]
+    labels = similarities.labels
+    parts = labels.parts or labels.in_parts(sizes).parts
+    return [CropSimilarities(similarities.crops, part) for part in parts]
 
 
 def nearest_landmarks(similarities: Similarities, k: int

@@ -52,10 +52,13 @@ def _compare_all(scene, depths, compatible):
         for j in range(i):
             if pairs[i, 0] == pairs[j, 0] or pairs[i, 1] == pairs[j, 1]:
                 continue
-            a, b = scene.bearings[pairs[i, 0]], scene.bearings[pairs[j, 0]]
             p, q = scene.centers[pairs[i, 1]], scene.centers[pairs[j, 1]]
-            cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
             apart = sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+            # most pairs of a large map are farther apart than any camera between them allows
+            if apart > FARTHEST * (depths[i] + depths[j]):
+                continue
+            a, b = scene.bearings[pairs[i, 0]], scene.bearings[pairs[j, 0]]
+            cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
             low, high = _distance_range(depths[i], depths[j], cosine)
             if low <= apart <= high:
                 compatible[i, j] = compatible[j, i] = True

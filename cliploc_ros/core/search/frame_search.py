@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.association.scene import Scene
+from cliploc_ros.core.joined_map import parts_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -54,6 +55,8 @@ class SearchedFrame(NamedTuple):
     progress : Progress
     samples : ndarray (t, 3) or None
         The samples tried; None for all samples of the first candidates, see progress.reach.
+    firsts : tuple of int
+        Row of the first landmark of each of several maps.
     """
 
     observation: Observation
@@ -63,6 +66,7 @@ class SearchedFrame(NamedTuple):
     tilted: Leaders
     progress: Progress
     samples: NDArray[np.int64] | None = None
+    firsts: tuple[int, ...] = (0,)
 
     @property
     def sample_size(self) -> int:
@@ -76,8 +80,13 @@ class SearchedFrame(NamedTuple):
 
     @property
     def known_tried(self) -> int:
-        """Return how many samples were tried or ruled out as incompatible."""
-        return max(self.progress.tried, comb(self.progress.reach, self.sample_size))
+        """Return how many samples were tried or ruled out as incompatible, of each map on average.
+
+        Samples across maps are none: that they were not tried says nothing about rivals.
+        """
+        maps = np.searchsorted(self.firsts, self.scene.pairs[:self.progress.reach, 1], 'right')
+        within = sum(comb(count, self.sample_size) for count in np.bincount(maps).tolist())
+        return max(self.progress.tried, within) // len(self.firsts)
 
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
@@ -119,7 +128,8 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
         progress = progress._replace(
             coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
-    return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples)
+    return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
+                         tuple(part.first for part in parts_of(landmark_map)))
 
 
 def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from rclpy.parameter import Parameter
 
 from cliploc_ros.errors import OptionsError
 
-Value = str | int | float | bool | list[float]
+Value = str | int | float | bool | list[float] | list[str]
 
 # What rclpy declares by itself, or what holds a map.
 _FOREIGN_PREFIXES = ('map.', 'qos_overrides.')
@@ -36,8 +36,9 @@ class ParameterRow:
     Parameters
     ----------
     name : str
-    default : str, int, float, bool or list of float
-        Its type is the parameter's.
+    default : str, int, float, bool, list of float or list of str
+        Its type is the parameter's. A list of texts may have any length, and ROS knows the type of
+        one that is not empty only: [''] stands for none.
     description : str
         One sentence in prose.
     unit : str
@@ -97,7 +98,11 @@ class ParameterRow:
         """
         if isinstance(self.default, float) and type(value) is int:
             value = float(value)
-        if isinstance(self.default, list):
+        if isinstance(self.default, list) and isinstance(self.default[0], str):
+            if not _is_text_list(value):
+                raise OptionsError(f'{self.name}: must be a list of texts, not {value!r:.60}')
+            value = list(value)
+        elif isinstance(self.default, list):
             if not _is_number_list(value) or len(value) != len(self.default):
                 raise OptionsError(f'{self.name}: must be {len(self.default)} finite numbers')
             value = [float(item) for item in value]
@@ -116,6 +121,10 @@ class ParameterRow:
 def _is_number_list(value: Any) -> bool:
     return (not isinstance(value, str | bytes) and isinstance(value, Iterable)
             and all(type(item) in (int, float) and math.isfinite(item) for item in value))
+
+
+def _is_text_list(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
 
 
 class NodeParameters:

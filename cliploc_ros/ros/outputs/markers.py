@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from cliploc_ros.core.joined_map import parts_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 #: The most landmarks that are shown: with more, RViz draws slowly.
@@ -23,12 +24,23 @@ _REFUSED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=0.9)
 
 
 def landmark_markers(landmark_map: LandmarkMap) -> MarkerArray:
-    """Return an ellipsoid and a text for each landmark, one colour for each class."""
-    header = Header(frame_id=landmark_map.frame_id)
-    markers = [Marker(header=header, action=Marker.DELETEALL)]
-    rows = zip(landmark_map.centers[:MAX_SHOWN], landmark_map.semi_axes, landmark_map.quats_xyzw,
+    """Return an ellipsoid and a text for each landmark, one colour for each class.
+
+    Several maps get markers in their own coordinate frames.
+    """
+    markers = [Marker(header=Header(frame_id=landmark_map.frame_id), action=Marker.DELETEALL)]
+    for part in parts_of(landmark_map):
+        markers += _markers_of(part.landmark_map, part.first)
+    return MarkerArray(markers=markers)
+
+
+def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
+    """Return the markers of one map, whose numbers begin with the first; at most MAX_SHOWN."""
+    header, markers = Header(frame_id=landmark_map.frame_id), []
+    shown = max(0, MAX_SHOWN - first)
+    rows = zip(landmark_map.centers[:shown], landmark_map.semi_axes, landmark_map.quats_xyzw,
                landmark_map.labels, landmark_map.class_ids, strict=False)
-    for number, (center, semi_axes, quat_xyzw, label, class_id) in enumerate(rows):
+    for number, (center, semi_axes, quat_xyzw, label, class_id) in enumerate(rows, start=first):
         ellipsoid = Marker(header=header, ns='landmarks', id=number, type=Marker.SPHERE,
                            color=class_color(class_id))
         _place(ellipsoid, center)
@@ -41,7 +53,7 @@ def landmark_markers(landmark_map: LandmarkMap) -> MarkerArray:
         _place(text, center + np.array([0.0, 0.0, semi_axes.max() + _TEXT_HEIGHT_M]))
         text.scale.z = _TEXT_HEIGHT_M
         markers += [ellipsoid, text]
-    return MarkerArray(markers=markers)
+    return markers
 
 
 def no_markers() -> MarkerArray:

@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps at run time: ``~/reload_map``, and ``~/load_map`` where nav2_msgs is installed."""
+
+import importlib
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.pipeline import Pipeline
+
+_URL_PREFIX = 'file://'
+
+
+class MapServices:
+    """Reads maps in the node's worker, never in the middle of a search.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    pipeline : Pipeline
+    group : CallbackGroup
+        Of the services.
+    """
+
+    def __init__(self, node: ManagedNode, pipeline: Pipeline, group: CallbackGroup) -> None:
+        self._node = node
+        self._pipeline = pipeline
+        node.create_service(Trigger, '~/reload_map', self._on_reload, qos_profile=qos.SERVICE,
+                            callback_group=group)
+        try:
+            load_map = importlib.import_module('nav2_msgs.srv').LoadMap
+        except ImportError:
+            return  # map_file and reload_map do the same
+        node.create_service(load_map, '~/load_map', self._on_load, qos_profile=qos.SERVICE,
+                            callback_group=group)
+
+    def load(self, map_url: str) -> str:
+        """Search one map from now on; return what was loaded, in one line.
+
+        Parameters
+        ----------
+        map_url : str
+            A file, or a URL of one that begins with file://.
+
+        Raises
+        ------
+        CliplocError
+            Names what to fix; parameters and maps stay as they were.
+        """
+        before = {name: self._node.settings[name] for name in ('map_file', 'map_files')}
+        self._set(map_file=map_url.removeprefix(_URL_PREFIX), map_files=[''])
+        try:
+            return self._node.worker.run(self._pipeline.reload_map)
+        except CliplocError:
+            self._set(**before)
+            raise
+
+    def _set(self, **values: Any) -> None:
+        self._node.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()])
+
+    def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            description = self._node.worker.run(self._pipeline.reload_map)
+            response.message = f'loaded: {description}'
+            response.success = True
+        except CliplocError as error:
+            response.message = f'not loaded: {error}'
+        self._node.get_logger().info(f'map {response.message}')
+        return response
+
+    def _on_load(self, request: Any, response: Any) -> Any:
+        try:
+            self._node.get_logger().info(f'map loaded: {self.load(request.map_url)}')
+            response.result = response.RESULT_SUCCESS
+        except CliplocError as error:
+            self._node.get_logger().error(f'map not loaded: {error}')
+            response.result = response.RESULT_INVALID_MAP_DATA
+        return response

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Real detections and CLIP on the demo's floor, searched together with other floors."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cliploc_ros.benchmark.building import main as building
+from cliploc_ros.cli.evaluate import main
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.map_file import write_map
+from cliploc_ros.demo import ASSETS
+
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+            '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods', 'auto', '--trials', 1,
+            '--no-figures', '--workers', 1)
+
+
+@pytest.fixture(scope='module')
+def walk(tmp_path_factory):
+    """The demo's walk, and maps: its floor, the same again, and the same objects elsewhere."""
+    folder = tmp_path_factory.mktemp('floors')
+    shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
+    true = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    mixed = true.centers[np.random.default_rng(1).permutation(len(true))]
+    for name, centers in (('ground', true.centers), ('alike', true.centers), ('other', mixed)):
+        write_map(folder / f'{name}.yaml', replace(true, frame_id=name, centers=centers))
+    return folder
+
+
+def evaluate(folder, *names):
+    """Return the results of six images in some maps."""
+    out, maps = folder / '_'.join(names), [folder / f'{name}.yaml' for name in names]
+    assert main([str(one) for one in ('--tum', folder / 'sequence', '--every', 8, *NETWORKS,
+                                      '--map', *maps, '--out', out)]) == 0
+    return json.loads((out / 'results.json').read_text())
+
+
+def test_the_right_floor_is_found_and_equal_floors_are_refused(walk):
+    found = evaluate(walk, 'ground', 'other')
+    accepted = [one for one in found if one['accepted']]
+    assert len(found) == 6 and len(accepted) >= 5
+    assert all(one['map'] == 'ground' and one['error_m'] < 0.5 for one in accepted)
+    alike = evaluate(walk, 'ground', 'alike')
+    assert not any(one['accepted'] for one in alike)
+
+
+def test_maps_that_cannot_be_joined_are_named(walk, capsys):
+    assert main(['--tum', str(walk / 'sequence'), '--map', *[str(walk / 'alike.yaml')] * 2]) == 1
+    assert "both have frame_id 'alike'" in capsys.readouterr().err
+
+
+def test_the_benchmark_of_a_building(capsys):
+    """Reduced: no false accept, and floors cost no accepted pose."""
+    assert building(['--floors', '3', '--objects', '200', '--queries', '6', '--dimensions', '512',
+                     '--time-budget-ms', 'inf']) == 0
+    rows = {line[:18].strip(): line[18:].split() for line in capsys.readouterr().out.splitlines()}
+    alone, together, absent = (rows[name] for name in (
+        'its floor alone', 'all floors', 'all but its floor'))
+    right, _, queries, accepted, false = map(str, together[:5])
+    assert (queries, false) == ('6', '0') and int(right) >= 5
+    assert int(accepted) >= int(alone[3]) - 1
+    assert absent[3:5] == ['0', '0']

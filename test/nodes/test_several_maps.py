@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A relocalizer that searches two floors, and changes of its maps while it runs."""
+
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import make_room, see_room, write_map
+from std_srvs.srv import Trigger
+from tester import make_frame
+
+ROOM = make_room()
+NEAR = replace(ROOM, centers=ROOM.centers - np.array([0.0, 0.0, 1.5]))
+
+
+def other_room():
+    rng = np.random.default_rng(3)
+    return replace(ROOM, centers=np.c_[rng.uniform(-2, 2, (12, 2)), rng.uniform(3, 6, 12)])
+
+
+@pytest.fixture
+def floors(tmp_path):
+    """Write maps; return their files as a parameter of the command line has them."""
+    def write(*maps):
+        files = [tmp_path / f'{number}.yaml' for number in range(len(maps))]
+        for number, (one, file) in enumerate(zip(maps, files, strict=True)):
+            write_map(replace(one, frame_id=f'floor_{number}'), file)
+        return list(map(str, files))
+    return write
+
+
+def listed(files):
+    return f'[{", ".join(files)}]'
+
+
+def reload_map(tester):
+    return tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request())
+
+
+def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester, floors):
+    files = floors(ROOM, other_room())
+    process = own_relocalizer(map_file="''", map_files=listed(files),
+                              expect="24 landmarks in 2 maps, frames 'floor_0', 'floor_1'")
+    for number, room in enumerate((ROOM, other_room())):
+        tester.forget()
+        answer = tester.relocalize(make_frame(see_room(room), stamp_s=100.0 + number))
+        assert answer.success, answer.message
+        assert f' m in floor_{number} ' in answer.message
+        tester.wait(lambda: tester.poses, 'a pose')
+        assert tester.poses[-1].header.frame_id == f'floor_{number}'
+        assert tester.poses[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.05)
+    assert process.stop()[0] == 0
+
+
+def test_floors_that_look_alike_are_refused_and_named(own_relocalizer, tester, floors):
+    own_relocalizer(map_file="''", map_files=listed(floors(NEAR, NEAR)))
+    answer = tester.relocalize(make_frame(see_room(NEAR)))
+    assert not answer.success and answer.message.startswith('refused: in floor_')
+    assert 'floor_0' in answer.message and 'floor_1' in answer.message
+
+
+def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
+    """A bad list changes nothing; one map is rolled out, and back."""
+    first, second = floors(ROOM, other_room())
+    own_relocalizer(map_file=first)
+    frame = make_frame(see_room(other_room()))
+    assert not tester.relocalize(frame).success
+    assert tester.set_parameter('map_files', [first, second]).successful
+    assert 'map_file and map_files both name files' in reload_map(tester).message
+    assert tester.set_parameter('map_file', '').successful
+    assert reload_map(tester).success
+    assert ' in floor_1 ' in tester.relocalize(frame).message
+    assert tester.set_parameter('map_files', [first, first]).successful
+    assert "both have frame_id 'floor_0'" in reload_map(tester).message
+    assert tester.set_parameter('map_files', [first, '/nowhere.yaml']).successful
+    assert '/nowhere.yaml' in reload_map(tester).message
+    assert ' in floor_1 ' in tester.relocalize(frame).message
+    assert tester.set_parameter('map_files', ['']).successful
+    assert tester.set_parameter('map_file', first).successful
+    assert reload_map(tester).message == "loaded: 12 landmarks in frame 'floor_0', class_bf"
+    assert not tester.relocalize(frame).success
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors):
+    srv = importlib.import_module('nav2_msgs.srv')
+    first, second = floors(ROOM, other_room())
+    own_relocalizer(map_file="''", map_files=listed([first, second]))
+
+    def load(url):
+        return tester.call(srv.LoadMap, '/relocalizer/load_map',
+                           srv.LoadMap.Request(map_url=url)).result
+    assert load('/nowhere.yaml') == srv.LoadMap.Response.RESULT_INVALID_MAP_DATA
+    assert tester.relocalize(make_frame(see_room(other_room()))).success
+    assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
+    assert tester.relocalize(make_frame()).success
+    assert not tester.relocalize(make_frame(see_room(other_room()))).success
