@@ -26,7 +26,7 @@ LAYERS = (
     ('core.geometry',),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
-    ('core.association',),
+    ('core.association', 'core.keyframes'),
     ('core.search',),
     ('core.fit',),
     ('core.acceptance',),
