@@ -33,6 +33,7 @@ from cliploc_ros.ros.conversions import (
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
 from cliploc_ros.ros.map_parameters import load_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
@@ -75,11 +76,15 @@ class Localizer:
     options : RelocalizerOptions
     device : str
         Where the observer's network runs.
+    keyframes : Keyframes, optional
+        The layer of keyframes of the map.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
-                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str) -> None:
+                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
+                 keyframes: Keyframes | None = None) -> None:
         self.device = device
+        self._keyframes = keyframes
         self._map = landmark_map
         self._observer = observer
         self._options = options
@@ -99,7 +104,8 @@ class Localizer:
     @property
     def description(self) -> str:
         """Return what is loaded, in a line."""
-        return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', "
+        keyframes = '' if self._keyframes is None else f'{len(self._keyframes)} keyframes, '
+        return (f"{len(self._map)} landmarks in frame '{self._map.frame_id}', {keyframes}"
                 f'{self._options.matching}_{self._options.algorithm}')
 
     def reloaded(self, node: Node, values: Mapping[str, Any]) -> 'Localizer':
@@ -119,7 +125,8 @@ class Localizer:
             observer = observer.with_labels(embed_map(
                 _clip_options(values), landmark_map, values['map_file'],
                 values['landmark_embeddings']))
-        return Localizer(landmark_map, observer, relocalizer, options, self.device)
+        return Localizer(landmark_map, observer, relocalizer, options, self.device,
+                         load_keyframes(values, landmark_map))
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -165,6 +172,9 @@ class Localizer:
                                      values['fuse_window_s'], stages)
         seen = session.observation
         assert seen is not None
+        if self._keyframes is not None:
+            times.begin('keyframes')
+            found = self._keyframes.join(found, image, seen, options, deadline)
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         return Localized(found, SeenImage(image, seen), compared, is_cut)
@@ -231,7 +241,8 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
             values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
-    return Localizer(landmark_map, observer, relocalizer, options, device)
+    return Localizer(landmark_map, observer, relocalizer, options, device,
+                     load_keyframes(values, landmark_map))
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:

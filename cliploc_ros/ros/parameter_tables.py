@@ -70,6 +70,9 @@ DETECTOR = (
 RELOCALIZER = (
     ParameterRow('map_file', '', "Map file, read when the node is configured and by reload_map; "
                  "empty: the parameters below 'map' hold the map."),
+    ParameterRow('keyframes_file', 'auto', "Layer of keyframes of the map, read with it: a file, "
+                 "or 'auto': NAME.keyframes.npz next to map_file NAME.yaml, where there is one; "
+                 'empty: none.'),
     ParameterRow('mode', 'on_request', 'Localize on request, or with every '
                  'frame.', choices=MODES, read_only=True),
     ParameterRow('timeout_s', 10.0, 'A request is answered within this time.', unit='s',

@@ -30,14 +30,14 @@ class Features:
 
     Parameters
     ----------
-    pixels : ndarray (n, 2) float32
+    pixels : ndarray (n, 2)
         [px] in the image as it is, distorted.
     descriptors : ndarray (n, 128) uint8
     strengths : ndarray (n,) float32
         Response of the detector; the strongest is first.
     """
 
-    pixels: NDArray[np.float32]
+    pixels: NDArray[np.float64]
     descriptors: NDArray[np.uint8]
     strengths: NDArray[np.float32]
 
@@ -53,15 +53,15 @@ def extract(image_rgb: NDArray[np.uint8], most: int) -> Features:
     scale = min(1.0, _LONGEST_SIDE_PX / longest)
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    sift = cv2.SIFT_create(nfeatures=most)
+    sift = cv2.SIFT.create(nfeatures=most)
     points, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:
-        return Features(np.empty((0, 2), np.float32), np.empty((0, DIMENSIONS), np.uint8),
+        return Features(np.empty((0, 2)), np.empty((0, DIMENSIONS), np.uint8),
                         np.empty(0, np.float32))
     strengths = np.array([point.response for point in points], dtype=np.float32)
     rows = np.argsort(-strengths, kind='stable')[:most]
-    pixels = (cv2.KeyPoint_convert(points)[rows] + 0.5) / scale - 0.5
-    return Features(pixels.astype(np.float32), _compact(descriptors[rows]), strengths[rows])
+    pixels = (np.array([point.pt for point in points])[rows] + 0.5) / scale - 0.5
+    return Features(pixels, _compact(descriptors[rows]), strengths[rows])
 
 
 def _compact(sift: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -20,6 +20,8 @@ from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
 WORDS = 1024
 # Descriptors that the words are learned from, and steps of k-means.
 _MOST_LEARNED, _STEPS = 50_000, 8
+# Focal lengths, as shares of the image's width, are equal to so much.
+_SAME_FOCAL = 0.02
 #: A pixel of the layer is kept in sixteenths.
 PIXEL_SCALE = 16.0
 
@@ -71,6 +73,16 @@ class KeyframeLayer:
     def prepare(self) -> None:
         """Compute what the first request would wait for."""
         _ = self._profiles, self._unit_vocabulary
+
+    def camera_note(self, camera: Camera) -> str:
+        """Return how a camera differs from that of the keyframes; empty if it does not."""
+        own = self.camera
+        ours = np.array([own.fx, own.fy]) / own.width
+        theirs = np.array([camera.fx, camera.fy]) / camera.width
+        if np.abs(theirs / ours - 1.0).max() <= _SAME_FOCAL:
+            return ''
+        return (f'the camera differs from that of the keyframes: fx {camera.fx:.1f} of '
+                f'{camera.width} px, theirs {own.fx:.1f} of {own.width} px; is camera_info right?')
 
     def rows(self, keyframe: int) -> slice:
         """Return where the points of a keyframe are."""

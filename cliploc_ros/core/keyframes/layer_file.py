@@ -167,7 +167,8 @@ def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
 
 def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
     offsets = arrays['offsets']
-    if offsets[0] != 0 or offsets[-1] != len(arrays['descriptors']) or (np.diff(offsets) < 0).any():
+    count = len(arrays['descriptors'])
+    if offsets[0] != 0 or offsets[-1] != count or (np.diff(offsets) < 0).any():
         raise _LayerError('array offsets does not count the points of the keyframes')
     for row, pose in enumerate(arrays['map_from_camera']):
         if not is_rigid(pose, tolerance=1e-3):
