@@ -66,7 +66,7 @@ class Study:
     def place(self, rows: Sequence[int], out: Path, options: LayerOptions) -> Place:
         """Return what is built of some images, and write it."""
         built = build_map(self.recorded.select_frames(rows), MappingOptions()).landmark_map
-        layer = build_layer(_some(self._frames, rows), built, options)
+        layer = build_layer(some_frames(self._frames, rows), built, options)
         write_map(out.with_suffix('.yaml'), built, ['study of keyframes'], None)
         save_layer(out, layer)
         baseline = Baseline([self.images[row] for row in rows])
@@ -110,7 +110,7 @@ def _elsewhere(images: Sequence[Frame], row: int, mapped: Sequence[int],
     return mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
 
 
-def _some(frames: Frames, rows: Sequence[int]) -> Frames:
+def some_frames(frames: Frames, rows: Sequence[int]) -> Frames:
     """Return some of the frames."""
     chosen = set(rows)
 

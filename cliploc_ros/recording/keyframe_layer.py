@@ -13,7 +13,9 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import extract, unit_rows
 from cliploc_ros.core.keyframes.layer import (
+    FROM_DEPTH,
     PIXEL_SCALE,
+    TRIANGULATED,
     KeyframeLayer,
     learn_words,
     nearest_words,
@@ -97,7 +99,9 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                            f'{_LEAST_POINTS} features with a place in the map; record depth, or '
                            'images that overlap and are 5 cm or more apart')
     return _assemble(landmark_map, camera, [images[row] for row in rows],
-                     [points[row] for row in rows], [kept[row] for row in rows])
+                     [points[row] for row in rows], [kept[row] for row in rows],
+                     FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
+                     else TRIANGULATED)
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
@@ -152,8 +156,8 @@ def _strongest(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
 
 
 def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedFeatures],
-              points: Sequence[NDArray[np.float64]], kept: Sequence[NDArray[np.int64]]
-              ) -> KeyframeLayer:
+              points: Sequence[NDArray[np.float64]], kept: Sequence[NDArray[np.int64]],
+              deviation_per_metre: float) -> KeyframeLayer:
     descriptors = np.concatenate([one.descriptors[rows]
                                   for one, rows in zip(images, kept, strict=True)])
     pixels = np.concatenate([one.bearings[rows] for one, rows in zip(images, kept, strict=True)])
@@ -168,4 +172,4 @@ def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedF
         np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
                        ).astype(np.float32),
         descriptors, nearest_words(unit_rows(descriptors), unit_rows(vocabulary)
-                                   ).astype(np.uint16), vocabulary)
+                                   ).astype(np.uint16), vocabulary, deviation_per_metre)

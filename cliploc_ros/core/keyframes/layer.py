@@ -22,6 +22,9 @@ WORDS = 1024
 _MOST_LEARNED, _STEPS = 50_000, 8
 # Focal lengths, as shares of the image's width, are equal to so much.
 _SAME_FOCAL = 0.02
+#: Deviations a metre from a keyframe: of points from depth, whose scale and registration are never
+#: exact (chosen on the kitchen), and of triangulated ones (a guess on the safe side).
+FROM_DEPTH, TRIANGULATED = 0.08, 0.02
 #: A pixel of the layer is kept in sixteenths.
 PIXEL_SCALE = 16.0
 
@@ -52,6 +55,9 @@ class KeyframeLayer:
         Word of each descriptor.
     vocabulary : ndarray (W, 128) uint8
         The words' mean descriptors.
+    deviation_per_metre : float
+        How far a pose is off that was found from a keyframe a metre away, as a standard
+        deviation on each axis [m]: the error that its points share.
     """
 
     frame_id: str
@@ -65,6 +71,7 @@ class KeyframeLayer:
     descriptors: NDArray[np.uint8]
     words: NDArray[np.uint16]
     vocabulary: NDArray[np.uint8]
+    deviation_per_metre: float = FROM_DEPTH
 
     def __len__(self) -> int:
         """Return the number of keyframes."""

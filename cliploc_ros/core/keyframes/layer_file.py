@@ -9,7 +9,6 @@ costs memory only where it is used, and may be larger than the memory.
 import json
 import os
 import zipfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +36,10 @@ _LAYOUT: dict[str, tuple[tuple[object, ...], str]] = {
     'words': (('n',), 'uint16'),
     'vocabulary': (('W', DIMENSIONS), 'uint8'),
 }
+_CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
 _MAPPED = ('pixels', 'points', 'descriptors')
 _HEADER_BYTES = 100_000
+_MOST_DEVIATION = 1.0
 # A map whose landmarks of the same name have moved so far in general is another map [m].
 _MOST_MOVED_M = 1.0
 _MAKE_AGAIN = 'make the layer again with build_map --keyframe-layer, or remove the file'
@@ -58,7 +59,8 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
         The file cannot be written.
     """
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
-              'camera': asdict(layer.camera)}
+              'deviation_per_metre': layer.deviation_per_metre,
+              'camera': {name: getattr(layer.camera, name) for name in _CAMERA}}
     arrays: dict[str, NDArray[Any]] = {
         name: np.asarray(getattr(layer, name)).astype(kind, copy=False)
         for name, (_, kind) in _LAYOUT.items()}
@@ -97,18 +99,23 @@ def _load(path: Path) -> KeyframeLayer:
         with zipfile.ZipFile(path) as archive, path.open('rb') as file:
             header = _read_header(archive)
             arrays = {name: _read_array(archive, file, path, name) for name in _LAYOUT}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError
-            ) as error:
+    except _LayerError:
+        raise
+    except Exception as error:  # whatever NumPy and zipfile meet in a broken file
         raise _LayerError(f'is no complete layer of keyframes ({error})') from error
     _check_layout(arrays)
     _check_values(arrays)
     try:
-        camera = Camera(**header['camera'])
-    except (CameraError, KeyError, TypeError) as error:
-        raise _LayerError(f'has no valid camera in its header ({error})') from error
+        camera = Camera(*(header['camera'][name] for name in _CAMERA))
+        deviation = float(header['deviation_per_metre'])
+    except (CameraError, KeyError, TypeError, ValueError) as error:
+        raise _LayerError(f'has no valid camera or deviation in its header ({error})') from error
+    if not 0.0 <= deviation <= _MOST_DEVIATION:
+        raise _LayerError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
-                         arrays.pop('landmark_centers'), camera, **arrays)
+                         arrays.pop('landmark_centers'), camera, **arrays,
+                         deviation_per_metre=deviation)
 
 
 def _read_header(archive: zipfile.ZipFile) -> dict[str, Any]:

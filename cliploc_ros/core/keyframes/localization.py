@@ -31,10 +31,9 @@ _RIVAL_TOLERANCE = 3.0
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
-# Errors that all points of a keyframe share: of its pose, and of its depths, which matter the
-# more the further the image is from the keyframe. Fitted on the kitchen, see the study.
-_KEYFRAME_M, _KEYFRAME_RAD = 0.012, np.radians(0.35)
-_PER_METRE, _PER_RADIAN = 0.08, 0.03
+# Errors that all points of a keyframe share: of its pose, and of its points, which matter the
+# more the further the image is from the keyframe. Chosen on the kitchen, see the study.
+_KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.35), 0.03
 
 
 class Recognized(NamedTuple):
@@ -164,7 +163,8 @@ class KeyframeLocalizer:
         other = find_pose(left.points, bearings[left.features], camera)
         if other is None or _same_place(best, other.map_from_camera):
             return 0, None
-        return len(np.unique(left.features[other.inliers])), other.map_from_camera
+        count = len(np.unique(left.features[other.inliers]))
+        return (count, other.map_from_camera) if count >= LEAST_INLIERS else (0, None)
 
     def _confirmed(self, pose: NDArray[np.float64], camera: Camera, features: Features,
                    inliers: _Matched, used: NDArray[np.int64]) -> float:
@@ -189,7 +189,7 @@ class KeyframeLocalizer:
         distance = shares @ np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
         turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
         angle = shares @ turns.magnitude()
-        position = _KEYFRAME_M**2 + (_PER_METRE * distance) ** 2
+        position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
         rotation = _KEYFRAME_RAD**2 + (_PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
 

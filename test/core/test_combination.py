@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One answer from objects and keyframes: agreement, contradiction, and what each alone may do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.combination import ObjectsThere, combine, fuse, objects_there
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Hypothesis, Relocalization
+
+OPTIONS = RelocalizerOptions(matching='class')
+ROUGH, FINE = np.diag([0.01] * 3 + [1e-3] * 3), np.diag([1e-4] * 3 + [1e-5] * 3)
+NOWHERE = Relocalization(False, '2 objects matched < 3')
+SOME = ObjectsThere(3, 1)
+
+
+def at(x):
+    return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def by_objects(x, confidence, accepted):
+    return Relocalization(accepted, '' if accepted else 'confidence too low',
+                          (Hypothesis(at(x), 2.0, confidence, Support(inliers=4)),),
+                          covariance=ROUGH)
+
+
+def by_keyframes(x, inliers=200, rival=0, confirmed=0.8):
+    return Recognized(at(x), FINE, inliers, rival, None, confirmed, (0,))
+
+
+def test_without_a_layer_nothing_changes():
+    found = by_objects(0.0, 0.995, True)
+    assert combine(found, None, None, OPTIONS) is found
+
+
+def test_many_points_accept_what_objects_could_not():
+    found = combine(NOWHERE, by_keyframes(1.0), SOME, OPTIONS)
+    assert found.accepted
+    assert found.source == 'keyframes'
+    assert pose_error(found.map_from_camera, at(1.0))[0] == 0.0
+    assert found.covariance is FINE
+
+
+def test_agreeing_poses_are_fused_and_the_better_one_weighs_more():
+    found = combine(by_objects(0.1, 0.9, False), by_keyframes(0.0), SOME, OPTIONS)
+    assert found.accepted
+    assert found.source == 'both'
+    assert found.confidence > 0.99
+    assert pose_error(found.map_from_camera, at(0.0))[0] < 0.01
+    assert np.trace(found.covariance) < np.trace(FINE)
+
+
+@pytest.mark.parametrize(('confidence', 'accepted'), [(0.995, True), (0.7, False)])
+def test_objects_elsewhere_refuse_a_poster(confidence, accepted):
+    found = combine(by_objects(5.0, confidence, accepted), by_keyframes(0.0), SOME, OPTIONS)
+    assert not found.accepted
+    assert '5.00 m apart' in found.reason
+
+
+@pytest.mark.parametrize('seen', [
+    by_keyframes(0.0, inliers=12), by_keyframes(0.0, confirmed=0.1),
+    by_keyframes(0.0, rival=150)], ids=['few points', 'a small poster', 'two equal rooms'])
+def test_weak_features_accept_nothing_and_leave_the_objects_pose(seen):
+    refused = combine(NOWHERE, seen, SOME, OPTIONS)
+    assert not refused.accepted
+    assert 'keyframes: ' in refused.reason
+    found = by_objects(5.0, 0.995, True)
+    assert combine(found, seen, SOME, OPTIONS) is found
+
+
+def test_objects_that_the_pose_does_not_explain_speak_against_it():
+    seen = by_keyframes(0.0, inliers=80, confirmed=0.6)
+    assert combine(NOWHERE, seen, ObjectsThere(4, 0), OPTIONS).accepted
+    assert not combine(NOWHERE, seen, ObjectsThere(0, 8), OPTIONS).accepted
+
+
+def test_a_fused_pose_is_symmetric_and_grows_with_disagreement():
+    first, covariance = fuse(at(0.0), ROUGH, at(0.1), ROUGH)
+    assert first[0, 3] == pytest.approx(0.05)
+    assert np.allclose(covariance, ROUGH / 2)
+    _, stretched = fuse(at(0.0), FINE, at(0.5), FINE)
+    assert stretched[0, 0] > 10 * FINE[0, 0]
+    swapped, _ = fuse(at(0.1), ROUGH, at(0.0), ROUGH)
+    assert np.allclose(first, swapped)
+
+
+def test_a_perfect_view_explains_its_objects_only_where_it_is():
+    room = make_room()
+    observation = Observation(CAMERA, see_room(room))
+    assert objects_there(room, observation, MAP_FROM_CAMERA) == ObjectsThere(len(room), 0)
+    away = MAP_FROM_CAMERA.copy()
+    away[0, 3] += 3.0
+    assert objects_there(room, observation, away).explained < len(room) // 2
+    unknown = replace(observation.detections, class_ids=('z',) * len(room))
+    assert objects_there(room, replace(observation, detections=unknown), away) == (0, 0)

@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameter keyframes_file: which layer is read, and that a bad one stops nothing."""
+
+import logging
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room, write_map
+
+from cliploc_ros.core.keyframes.features import DIMENSIONS
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.ros.keyframes import load_keyframes
+
+ROOM = make_room()
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A map with a layer of one keyframe next to it."""
+    path = tmp_path / 'room.yaml'
+    write_map(ROOM, path)
+    save_layer(layer_path(path), KeyframeLayer(
+        'map', ROOM.landmark_ids, ROOM.centers.astype(np.float32), CAMERA, np.eye(4)[None],
+        np.array([0, 5]), np.zeros((5, 2), np.uint16), np.ones((5, 3), np.float32),
+        np.ones((5, DIMENSIONS), np.uint8), np.zeros(5, np.uint16),
+        np.ones((1, DIMENSIONS), np.uint8)))
+    return path
+
+
+def load(map_file, keyframes_file='auto'):
+    return load_keyframes({'map_file': str(map_file), 'keyframes_file': str(keyframes_file)}, ROOM)
+
+
+def test_the_layer_next_to_the_map_or_a_named_one_is_read(room, tmp_path):
+    assert len(load(room)) == 1
+    moved = tmp_path / 'other.npz'
+    (tmp_path / 'room.keyframes.npz').rename(moved)
+    assert load(room) is None
+    assert len(load(room, moved)) == 1
+    assert len(load('', moved)) == 1
+
+
+def test_no_layer_is_read_where_none_is_wanted(room):
+    assert load(room, '') is None
+    assert load('') is None
+
+
+@pytest.mark.parametrize('spoil', ['truncated', 'missing'])
+def test_a_bad_layer_is_logged_and_left_out(room, caplog, spoil):
+    layer = room.with_name('room.keyframes.npz')
+    named = 'auto'
+    if spoil == 'truncated':
+        layer.write_bytes(layer.read_bytes()[:300])
+    else:
+        named = room.with_name('none.npz')
+    with caplog.at_level(logging.ERROR):
+        assert load(room, named) is None
+    assert 'localizing without keyframes' in caplog.text
+    assert str(layer if spoil == 'truncated' else named) in caplog.text
