@@ -29,14 +29,23 @@ from cliploc_ros.core.relocalization import Hypothesis, Relocalization
 # the image that is confirmed, of each detected object that the map explains there and of each
 # that it does not. Rounded by hand on the kitchen's halves and on rooms that are not in the map,
 # see cliploc_ros.evaluation.keyframes.
-_INLIERS, _CONFIRMED, _EXPLAINED, _UNEXPLAINED, _NONE = 2.5, 6.0, 0.7, -0.7, -11.0
+_INLIERS, _CONFIRMED, _EXPLAINED, _UNEXPLAINED, _NONE = 5.0, 6.0, 0.7, -0.7, -14.0
 # Of the inliers, so many are lost for each that a pose elsewhere has.
 _RIVAL_COUNTS = 3.0
 _MOST_CONFIDENCE = 0.9999
 # Features alone are accepted only where they confirm so much of the image. Objects whose pose
 # elsewhere is so likely contradict the features.
-_LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 25
+_LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 20
+# As many points elsewhere contradict a pose; of 231 right poses of the kitchen, none had more
+# than 19. So does a share of the image that is much less than its inliers let expect, as where
+# they lie on a poster: from a few inliers up to many.
+_MOST_RIVAL = 20
+_LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.25, 300
 _CONTRADICTS = 0.5
+# Weights of the first pose that covariance intersection tries.
+_WEIGHTS = np.linspace(0.0, 1.0, 11)
+# Detected objects of the map's classes contradict a pose that explains so few of them.
+_MOST_UNEXPLAINED, _LEAST_EXPLAINED = 4, 0.25
 # A detection is explained by a landmark of its class whose outline overlaps it so much.
 _EXPLAINS_IOU = 0.2
 
@@ -77,6 +86,8 @@ def chance_recognized(seen: Recognized, there: ObjectsThere) -> float:
     odds = (_NONE + _INLIERS * math.log(inliers) + _CONFIRMED * seen.confirmed
             + _EXPLAINED * there.explained + _UNEXPLAINED * there.unexplained)
     right = 1.0 / (1.0 + math.exp(-min(odds, 50.0)))
+    if _inconsistent(seen, there):
+        right = min(right, 0.5)
     return min(_MOST_CONFIDENCE, right) * share_within(RIGHT_M, seen.covariance)
 
 
@@ -99,27 +110,45 @@ def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere 
     chance = chance_recognized(seen, there)
     agree = found.map_from_camera is not None and _agree(found.map_from_camera,
                                                          seen.map_from_camera)
-    refusal = _refusal(seen, chance, options)
+    refusal = _refusal(seen, there, chance, options)
     if agree:
-        return _both(found, seen, chance, options)
+        return _both(found, seen, chance, refusal, options)
     if found.accepted and not refusal:
         return replace(found, accepted=False, reason=_contradiction(found, seen))
-    if found.accepted or (refusal and found.confidence >= chance):
+    if found.accepted:
         return found
     if not refusal and found.confidence >= _CONTRADICTS:
         refusal = _contradiction(found, seen)
-    if refusal:
-        return replace(found, reason=f'{found.reason}; keyframes: {refusal}')
-    return _with_pose(found, seen.map_from_camera, seen.covariance, chance, 'keyframes', '')
+    reason = f'{found.reason}; keyframes: {refusal}' if refusal else ''
+    if refusal and found.confidence >= chance:
+        return replace(found, reason=reason)
+    return _with_pose(found, seen.map_from_camera, seen.covariance, chance, 'keyframes', reason)
 
 
-def _refusal(seen: Recognized, chance: float, options: RelocalizerOptions) -> str:
+def _inconsistent(seen: Recognized, there: ObjectsThere) -> str:
+    """Return what in the image contradicts a pose of keyframes; empty where nothing does."""
+    if seen.rival >= _MOST_RIVAL:
+        return f'{seen.inliers} points agree, but {seen.rival} on another place'
+    least = _LEAST_OF_EXPECTED + _MORE_OF_EXPECTED * min(1.0, seen.inliers / _MANY_INLIERS)
+    if seen.confirmed < least * seen.expected:
+        return (f'{seen.inliers} points agree, but only in {seen.confirmed:.0%} of the image; '
+                'has something been moved?')
+    known = there.explained + there.unexplained
+    if there.unexplained >= _MOST_UNEXPLAINED and there.explained < _LEAST_EXPLAINED * known:
+        return f'{there.unexplained} of {known} objects are not where the pose expects them'
+    return ''
+
+
+def _refusal(seen: Recognized, there: ObjectsThere, chance: float,
+             options: RelocalizerOptions) -> str:
     """Return why the pose of keyframes is refused; empty if it is accepted."""
     if seen.inliers < _LEAST_INLIERS:
         return f'{seen.inliers} points agree < {_LEAST_INLIERS}'
     if seen.confirmed < _LEAST_CONFIRMED:
         return (f'{seen.confirmed:.0%} of the image shows what it should < '
                 f'{_LEAST_CONFIRMED:.0%}')
+    if inconsistent := _inconsistent(seen, there):
+        return inconsistent
     if chance < options.min_confidence:
         rival = f', {seen.rival} elsewhere' if seen.rival else ''
         return (f'confidence {math.floor(chance * 100) / 100:.2f} < {options.min_confidence:g}, '
@@ -127,8 +156,8 @@ def _refusal(seen: Recognized, chance: float, options: RelocalizerOptions) -> st
     return ''
 
 
-def _both(found: Relocalization, seen: Recognized, chance: float, options: RelocalizerOptions
-          ) -> Relocalization:
+def _both(found: Relocalization, seen: Recognized, chance: float, refusal: str,
+          options: RelocalizerOptions) -> Relocalization:
     """Return the fused answer of two poses that agree.
 
     Each is wrong with its own probability, and both lead to the same wrong place only by chance:
@@ -139,7 +168,7 @@ def _both(found: Relocalization, seen: Recognized, chance: float, options: Reloc
                             seen.covariance)
     confidence = min(_MOST_CONFIDENCE, 1.0 - (1.0 - found.confidence) * (1.0 - chance))
     reason = '' if found.accepted or confidence >= options.min_confidence else \
-        f'{found.reason}; keyframes: {_refusal(seen, chance, options)}'
+        f'{found.reason}; keyframes: {refusal}'
     return _with_pose(found, pose, covariance, confidence, 'both', reason)
 
 
@@ -159,18 +188,22 @@ def _with_pose(found: Relocalization, pose: NDArray[np.float64],
 def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
          second: NDArray[np.float64], second_covariance: NDArray[np.float64]
          ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean of two independent poses (4, 4) and its covariance (6, 6).
+    """Return the weighted mean of two poses (4, 4) and its covariance (6, 6).
 
-    The covariances are in the order of core.fit.covariance. Where the poses differ by more than
-    their covariances allow, the fused one grows by as much.
+    Both share the errors of the map, to an unknown degree. Covariance intersection is right for
+    any degree (Julier and Uhlmann, "A Non-divergent Estimation Algorithm in the Presence of
+    Unknown Correlations", 1997). The weight gives the least variance of the position, so a pose
+    that is better in every direction stays as it is. The covariances are in the order of
+    core.fit.covariance.
     """
+    informations = np.linalg.inv(first_covariance), np.linalg.inv(second_covariance)
+    covariances = [np.linalg.inv(weight * informations[0] + (1.0 - weight) * informations[1])
+                   for weight in _WEIGHTS]
+    best = int(np.argmin([np.trace(one[:3, :3]) for one in covariances]))
+    covariance = (covariances[best] + covariances[best].T) / 2
     step = np.concatenate([first[:3, 3] - second[:3, 3],
                            Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()])
-    gain = second_covariance @ np.linalg.inv(first_covariance + second_covariance)
-    moved = gain @ step
-    covariance = second_covariance - gain @ second_covariance
-    surprise = float(step @ np.linalg.solve(first_covariance + second_covariance, step)) / 6.0
-    covariance = (covariance + covariance.T) / 2 * max(1.0, surprise)
+    moved = _WEIGHTS[best] * covariance @ informations[0] @ step
     turn = Rotation.from_rotvec(moved[3:]).as_matrix()
     return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance
 

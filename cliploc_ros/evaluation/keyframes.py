@@ -13,6 +13,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -67,10 +68,11 @@ class Study:
         """Return what is built of some images, and write it."""
         built = build_map(self.recorded.select_frames(rows), MappingOptions()).landmark_map
         layer = build_layer(some_frames(self._frames, rows), built, options)
-        write_map(out.with_suffix('.yaml'), built, ['study of keyframes'], None)
+        name = out.name.partition('.')[0]
+        write_map(out.with_name(f'{name}.yaml'), built, ['study of keyframes'], None)
         save_layer(out, layer)
         baseline = Baseline([self.images[row] for row in rows])
-        print(f'{out.stem}: {len(built)} landmarks, {len(layer)} keyframes, '
+        print(f'{name}: {len(built)} landmarks, {len(layer)} keyframes, '
               f'{out.stat().st_size / 1e6:.1f} MB; baseline {baseline.megabytes:.1f} MB',
               flush=True)
         return Place(built, KeyframeLocalizer(layer), baseline)
@@ -137,7 +139,7 @@ def _ask(place: Place, case: str, queries: Iterator[Query]) -> list[Row]:
 
 
 def _cases(study: Study, place: Place, mapped: Sequence[int], asked: Sequence[int],
-           others: Sequence[Path], seed: int) -> Iterator[list[Row]]:
+           others: Sequence[Path], every: int, seed: int) -> Iterator[list[Row]]:
     """Yield the results of the changed images and of those that must not be accepted."""
     for name, change in IMAGE_CHANGES.items():
         yield _ask(place, name, study.queries(asked, change))
@@ -151,7 +153,8 @@ def _cases(study: Study, place: Place, mapped: Sequence[int], asked: Sequence[in
     for folder in others:
         frames = tum_frames(read_tum(folder), find_camera(None, folder)[0])
         yield _ask(place, f'other room {folder.name}',
-                   (study.query(one, is_here=False) for one in frames.read()))
+                   (study.query(one, is_here=False) for one in islice(frames.read(), None, None,
+                                                                     every)))
 
 
 def run(arguments: list[str]) -> int:
@@ -188,7 +191,7 @@ def run(arguments: list[str]) -> int:
     if not options.plain:
         mapped, asked = splits['interleaved']
         for found in _cases(study, places['interleaved'], mapped, asked[::options.every],
-                            options.other, options.seed):
+                            options.other, options.every, options.seed):
             rows += found
             _write(options.out, rows)
     _write(options.out, rows)

@@ -51,7 +51,7 @@ def test_covariances_of_noisy_features_are_honest():
 
 def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
     rng = np.random.default_rng(3)
-    pose, points, bearings = look(rng, 30)
+    _, points, bearings = look(rng, 30)
     assert find_pose(points[:5], bearings[:5], CAMERA) is None
     assert find_pose(np.empty((0, 3)), np.empty((0, 2)), CAMERA) is None
     found = find_pose(points, rng.permutation(bearings), CAMERA)

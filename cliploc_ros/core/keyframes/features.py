@@ -20,6 +20,9 @@ DIMENSIONS = 128
 _SCALE = 512.0
 # Larger images are made smaller first: it bounds the time.
 _LONGEST_SIDE_PX = 800
+# A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
+# leaves out features of little contrast.
+_DARK = 160.0
 # A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
 _RATIO = 0.85
 
@@ -53,6 +56,9 @@ def extract(image_rgb: NDArray[np.uint8], most: int) -> Features:
     scale = min(1.0, _LONGEST_SIDE_PX / longest)
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    bright = float(np.percentile(gray, 99))
+    if 0.0 < bright < _DARK:
+        gray = cv2.convertScaleAbs(gray, alpha=_DARK / bright)
     sift = cv2.SIFT.create(nfeatures=most)
     points, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:

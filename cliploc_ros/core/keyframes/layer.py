@@ -24,7 +24,7 @@ _MOST_LEARNED, _STEPS = 50_000, 8
 _SAME_FOCAL = 0.02
 #: Deviations a metre from a keyframe: of points from depth, whose scale and registration are never
 #: exact (chosen on the kitchen), and of triangulated ones (a guess on the safe side).
-FROM_DEPTH, TRIANGULATED = 0.08, 0.02
+FROM_DEPTH, TRIANGULATED = 0.1, 0.02
 #: A pixel of the layer is kept in sixteenths.
 PIXEL_SCALE = 16.0
 

@@ -33,7 +33,7 @@ _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
 # Errors that all points of a keyframe share: of its pose, and of its points, which matter the
 # more the further the image is from the keyframe. Chosen on the kitchen, see the study.
-_KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.35), 0.03
+_KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
 class Recognized(NamedTuple):
@@ -52,6 +52,8 @@ class Recognized(NamedTuple):
         That pose.
     confirmed : float
         Share of the parts of the image that show what the keyframes have there: 0 to 1.
+    expected : float
+        The share that so many inliers would confirm if they were spread as usual: 0 to 1.
     keyframes : tuple of int
         Those that points agree with, the most points first.
     """
@@ -62,6 +64,7 @@ class Recognized(NamedTuple):
     rival: int
     rival_pose: NDArray[np.float64] | None
     confirmed: float
+    expected: float
     keyframes: tuple[int, ...]
 
 
@@ -122,7 +125,7 @@ class KeyframeLocalizer:
             best.map_from_camera,
             best.covariance + self._shared(best.map_from_camera, counts),
             len(np.unique(inliers.features)), rival, rival_pose,
-            self._confirmed(best.map_from_camera, camera, features, inliers, used),
+            *self._confirmed(best.map_from_camera, camera, features, inliers, used),
             tuple(used.tolist()))
 
     def _choose(self, descriptors: NDArray[np.float32], guesses: Sequence[NDArray[np.float64]]
@@ -167,10 +170,12 @@ class KeyframeLocalizer:
         return (count, other.map_from_camera) if count >= LEAST_INLIERS else (0, None)
 
     def _confirmed(self, pose: NDArray[np.float64], camera: Camera, features: Features,
-                   inliers: _Matched, used: NDArray[np.int64]) -> float:
+                   inliers: _Matched, used: NDArray[np.int64]) -> tuple[float, float]:
         """Return the share of cells with inliers, of those where keyframes expect some.
 
-        A cell without features, such as one that something covers, says nothing.
+        A cell without features, such as one that something covers, says nothing. The second
+        value is the share that is expected of so many inliers, whose density varies much from
+        cell to cell (a geometric distribution).
         """
         expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
         for keyframe in used[:_SIMILAR].tolist():
@@ -179,7 +184,10 @@ class KeyframeLocalizer:
         seen = _count(features.pixels, camera)
         matched = _count(features.pixels[np.unique(inliers.features)], camera)
         comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
-        return float((matched[comparable] > 0).mean()) if comparable.any() else 0.0
+        if not comparable.any():
+            return 0.0, 0.0
+        density = len(np.unique(inliers.features)) / comparable.sum()
+        return float((matched[comparable] > 0).mean()), float(density / (1.0 + density))
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""

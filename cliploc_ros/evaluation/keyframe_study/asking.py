@@ -120,8 +120,9 @@ def _evidence(seen: Recognized | None, there: ObjectsThere, found: Relocalizatio
     if seen is None:
         return {}
     return {'error_m': _error(seen.map_from_camera, truth), 'inliers': seen.inliers,
-            'rival': seen.rival, 'confirmed': seen.confirmed, 'explained': there.explained,
-            'unexplained': there.unexplained, 'chance': chance_recognized(seen, there),
+            'rival': seen.rival, 'confirmed': seen.confirmed, 'expected': seen.expected,
+            'explained': there.explained, 'unexplained': there.unexplained,
+            'chance': chance_recognized(seen, there),
             'objects_confidence': found.confidence}
 
 
