@@ -49,12 +49,21 @@ def test_many_points_accept_what_objects_could_not():
     assert found.covariance is FINE
 
 
-def test_agreeing_poses_are_fused_and_the_better_one_weighs_more():
+def test_a_weak_pose_of_keyframes_improves_that_of_objects():
+    weak = by_keyframes(0.0, inliers=9, confirmed=0.4)
+    found = combine(by_objects(0.1, 0.995, True), weak, SOME, OPTIONS)
+    assert found.accepted
+    assert found.source == 'both'
+    assert pose_error(found.map_from_camera, at(0.0))[0] < 0.01
+    assert not combine(by_objects(0.1, 0.5, False), weak, SOME, OPTIONS).accepted
+
+
+def test_of_agreeing_poses_the_strong_one_of_keyframes_stays():
     found = combine(by_objects(0.1, 0.9, False), by_keyframes(0.0), SOME, OPTIONS)
     assert found.accepted
     assert found.source == 'both'
     assert found.confidence > 0.99
-    assert pose_error(found.map_from_camera, at(0.0))[0] < 0.01
+    assert pose_error(found.map_from_camera, at(0.0))[0] == 0.0
     assert np.allclose(found.covariance, FINE)
 
 
@@ -75,6 +84,12 @@ def test_weak_features_accept_nothing_and_leave_the_objects_pose(seen):
     assert 'keyframes: ' in refused.reason
     found = by_objects(5.0, 0.995, True)
     assert combine(found, seen, SOME, OPTIONS) is found
+
+
+def test_accepted_objects_elsewhere_do_not_overrule_strong_features():
+    found = combine(by_objects(5.0, 0.999, True), by_keyframes(0.0), ObjectsThere(0, 8), OPTIONS)
+    assert not found.accepted
+    assert 'contradict' in found.reason
 
 
 def test_objects_that_the_pose_does_not_explain_speak_against_it():
