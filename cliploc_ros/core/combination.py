@@ -40,12 +40,14 @@ _LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 20
 # than 19. So does a share of the image that is much less than its inliers let expect, as where
 # they lie on a poster: from a few inliers up to many.
 _MOST_RIVAL = 20
-_LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.25, 300
+_LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.32, 300
 _CONTRADICTS = 0.5
 # Weights of the first pose that covariance intersection tries.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 # Detected objects of the map's classes contradict a pose that explains so few of them.
 _MOST_UNEXPLAINED, _LEAST_EXPLAINED = 4, 0.25
+# So many points elsewhere contradict accepted objects, whatever else they lack; a guess.
+_CONTRADICTING_INLIERS = 100
 # A detection is explained by a landmark of its class whose outline overlaps it so much.
 _EXPLAINS_IOU = 0.2
 
@@ -116,12 +118,9 @@ def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere 
     refusal = _refusal(seen, there, chance, options)
     if agree:
         return _both(found, seen, chance, refusal, options)
-    # of two contradicting sources neither judges the other
-    if found.accepted and not _refusal(seen, _NO_OBJECTS, chance_recognized(seen, _NO_OBJECTS),
-                                       options):
-        return replace(found, accepted=False, reason=_contradiction(found, seen))
     if found.accepted:
-        return found
+        return replace(found, accepted=False, reason=_contradiction(found, seen)) \
+            if _contradicts(seen, found, options) else found
     if not refusal and found.confidence >= _CONTRADICTS:
         refusal = _contradiction(found, seen)
     reason = f'{found.reason}; keyframes: {refusal}' if refusal else ''
@@ -213,6 +212,20 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
     moved = _WEIGHTS[best] * covariance @ informations[0] @ step
     turn = Rotation.from_rotvec(moved[3:]).as_matrix()
     return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance
+
+
+def _contradicts(seen: Recognized, found: Relocalization, options: RelocalizerOptions) -> bool:
+    """Return whether keyframes contradict accepted objects elsewhere.
+
+    Of two contradicting sources neither judges the other: the objects do not count here. Where
+    the second best place of the keyframes is the objects' own, as in two equal rooms, the objects
+    decide.
+    """
+    assert found.map_from_camera is not None
+    if seen.rival_pose is not None and _agree(seen.rival_pose, found.map_from_camera):
+        return False
+    alone = _refusal(seen, _NO_OBJECTS, chance_recognized(seen, _NO_OBJECTS), options)
+    return not alone or seen.inliers >= _CONTRADICTING_INLIERS
 
 
 def _contradiction(found: Relocalization, seen: Recognized) -> str:

@@ -78,12 +78,18 @@ def test_objects_elsewhere_refuse_a_poster(confidence, accepted):
     by_keyframes(0.0, inliers=12), by_keyframes(0.0, confirmed=0.1),
     by_keyframes(0.0, confirmed=0.5), by_keyframes(0.0, rival=150), by_keyframes(0.0, rival=25)],
     ids=['few points', 'little of the image', 'a poster', 'two equal rooms', 'another place'])
-def test_weak_features_accept_nothing_and_leave_the_objects_pose(seen):
+def test_weak_features_accept_nothing(seen):
     refused = combine(NOWHERE, seen, SOME, OPTIONS)
     assert not refused.accepted
     assert 'keyframes: ' in refused.reason
+
+
+def test_objects_stand_against_few_points_and_decide_between_two_equal_rooms():
     found = by_objects(5.0, 0.995, True)
-    assert combine(found, seen, SOME, OPTIONS) is found
+    assert combine(found, by_keyframes(0.0, inliers=12), SOME, OPTIONS) is found
+    twin = by_keyframes(0.0, rival=190)._replace(rival_pose=at(5.1))
+    assert combine(found, twin, SOME, OPTIONS) is found
+    assert not combine(found, twin._replace(rival_pose=at(9.0)), SOME, OPTIONS).accepted
 
 
 def test_accepted_objects_elsewhere_do_not_overrule_strong_features():
