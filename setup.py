@@ -1,12 +1,36 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Build and install the package with colcon; script/setup makes the Python environment."""
+"""Build and install the package, with colcon or with pip; script/setup uses colcon."""
 
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'cliploc_ros'
+# colcon puts these into lib/cliploc_ros for ros2 run. pip puts executables into bin/, where all
+# programs share one name space: there they are named cliploc_evaluate and so on.
+COMMANDS = ('build_map', 'check_map', 'evaluate', 'import_map', 'studio', 'tum_to_bag')
+# These need ROS. Without it they would only print that, so a wheel has none of them.
+ROS_COMMANDS = ('demo', 'prepare', 'replay')
+NODES = ('detector', 'relocalizer')
+BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
+
+# OpenCV is no requirement of its own: pip's and apt's packages of it have different names.
+OPENCV = 'opencv-python-headless'
+EXTRAS = {
+    'evaluate': [OPENCV, 'matplotlib', 'rosbags'],
+    'build_map': [OPENCV, 'matplotlib', 'rosbags'],
+    'studio': [OPENCV, 'rosbags', 'viser==1.1.1'],
+    # Detector and CLIP: what looks at images. The others read observation files without it.
+    'models': [
+        OPENCV, 'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
+        'torchvision', 'ultralytics-opencv-headless',
+    ],
+    'cluster': ['distributed'],
+}
+EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})
+EXTRAS['test'] = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -14,13 +38,26 @@ def files(folder: str, pattern: str) -> list[str]:
     return [str(path) for path in sorted(Path(folder).glob(pattern))]
 
 
+def console_scripts() -> list[str]:
+    """Return the executables under the names that their folder asks for."""
+    if BUILDS_WHEEL:
+        return [f'cliploc_{name} = {PACKAGE}.cli.{name}:main' for name in COMMANDS]
+    modules = [f'cli.{name}' for name in COMMANDS + ROS_COMMANDS]
+    modules += [f'nodes.{name}' for name in NODES]
+    return [f'{module.partition(".")[2]} = {PACKAGE}.{module}:main' for module in modules]
+
+
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='0.2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.demo': ['assets/*.*', 'assets/*/*.*', 'assets/*/rgb/*.jpg'],
+        # By name: evaluate and build_map put files of their own beside a recording.
+        f'{PACKAGE}.demo': [
+            'assets/clip.*', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
+            'assets/*/rgb/*.jpg',
+        ],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
@@ -30,38 +67,13 @@ setup(
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',
-    # script/requirements*.txt hold the versions. OpenCV is missing here: pip's and apt's packages
-    # of it have different names.
+    # script/requirements*.txt hold the versions.
     install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
-    extras_require={
-        'models': [
-            'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
-            'torchvision', 'ultralytics-opencv-headless',
-        ],
-        'cluster': ['distributed'],
-        'datasets': ['rosbags'],
-        'demo': ['matplotlib'],
-        'studio': ['viser==1.1.1'],
-        'test': ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist'],
-    },
+    extras_require=EXTRAS,
     zip_safe=False,
     maintainer='the cliploc_ros authors',
     maintainer_email='cliploc-ros@example.org',
     description='Global localization from one image in a map of labelled objects (CLIP-Loc).',
     license='Apache-2.0',
-    entry_points={
-        'console_scripts': [
-            f'build_map = {PACKAGE}.cli.build_map:main',
-            f'check_map = {PACKAGE}.cli.check_map:main',
-            f'demo = {PACKAGE}.cli.demo:main',
-            f'detector = {PACKAGE}.nodes.detector:main',
-            f'evaluate = {PACKAGE}.cli.evaluate:main',
-            f'import_map = {PACKAGE}.cli.import_map:main',
-            f'prepare = {PACKAGE}.cli.prepare:main',
-            f'relocalizer = {PACKAGE}.nodes.relocalizer:main',
-            f'replay = {PACKAGE}.cli.replay:main',
-            f'studio = {PACKAGE}.cli.studio:main',
-            f'tum_to_bag = {PACKAGE}.cli.tum_to_bag:main',
-        ],
-    },
+    entry_points={'console_scripts': console_scripts()},
 )

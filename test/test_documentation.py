@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """README, doc/ and config/ say what the code declares."""
 
+import ast
 import importlib.machinery
 import importlib.util
 import re
@@ -71,6 +72,30 @@ def test_commands_run_what_there_is(path):
         assert (PROJECT / test).is_file(), test
     for script in re.findall(r'\bscript/([\w.-]+)', text):
         assert (PROJECT / 'script' / script).exists(), script
+
+
+def texts(node):
+    """Return the strings of a syntax tree; what they insert is an ellipsis."""
+    if isinstance(node, ast.JoinedStr):
+        yield ''.join(one.value if isinstance(one, ast.Constant) else '...'
+                      for one in node.values)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from texts(child)
+
+
+def test_the_messages_that_are_looked_up_exist():
+    sources = (PROJECT / 'cliploc_ros').rglob('*.py')
+    known = [text for path in sources for text in texts(ast.parse(path.read_text()))]
+    page = (PROJECT / 'doc/troubleshooting.md').read_text().split('\n## There is no')[1]
+    quoted = re.findall(r'^\| `([^`|]+ [^`|]+)` \|', page, re.MULTILINE)
+    assert len(quoted) > 10
+    for message in quoted:
+        for part in message.split('...'):
+            part = part.strip('; ')
+            assert any(part in text for text in known), f'no program says: {part}'
 
 
 def test_the_default_parameters_are_valid_together():

@@ -61,13 +61,6 @@ def run_python(code: str, cwd: Path) -> str:
     return done.stdout
 
 
-def test_versions_are_equal():
-    manifest = ElementTree.parse(PROJECT / 'package.xml').findtext('version')
-    setup = re.search(r"version='(.+)'", (PROJECT / 'setup.py').read_text()).group(1)
-    changelog = re.findall(r'^(\d+\.\d+\.\d+) ', (PROJECT / 'CHANGELOG.rst').read_text(), re.M)
-    assert manifest == setup == changelog[0]
-
-
 def test_core_imports_neither_ros_nor_torch():
     code = (
         'import pkgutil, sys, importlib, cliploc_ros, cliploc_ros.core\n'

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,13 @@ def add_label_options(parser: argparse.ArgumentParser) -> None:
                        help='phrases by class (YAML), besides the shipped ones')
 
 
+class Encoder(NamedTuple):
+    """The CLIP that made the embeddings of a recording, and its weights."""
+
+    options: 'ClipOptions'
+    weights: 'ClipWeights'
+
+
 @dataclass(frozen=True)
 class Labeller:
     """What describes the landmarks of a map.
@@ -37,16 +44,14 @@ class Labeller:
     Parameters
     ----------
     vocabulary : Vocabulary
-    clip : ClipOptions
-    weights : ClipWeights, optional
-        Of the encoder that made the embeddings; None: labels stay class names.
+    encoder : Encoder, optional
+        What made the embeddings; None: labels stay class names.
     note : str
         Why they do; '' where they do not.
     """
 
     vocabulary: 'Vocabulary'
-    clip: 'ClipOptions'
-    weights: 'ClipWeights | None'
+    encoder: 'Encoder | None'
     note: str
 
     def describe(self, landmark_map: 'LandmarkMap', detections: 'PosedDetections',
@@ -71,19 +76,19 @@ class Labeller:
         if not _has_embeddings(detections):
             return landmark_map, None
         embeddings = embed_landmarks(landmark_map.landmark_ids, detections, shown)
-        if self.weights is None:
+        if self.encoder is None:
             return landmark_map, embeddings
         names = sorted({name for row in range(len(landmark_map))
                         for name in classes_of(landmark_map, row)})
-        labelled = label_landmarks(landmark_map, embeddings, self._phrases(self.weights, names))
+        labelled = label_landmarks(landmark_map, embeddings, self._phrases(self.encoder, names))
         return labelled, embeddings
 
-    def _phrases(self, weights: 'ClipWeights', names: Sequence[str]) -> 'dict[str, list[Phrases]]':
+    def _phrases(self, encoder: Encoder, names: Sequence[str]) -> 'dict[str, list[Phrases]]':
         """Return the phrases of some classes; the user's change more often than the shipped."""
         from cliploc_ros.models.phrase_embeddings import phrases_of_classes
         from cliploc_ros.vocabulary.vocabulary import shipped_phrases
 
-        return phrases_of_classes(weights, self.clip, [
+        return phrases_of_classes(encoder.weights, encoder.options, [
             {name: shipped_phrases(name) for name in names},
             {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
 
@@ -99,18 +104,16 @@ def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -
     from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
     vocabulary = load_vocabulary(options.vocabulary)
-    clip = clip_options(options)
     try:
-        return Labeller(vocabulary, clip, _find_weights(options, clip, detections), '')
+        return Labeller(vocabulary, _find_encoder(options, detections), '')
     except ModelError as error:
         if options.vocabulary is not None:
             raise
-        return Labeller(vocabulary, clip, None, f'labels are class names: {error}')
+        return Labeller(vocabulary, None, f'labels are class names: {error}')
 
 
-def _find_weights(options: argparse.Namespace, clip: 'ClipOptions',
-                  detections: 'PosedDetections') -> 'ClipWeights':
-    """Return the weights of the encoder that made the embeddings; ModelError where not at hand."""
+def _find_encoder(options: argparse.Namespace, detections: 'PosedDetections') -> Encoder:
+    """Return the encoder that made the embeddings; ModelError where it is not at hand."""
     from cliploc_ros.models.clip_weights import resolve_clip_weights
 
     if not options.clip:
@@ -118,6 +121,7 @@ def _find_weights(options: argparse.Namespace, clip: 'ClipOptions',
     if not _has_embeddings(detections):
         raise ModelError('the observations have no CLIP embeddings that name their encoder; '
                          'record them again with CLIP')
+    clip = clip_options(options)
     key = detections.encoder_key
     hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
     # compared first, since the weights of another model would be downloaded in vain
@@ -131,7 +135,7 @@ def _find_weights(options: argparse.Namespace, clip: 'ClipOptions',
     if detections.embeddings.shape[1] != weights.embed_dim:
         raise ModelError(f'the embeddings have {detections.embeddings.shape[1]} numbers, but '
                          f'{weights.key} gives {weights.embed_dim}; record them again')
-    return weights
+    return Encoder(clip, weights)
 
 
 def _has_embeddings(detections: 'PosedDetections') -> bool:

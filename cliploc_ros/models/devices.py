@@ -9,7 +9,7 @@ import sys
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import ModelError, OptionsError
 
 if TYPE_CHECKING:
     import torch
@@ -39,8 +39,14 @@ def resolve_device(device: str) -> 'torch.device':
     ------
     OptionsError
         For another name, or a GPU that torch does not see.
+    ModelError
+        Where PyTorch is not installed.
     """
-    import torch
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise ModelError(f'{error.name} is not installed: detector and CLIP need it; pip install '
+                         "the extra 'models', see doc/install.md") from error
 
     if device == 'auto':
         device = 'cuda' if torch.cuda.is_available() else 'cpu'

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every command in the documents is one that the programs accept; the cheap ones run."""
+
+import argparse
+import importlib
+import os
+import re
+import runpy
+import subprocess
+import sys
+import textwrap
+import xml.etree.ElementTree as ElementTree
+from functools import cache
+
+import pytest
+import yaml
+from doc_commands import FOREIGN, PROJECT, Command, commands, commands_of, inline_commands, split
+
+from cliploc_ros.command import split_ros_args
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
+
+NODES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
+EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
+               if 'def make_parser' in path.read_text()}
+# Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
+OF_ROS = {'bag', 'pkg', 'security', 'topic'}
+MODULES = re.compile(r'(cliploc_ros|demo_world)\.')
+
+
+class _CaughtError(Exception):
+    """The parser that a program asks to parse its command line."""
+
+    def __init__(self, parser):
+        super().__init__()
+        self.parser = parser
+
+
+@cache
+def parser_of(module: str) -> argparse.ArgumentParser:
+    """Return the parser of a module that runs as a program, the one that it makes itself."""
+    if module.startswith('cliploc_ros.cli.'):
+        return importlib.import_module(module).make_parser()
+
+    def caught(parser, *_):
+        raise _CaughtError(parser)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, 'parse_args', caught)
+        patch.setattr(sys, 'argv', [module])
+        with pytest.raises(_CaughtError) as found:
+            runpy.run_module(module, run_name='__main__')
+    return found.value.parser
+
+
+def program_of(command: Command) -> tuple[str, list[str]]:
+    """Return the module that runs a command of this package, '' for another's, and arguments."""
+    first, *rest = command.words
+    if first == 'ros2' and rest[:2] == ['run', 'cliploc_ros']:
+        first, *rest = rest[1:]
+        first, *rest = rest
+    elif first in ('python', 'python3') and rest[0] == '-m' and MODULES.match(rest[1]):
+        return rest[1], rest[2:]
+    name = re.sub('^(install/lib/cliploc_ros/|script/(?=demo$)|cliploc_(?!ros))', '', first)
+    if name in EXECUTABLES:
+        return f'cliploc_ros.cli.{name}', rest
+    return (f'cliploc_ros.nodes.{name}', rest) if name in NODES else ('', [])
+
+
+@pytest.mark.parametrize('command', commands(), ids=str)
+def test_a_command_is_accepted(command, capsys):
+    module, arguments = program_of(command)
+    plain, ros = split_ros_args(arguments)
+    if module.startswith('cliploc_ros.nodes.'):
+        assert plain == []
+        check_node(module.rpartition('.')[2], ros)
+    elif module:
+        try:
+            parser_of(module).parse_args(plain)
+        except SystemExit:
+            pytest.fail(capsys.readouterr().err)
+    elif command.words[0] == 'ros2':
+        check_ros2(command.words[1:])
+    elif command.words[0].startswith('script/'):
+        check_script(*command.words)
+    else:
+        assert command.words[0] in FOREIGN | {'python', 'python3'}
+
+
+def check_node(node: str, ros_args: list[str]) -> None:
+    """Check parameters and remappings against the node's tables and topics."""
+    rows = {row.name: row for row in NODES[node]}
+    options = iter(ros_args[1:])
+    for option in options:
+        value = next(options)
+        name, assigned, text = value.partition(':=')
+        if option == '-p':
+            assert assigned
+            assert rows[name].validated(yaml.safe_load(text)) is not None
+        elif option == '-r':
+            assert name in names_of_interface() | {'__node', '__ns'}, name
+        else:
+            assert option in ('--params-file', '--enclave', '--log-level'), option
+
+
+@cache
+def names_of_interface() -> set[str]:
+    """Return topics and services, absolute and relative; a test holds them equal to the graph."""
+    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
+    names = {entry.text for entry in policy.iter() if entry.tag in ('topic', 'service')}
+    return names | {name.removeprefix('/') for name in names} | {'image/compressed'}
+
+
+def check_ros2(words: tuple[str, ...]) -> None:
+    """Check what a command of ros2 says about this package."""
+    verb, *rest = words
+    if verb == 'launch':
+        package, file, *_ = rest
+        assert package == 'cliploc_ros'
+        assert (PROJECT / 'launch' / file).is_file()  # test/test_launch.py checks the arguments
+    elif verb == 'service':
+        assert rest[0] == 'call'
+        assert rest[1] in names_of_interface()
+    elif verb == 'param':
+        _, node, name, value = rest
+        row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]
+        assert row.validated(yaml.safe_load(value)) is not None
+    else:
+        assert verb in OF_ROS or (verb == 'run' and rest[0] == 'tf2_ros'), verb
+
+
+def check_script(script: str, *arguments: str) -> None:
+    """Check a script, and the tests that script/test is to run."""
+    assert (PROJECT / script).is_file()
+    for word in arguments:
+        assert not word.startswith('test/') or (PROJECT / word).exists(), word
+
+
+@pytest.mark.parametrize('command', [one for one in inline_commands() if program_of(one)[0]],
+                         ids=str)
+def test_an_option_in_a_sentence_exists(command):
+    """A sentence may leave out what is required, so only the options are looked up."""
+    module, arguments = program_of(command)
+    for word in arguments:
+        if word.startswith('--') and len(word) > 2 and word != '--ros-args':
+            assert word.partition('=')[0] in parser_of(module)._option_string_actions, word
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A working folder with what earlier lines of the pages would have left."""
+    (tmp_path / 'room').mkdir()
+    (tmp_path / 'room/sequence').symlink_to(ASSETS / 'sequence')
+    example = re.search(r'    cup:\n(?: {4,}.*\n)+', (PROJECT / 'doc/mapping.md').read_text())
+    (tmp_path / 'our.yaml').write_text(textwrap.dedent(example.group()))
+    return tmp_path
+
+
+@pytest.mark.parametrize(('page', 'name'), [
+    ('first_relocalization.md', 'tum_to_bag'),
+    ('mapping.md', 'cliploc_ros.vocabulary.print_phrases')])
+def test_a_cheap_command_runs(page, name, room):
+    """The others take networks or minutes, and have tests of their own that run them."""
+    (command,) = [one for one in commands_of(PROJECT / 'doc' / page) if name in one.words]
+    module, arguments = program_of(command)
+    done = subprocess.run([sys.executable, '-m', module, *arguments], cwd=room, text=True,
+                          capture_output=True, timeout=300, env=environment())
+    assert done.returncode == 0, done.stderr
+    assert 'wrote room/walk: 48 images' in done.stdout or 'red team mug' in done.stdout
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a program that runs from the source tree."""
+    return os.environ | {'PYTHONPATH': f'{PROJECT}:{os.environ.get("PYTHONPATH", "")}'}
+
+
+def test_the_example_of_the_library_runs():
+    text = (PROJECT / 'doc/api.md').read_text()
+    code = re.search(r'```python\n(.*?)```', text, re.DOTALL).group(1)
+    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, text=True,
+                          capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('True  [[')
+
+
+@pytest.mark.parametrize('line', [
+    'ros2 run cliploc_ros evaluate --map office.yaml --querys office.npz',
+    'ros2 run cliploc_ros relocalizer --ros-args -p map_fil:=office.yaml',
+    'python -m cliploc_ros.evaluation.ladder --map office.yaml --frobnicate',
+    'ros2 service call /relocalizer/relocalise std_srvs/srv/Trigger',
+    'frobnicate office.yaml'])
+def test_a_wrong_command_is_noticed(line, capsys):
+    (words,) = split(line)
+    with pytest.raises((AssertionError, KeyError, pytest.fail.Exception)):
+        test_a_command_is_accepted(Command('page.md', words), capsys)
+
+
+def test_pages_have_commands():
+    """Else a change of the layout of the pages would hide all of them from these tests."""
+    pages = {command.page for command in commands()}
+    assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'security.md'} <= pages

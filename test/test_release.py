@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a release consists of agrees: versions, dates, dependencies, container and workflows."""
+
+import re
+import runpy
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import yaml
+
+PROJECT = Path(__file__).resolve().parents[1]
+# Keys of rosdep that name a package of apt on Ubuntu 24.04. The build farm takes no others.
+OF_UBUNTU = {'python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-opencv',
+             'python3-pytest', 'python3-scipy', 'python3-tqdm', 'python3-yaml'}
+
+
+def read(name: str) -> str:
+    return (PROJECT / name).read_text()
+
+
+def test_versions_are_equal():
+    found = {re.search(pattern, read(name), re.MULTILINE).group(1) for name, pattern in {
+        'package.xml': '<version>(.+)</version>', 'setup.py': "version='(.+)'",
+        'CITATION.cff': '^version: (.+)$', 'doc/conf.py': "version = '(.+)'",
+        'CHANGELOG.rst': r'^(\d+\.\d+\.\d+) '}.items()}
+    assert len(found) == 1, found
+
+
+def test_the_date_is_that_of_the_changelog():
+    released = re.search(r'^\d+\.\d+\.\d+ \((.+)\)$', read('CHANGELOG.rst'), re.MULTILINE).group(1)
+    assert yaml.safe_load(read('CITATION.cff'))['date-released'] == released
+
+
+def test_rosdep_can_resolve_every_key():
+    manifest = ElementTree.parse(PROJECT / 'package.xml').getroot()
+    keys = {entry.text for entry in manifest if entry.tag.endswith('depend')}
+    assert {key for key in keys if key.startswith('python3-')} == OF_UBUNTU
+    assert not [key for key in keys if key.endswith('-pip')]
+
+
+@pytest.fixture(scope='module')
+def extras() -> dict[str, list[str]]:
+    """The extras that setup.py declares."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('setuptools.setup', lambda **options: None)
+        patch.chdir(PROJECT)
+        return runpy.run_path('setup.py')['EXTRAS']
+
+
+def test_extras_are_what_the_tests_run_with(extras):
+    """And each has the versions of script/requirements*.txt, or none."""
+    required = read('script/requirements.txt') + read('script/requirements-models.txt')
+    # the last two come with open_clip
+    names = set(re.findall(r'^([\w-]+)', required, re.MULTILINE)) | {'huggingface_hub', 'pillow'}
+    assert {re.split('[=<>]', one)[0] for extra in extras.values() for one in extra} <= names
+    assert {one for one in extras['all'] if '==' in one} <= set(required.splitlines())
+
+
+def test_all_has_all(extras):
+    parts = {'evaluate', 'build_map', 'studio', 'models', 'cluster'}
+    assert extras.keys() == parts | {'all', 'test'}
+    assert set(extras['all']) == {one for name in parts for one in extras[name]}
+
+
+def test_workflows_run_the_ci_with_and_without_ros():
+    tree = yaml.safe_load(read('.github/workflows/ci.yml'))
+    jobs = {name: ' '.join(step.get('run', '') for step in job['steps'])
+            for name, job in tree['jobs'].items()}
+    assert all(job['runs-on'] == 'ubuntu-24.04' for job in tree['jobs'].values())
+    assert '.ci/run' in jobs['without-ros']
+    assert '--target ci ' in jobs['jazzy']
+    stages = read('docker/Dockerfile').split('\nFROM ')
+    assert stages[1].startswith('ros:jazzy-ros-base ')
+    (ci,) = [stage for stage in stages if ' AS ci\n' in stage]
+    assert '/opt/ros/jazzy/setup.bash && exec .ci/run' in ci
+
+
+def test_the_robots_image_has_no_sources():
+    (robot,) = [stage for stage in read('docker/Dockerfile').split('\nFROM ')
+                if ' AS robot\n' in stage]
+    assert re.findall('^COPY (.*)$', robot, re.MULTILINE) == [
+        '--from=build /ws/install install', 'docker/entrypoint /entrypoint']
+
+
+def test_copied_files_exist():
+    for sources in re.findall(r'^COPY (?!--from)(?:--chown=\w+ )?(.+) \S+$',
+                              read('docker/Dockerfile'), re.MULTILINE):
+        for pattern in sources.split():
+            assert pattern == '.' or list(PROJECT.glob(pattern)), pattern
+
+
+@pytest.mark.parametrize('path', sorted((PROJECT / '.github/ISSUE_TEMPLATE').glob('[!c]*.yml')),
+                         ids=lambda path: path.name)
+def test_issue_templates_ask_for_something(path):
+    form = yaml.safe_load(path.read_text())
+    assert {'name', 'description', 'body'} <= form.keys()
+    assert any(field.get('validations', {}).get('required') for field in form['body'])
+
+
+def test_bloom_finds_no_pyproject():
+    """With one, Debian's builder makes a wheel, whose executables land in /usr/bin."""
+    assert not (PROJECT / 'pyproject.toml').exists()
+
+
+def test_rosdoc2_builds_the_site():
+    manifest = ElementTree.parse(PROJECT / 'package.xml')
+    name = manifest.findtext('export/rosdoc2')
+    _, config = yaml.safe_load_all(read(name))
+    (builder,) = [one['sphinx'] for one in config['builders'] if 'sphinx' in one]
+    assert (PROJECT / builder['sphinx_sourcedir'] / 'conf.py').is_file()

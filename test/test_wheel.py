@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``pip install .`` without ROS: what the wheel holds, and that its commands run."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+
+PROJECT = Path(__file__).resolve().parents[1]
+ROOM = PROJECT / 'test/mapping/changed_room'
+SOURCES = ('cliploc_ros', 'config', 'launch', 'resource', 'LICENSE', 'package.xml', 'setup.cfg',
+           'setup.py')
+MAX_MB = 17.0
+#: What a computer without ROS and without the extra "models" lacks. ROS's .pth file starts the
+#: interpreter again with its libraries.
+LEFT_OUT = re.compile(r'(?!rosbags)(rclpy|rpyutils|ament|ros|\w+_(msgs|srvs|interfaces)|launch|'
+                      r'tf2|torch|ultralytics|open_clip|openvino|cliploc)|.*\.pth$')
+COMMANDS = {'build_map', 'check_map', 'evaluate', 'import_map', 'studio', 'tum_to_bag'}
+
+
+@pytest.fixture(scope='module')
+def wheel(tmp_path_factory):
+    """Build from a copy: build/ of the source tree may hold modules that were deleted."""
+    source, out = tmp_path_factory.mktemp('source'), tmp_path_factory.mktemp('wheel')
+    for name in SOURCES:
+        path = PROJECT / name
+        if path.is_dir():
+            shutil.copytree(path, source / name, ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            shutil.copy(path, source)
+    (source / 'cliploc_ros/demo/assets/sequence.cliploc-0.npz').touch()  # evaluate leaves such
+    pip('wheel', '--no-deps', '--no-build-isolation', '--wheel-dir', out, source)
+    (built,) = out.glob('*.whl')
+    return built
+
+
+@pytest.fixture(scope='module')
+def programs(wheel, tmp_path_factory):
+    """The commands, installed where neither ROS nor PyTorch is."""
+    folder = tmp_path_factory.mktemp('fresh')
+    subprocess.run([sys.executable, '-m', 'venv', '--without-pip', folder], check=True,
+                   timeout=300)
+    (site,) = folder.glob('lib/python3*/site-packages')
+    for packages in sys.path:
+        if packages.endswith(('/site-packages', '/dist-packages')):
+            link_libraries(Path(packages), site)
+    pip('--python', folder / 'bin/python', 'install', '--no-deps', '--no-index', wheel)
+    return folder / 'bin'
+
+
+def link_libraries(packages, site):
+    """Link what is installed here to a new environment, except for what that is to lack."""
+    if packages.is_relative_to('/opt/ros'):
+        return
+    for path in packages.iterdir():
+        if not LEFT_OUT.match(path.name) and not (site / path.name).exists():
+            (site / path.name).symlink_to(path)
+
+
+def pip(*arguments):
+    subprocess.run([sys.executable, '-m', 'pip', '--quiet', '--disable-pip-version-check',
+                    *map(str, arguments)], check=True, timeout=300)
+
+
+def environment():
+    """Return an environment without ROS, with the kernels that are compiled already."""
+    hidden = {'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'PYTHONHOME'}
+    kept = {name: value for name, value in os.environ.items() if name not in hidden}
+    return {'NUMBA_CACHE_DIR': str(PROJECT / 'cliploc_ros/__pycache__/kernels')} | kept
+
+
+def run(program, *arguments, cwd):
+    return subprocess.run([program, *map(str, arguments)], cwd=cwd, env=environment(), text=True,
+                          capture_output=True, timeout=300)
+
+
+def test_a_robot_gets_neither_worlds_nor_training_nor_tests(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.partition('/')[0] for name in names} == {
+        'cliploc_ros', wheel.name.removesuffix('-py3-none-any.whl') + '.dist-info',
+        wheel.name.removesuffix('-py3-none-any.whl') + '.data'}
+    modules = {name for name in names if name.startswith('cliploc_ros/') and name.endswith('.py')}
+    assert modules == {str(path.relative_to(PROJECT))
+                       for path in (PROJECT / 'cliploc_ros').rglob('*.py')}
+    assert not [name for name in names if re.search(r'train_|make_world|test|/build/', name)]
+    assert not [name for name in names if '.cliploc-' in name]
+
+
+def test_the_wheel_is_small(wheel):
+    contents = zipfile.ZipFile(wheel).infolist()
+    assets_mb = sum(one.compress_size for one in contents if '/assets/' in one.filename) / 1e6
+    size_mb = wheel.stat().st_size / 1e6
+    print(f'{size_mb:.1f} MB, of which the demo has {assets_mb:.1f} MB')
+    assert size_mb < MAX_MB
+    assert size_mb - assets_mb < 1.0
+
+
+def test_commands_have_names_of_their_own(programs):
+    installed = {path.name for path in programs.iterdir() if 'cliploc' in path.name}
+    assert installed == {f'cliploc_{name}' for name in COMMANDS}
+
+
+def test_ros_is_not_there(programs, tmp_path):
+    code = ('import importlib.util as u\n'
+            "print([m for m in ('rclpy', 'std_msgs', 'torch') if u.find_spec(m)])")
+    assert run(programs / 'python', '-c', code, cwd=tmp_path).stdout == '[]\n'
+
+
+@pytest.mark.parametrize('name', sorted(COMMANDS - {'build_map', 'evaluate', 'studio'}))
+def test_help_is_printed(programs, name, tmp_path):
+    assert 'usage: ' in run(programs / f'cliploc_{name}', '--help', cwd=tmp_path).stdout
+
+
+def test_evaluate_runs(programs, tmp_path):
+    landmark_map = LandmarkMap.from_file(ROOM / 'map.yaml')
+    save_queries_of_classes(tmp_path / 'queries.npz', landmark_map, frames=3)
+    done = run(programs / 'cliploc_evaluate', '--queries', 'queries.npz', '--map',
+               ROOM / 'map.yaml', '--methods', 'auto', '--trials', '1', '--sweep', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert '3 queries' in done.stdout
+    assert (tmp_path / 'evaluation/top_view.png').is_file()
+
+
+def save_queries_of_classes(path, landmark_map, frames):
+    """Write the first frames of the changed room, with similarities that say the class only."""
+    room = np.load(ROOM / 'after.npz')
+    offsets = room['frame_offsets'][:frames + 1]
+    classes = room['class_ids'][:offsets[-1]]
+    np.savez(path, landmark_ids=landmark_map.landmark_ids,
+             intrinsics_fx_fy_cx_cy=room['intrinsics_fx_fy_cx_cy'], frame_offsets=offsets,
+             boxes_xyxy=room['boxes_xyxy'][:offsets[-1]], class_ids=classes,
+             scores=room['scores'][:offsets[-1]],
+             similarities=(classes[:, None] == np.array(landmark_map.class_ids)) / 3.0,
+             true_landmark=np.full(len(classes), -1), timestamps=room['timestamps'][:frames],
+             map_from_camera=room['map_from_camera'][:frames], query_group=np.arange(frames),
+             is_main=np.ones(frames, dtype=bool))
+
+
+def test_build_map_runs_and_says_what_it_lacks(programs, tmp_path):
+    done = run(programs / 'cliploc_build_map', '--observations', ROOM / 'after.npz', '--every',
+               '5', '--no-joint', '--out', 'map.yaml', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert 'labels are class names: torch is not installed' in done.stdout
+    assert len(LandmarkMap.from_file(tmp_path / 'map.yaml')) > 5
+
+
+def test_images_need_the_extra_with_the_networks(programs, tmp_path):
+    done = run(programs / 'cliploc_build_map', '--tum',
+               PROJECT / 'cliploc_ros/demo/assets/mapping', '--out', 'map.yaml', cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == ("error: torch is not installed: detector and CLIP need it; pip install "
+                           "the extra 'models', see doc/install.md\n")
+
+
+def test_studio_serves_its_page(programs, tmp_path):
+    with subprocess.Popen([programs / 'cliploc_studio', ROOM / 'map.yaml', '--no-browser'],
+                          cwd=tmp_path, env=environment(), text=True, stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT) as studio:
+        try:
+            lines = iter(studio.stdout.readline, '')
+            url = next(line.split()[1] for line in lines if line.startswith('studio: http'))
+            with urllib.request.urlopen(url, timeout=60.0) as page:
+                assert b'<!doctype html>' in page.read(200).lower()
+        finally:
+            studio.send_signal(signal.SIGINT)
+            rest, _ = studio.communicate(timeout=60.0)
+    assert studio.returncode == 130, rest
