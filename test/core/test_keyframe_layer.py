@@ -10,6 +10,7 @@ import pytest
 from scene import CAMERA, make_room
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes import layer_file
 from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
 from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, save_layer
@@ -61,7 +62,14 @@ def test_a_layer_comes_back_as_it_was(file):
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
-    assert isinstance(after.descriptors, np.memmap), 'large arrays stay in the file'
+    assert not isinstance(after.descriptors, np.memmap), 'a small file may be written over'
+
+
+def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
+    monkeypatch.setattr(layer_file, 'MOST_READ', 0)
+    layer = load_layer_of_map(file, ROOM)
+    assert isinstance(layer.descriptors, np.memmap)
+    assert np.array_equal(layer.descriptors, make_layer().descriptors)
 
 
 def test_an_edited_map_keeps_its_layer(file):

@@ -95,7 +95,8 @@ def test_features_are_found_in_any_image():
     shifts = features.pixels[pairs[:, 1]] - small.pixels[pairs[:, 0]]
     assert len(pairs) > 50
     assert np.mean(np.abs(shifts).max(axis=1) < 0.5) > 0.9
-    for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8)):
+    for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
+                  np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert len(extract(empty, 300)) == 0
 
 

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The file of a layer: ``NAME.keyframes.npz`` next to ``NAME.yaml``.
 
-The arrays lie in the file uncompressed. The large ones are mapped into memory, not read: a layer
-costs memory only where it is used, and may be larger than the memory.
+The arrays lie in the file uncompressed. Those of a large file are mapped into memory, not read: a
+layer costs memory only where it is used, and may be larger than the memory. A small file is read:
+a program that writes over a mapped file in place would kill this process.
 """
 
 import json
@@ -39,6 +40,8 @@ _LAYOUT: dict[str, tuple[tuple[object, ...], str]] = {
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
 _MAPPED = ('pixels', 'points', 'descriptors')
 _HEADER_BYTES = 100_000
+#: Files up to this size are read into memory [bytes].
+MOST_READ = 256_000_000
 _MOST_DEVIATION = 1.0
 # A map whose landmarks of the same name have moved so far in general is another map [m].
 _MOST_MOVED_M = 1.0
@@ -153,7 +156,8 @@ def _read_array(archive: zipfile.ZipFile, file: Any, path: Path, name: str) -> N
     shape, fortran, dtype = read(file)
     if fortran or dtype.hasobject or not np.prod(shape):
         raise _LayerError(f'array {name} has shape {shape} and type {dtype}')
-    return np.memmap(path, dtype=dtype, mode='r', offset=file.tell(), shape=shape)
+    mapped = np.memmap(path, dtype=dtype, mode='r', offset=file.tell(), shape=shape)
+    return mapped if path.stat().st_size > MOST_READ else np.array(mapped)
 
 
 def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
