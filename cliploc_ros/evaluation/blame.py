@@ -59,7 +59,7 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
               for one in found.hypotheses]
     if errors and errors[0] <= limit_m:
         return ''
-    true_pose, matches = _refined(frame, query.map_from_camera)
+    true_pose, matches = _refined(frame, query.map_from_camera, landmark_map.position_sigmas)
     pairs = {(one.detection, one.landmark) for one in matches}
     if (len(pairs) < frame.sample_size
             or pose_error(true_pose, query.map_from_camera)[0] > limit_m):
@@ -77,10 +77,10 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
     return 'search' if int(np.argmax(utilities(supports))) == 0 else 'choice'
 
 
-def _refined(frame: SearchedFrame, map_from_camera: NDArray[np.float64]
-             ) -> tuple[NDArray[np.float64], tuple[Match, ...]]:
+def _refined(frame: SearchedFrame, map_from_camera: NDArray[np.float64],
+             sigmas: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[Match, ...]]:
     """Return a pose (4, 4) after refinement on a frame, and what it explains."""
-    rig = make_rig([frame.scene], np.eye(4)[None], frame.vertical[None])
+    rig = make_rig([frame.scene], np.eye(4)[None], frame.vertical[None], sigmas)
     camera_from_map = invert_transform(map_from_camera)
     refined = refine_rig(rig, np.ascontiguousarray(camera_from_map[:3, :3]),
                          np.ascontiguousarray(camera_from_map[:3, 3]))
