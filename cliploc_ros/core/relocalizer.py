@@ -14,6 +14,7 @@ from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import (
     RIGHT_M,
     ComparedFrame,
+    Setting,
     Support,
     agreeing_poses,
     confidences,
@@ -32,6 +33,7 @@ from cliploc_ros.core.fit.finalists import (
     Match,
     covariance_of,
     find_finalists,
+    first_of_each_place,
     matches_of,
     meetings_of,
 )
@@ -149,7 +151,7 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        cameras = _cameras_from_last([one.observation for one in frames])
+        cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
             return _nothing_found(frames, budget, f'{detections} detections give fewer than '
@@ -163,7 +165,8 @@ class Relocalizer:
                                                   'camera to more objects')
         compared = self._compare(frames, rig, cameras, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
-        likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
+        likely = confidences(compared.supports, poses, self._setting(rig),
+                             handicaps=compared.handicaps)
         covariance = covariance_of(frames, rig, best, matches)
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
@@ -175,10 +178,16 @@ class Relocalizer:
         return Relocalization(
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 likely * evidence.certainty, compared.supports)),
+                                 likely * evidence.certainty, compared.supports,
+                                 compared.handicaps.tolist())),
             matches=matches[-1], evidence=evidence, covariance=covariance.whole + nearby,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+
+    def _setting(self, rig: Rig) -> Setting:
+        known = rig.verticals[:, 6].any()
+        return Setting(len(self._map),
+                       self._options.vertical_deviation_deg if known else math.inf)
 
     def _finalists(self, frames: Sequence[SearchedFrame], rig: Rig, deadline: float
                    ) -> tuple[list[Finalist], NDArray[np.bool_]]:
@@ -200,7 +209,7 @@ class Relocalizer:
 
     def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
                  finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
-        """Return the finalists with their supports, the likeliest first.
+        """Return the finalists with their supports, the likeliest first, one of each place.
 
         Poses that ignore the known vertical come last. Without refinement the greatest score is
         first, as in the paper.
@@ -212,7 +221,9 @@ class Relocalizer:
             else tilt_handicaps(poses, self._options.tilt_deviation_deg)
         order = list(range(len(finalists)))
         if self._options.refine:
-            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+            likeliest = np.argsort(handicaps - utilities(supports), kind='stable')
+            order = [row for known in (True, False) for row in first_of_each_place(
+                likeliest[is_upright[likeliest] == known].tolist(), finalists, MAX_DISTINCT)]
         return _Compared([finalists[row] for row in order], poses[order],
                          [matches[row] for row in order], [supports[row] for row in order],
                          handicaps[order])
@@ -319,7 +330,7 @@ def _coverage(frames: Sequence[SearchedFrame]) -> float:
     return min(one.progress.coverage for one in frames)
 
 
-def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
     """Return each camera from the last (F, 4, 4), by odometry."""
     if not 1 <= len(observations) <= MAX_FRAMES:
         raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')

@@ -34,7 +34,7 @@ from cliploc_ros.ros.conversions import (
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
-from cliploc_ros.ros.map_parameters import load_map
+from cliploc_ros.ros.map_hash import load_hashed_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
@@ -80,14 +80,17 @@ class Localizer:
     options : RelocalizerOptions
     device : str
         Where the observer's network runs.
+    map_hash : str
+        See cliploc_ros.ros.map_hash.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
-                 keyframes: Keyframes | None = None) -> None:
+                 map_hash: str, keyframes: Keyframes | None = None) -> None:
         self.device = device
+        self.map_hash = map_hash
         self._keyframes = keyframes
         self._map = landmark_map
         self._observer = observer
@@ -121,7 +124,7 @@ class Localizer:
             Names what to fix in the map; this localizer stays as it was.
         """
         options = relocalizer_options(values)
-        landmark_map = load_map(node, values['map_file'])
+        landmark_map, map_hash = load_hashed_map(node, values['map_file'])
         relocalizer = Relocalizer(landmark_map, options)
         observer = self._observer
         if observer is not None:
@@ -130,7 +133,7 @@ class Localizer:
                 _clip_options(values), landmark_map, values['map_file'],
                 values['landmark_embeddings']))
         return Localizer(landmark_map, observer, relocalizer, options, self.device,
-                         load_keyframes(values, landmark_map))
+                         map_hash, load_keyframes(values, landmark_map))
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -237,7 +240,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     if values['cache_dir']:
         KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
-    landmark_map = load_map(node, values['map_file'])
+    landmark_map, map_hash = load_hashed_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
@@ -247,7 +250,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
             values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
-    return Localizer(landmark_map, observer, relocalizer, options, device,
+    return Localizer(landmark_map, observer, relocalizer, options, device, map_hash,
                      load_keyframes(values, landmark_map))
 
 
