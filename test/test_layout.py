@@ -27,7 +27,7 @@ LAYERS = (
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
     ('core.joined_map',),
-    ('core.association',),
+    ('core.association', 'core.keyframes'),
     ('core.search',),
     ('core.fit',),
     ('core.acceptance',),

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cliploc_ros.cli.map_labels import Labeller, add_label_options, prepare_labels
+from cliploc_ros.cli.map_layer import add_layer_options, check_layer_options, write_layer
 from cliploc_ros.cli.map_update import OldMap, read_old_map, update_old_map, with_usual_noise
 from cliploc_ros.cli.sources import add_source_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
@@ -34,6 +35,7 @@ examples:
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
+  build_map --rgbd kitchen --out kitchen.yaml --keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -64,6 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
     add_label_options(parser)
+    add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
@@ -93,6 +96,7 @@ def build(options: argparse.Namespace) -> int:
 
     begin = time.monotonic()
     _check_folder(options.out)
+    check_layer_options(options)
     old = None if options.update is None else read_old_map(options.update)
     recorded = read_source(options)
     detections = recorded.detections
@@ -104,9 +108,10 @@ def build(options: argparse.Namespace) -> int:
     made = _build(options, detections, labeller) if old is None else _update(
         options, old, detections, labeller)
     write_map(options.out, made.landmark_map, made.comments, made.embeddings)
+    lines = made.lines + write_layer(options, made.landmark_map)
     if options.report is not None:
         _write_report(options.report, made.report)
-    print('\n'.join(made.lines))
+    print('\n'.join(lines))
     if labeller.note:
         print(f'note: {labeller.note}')
     print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')

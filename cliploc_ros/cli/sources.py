@@ -116,7 +116,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     clip = clip_options(options) if options.clip else None
     yolo = yolo_options(options, conf=options.conf)
     reading = repr([str(getattr(options, name)) for name in _READING])
-    return record_once(_frames(options), RecordingOptions(
+    return record_once(read_frames(options), RecordingOptions(
         yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,
         options.scheduler), options.record_to, _odometry(options))
 
@@ -126,7 +126,14 @@ def source_of(options: argparse.Namespace) -> Path:
     return Path(options.bag or options.tum or options.rgbd or options.observations)
 
 
-def _frames(options: argparse.Namespace) -> 'Frames':
+def read_frames(options: argparse.Namespace) -> 'Frames':
+    """Return the images of the source, with their poses; not for --observations.
+
+    Raises
+    ------
+    CliplocError
+        The source or the options cannot be used.
+    """
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
     from cliploc_ros.datasets.poses import mount_from_numbers

@@ -4,7 +4,7 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-relocalizer, session, relocalization, warm_up
+relocalizer, session, relocalization, combination, warm_up
     Entry points and results.
 acceptance
     Confidence, and the decision to accept or refuse.
@@ -12,6 +12,8 @@ fit
     Verification, refinement, several frames, covariance.
 search
     Minimal samples to the best hypotheses of one frame.
+keyframes
+    Poses from local features of the place as it was mapped.
 association
     Observation and map to candidates and the scene of one frame.
 landmark_map, joined_map, observation, options

@@ -67,6 +67,9 @@ class Relocalization:
         Time of association, search and verification [ms].
     stamp_ns : int
         Stamp of the newest observation [ns].
+    source : str
+        What the best pose comes from: 'objects', 'keyframes' or 'both', see
+        cliploc_ros.core.combination.
     """
 
     accepted: bool
@@ -80,6 +83,7 @@ class Relocalization:
     coverage: float = 1.0
     search_ms: float = 0.0
     stamp_ns: int = 0
+    source: str = 'objects'
 
     @property
     def solved(self) -> bool:

@@ -34,6 +34,7 @@ from cliploc_ros.ros.conversions import (
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
 from cliploc_ros.ros.map_hash import load_hashed_map
 from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
@@ -87,13 +88,16 @@ class Localizer:
         Where the observer's network runs.
     map_hash : str
         See cliploc_ros.ros.map_hash.
+    keyframes : Keyframes, optional
+        The layer of keyframes of the map.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
-                 map_hash: str) -> None:
+                 map_hash: str, keyframes: Keyframes | None = None) -> None:
         self.device = device
         self.map_hash = map_hash
+        self._keyframes = keyframes
         self._map = landmark_map
         self._observer = observer
         self._options = options
@@ -111,7 +115,8 @@ class Localizer:
         frames = [f"'{part.landmark_map.frame_id}'" for part in parts_of(self._map)]
         where = f'frame {frames[0]}' if len(frames) == 1 else \
             f'{len(frames)} maps, frames {", ".join(frames)}'
-        return (f'{len(self._map)} landmarks in {where}, '
+        keyframes = '' if self._keyframes is None else f'{len(self._keyframes)} keyframes, '
+        return (f'{len(self._map)} landmarks in {where}, {keyframes}'
                 f'{self._options.matching}_{self._options.algorithm}')
 
     def reloaded(self, node: Node, values: Mapping[str, Any]) -> 'Localizer':
@@ -131,7 +136,8 @@ class Localizer:
             from cliploc_ros.models.map_rows import embed_map
             observer = observer.with_labels(embed_map(
                 _clip_options(values), landmark_map, files, values['landmark_embeddings']))
-        return Localizer(landmark_map, observer, relocalizer, options, self.device, map_hash)
+        return Localizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
+                         load_keyframes(values, landmark_map))
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -177,6 +183,9 @@ class Localizer:
                                      values['fuse_window_s'], stages)
         seen = session.observation
         assert seen is not None
+        if self._keyframes is not None:
+            times.begin('keyframes')
+            found = self._keyframes.join(found, image, seen, options, deadline)
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = session.covariance_for_filter(found) \
@@ -246,7 +255,8 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
             _clip_options(values), landmark_map, files, values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
-    return Localizer(landmark_map, observer, relocalizer, options, device, map_hash)
+    return Localizer(landmark_map, observer, relocalizer, options, device, map_hash,
+                     load_keyframes(values, landmark_map))
 
 
 def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation

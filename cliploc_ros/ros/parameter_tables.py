@@ -74,6 +74,9 @@ RELOCALIZER = (
     ParameterRow('map_files', [''], 'Map files of floors and buildings instead of map_file: a '
                  'request searches all of them. Each has a frame_id of its own, which names the '
                  'map in answers and poses.'),
+    ParameterRow('keyframes_file', 'auto', "Layer of keyframes of the map, read with it: a file, "
+                 "or 'auto': NAME.keyframes.npz next to map_file NAME.yaml, where there is one; "
+                 'empty: none.'),
     ParameterRow('mode', 'on_request', 'Localize on request, or with every '
                  'frame.', choices=MODES, read_only=True),
     ParameterRow('timeout_s', 10.0, 'A request is answered within this time.', unit='s',

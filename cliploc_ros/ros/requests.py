@@ -30,10 +30,11 @@ _SMALLER = 'choose a faster profile or a smaller'
 # Of each stage its name in a message, and what makes it faster.
 _STAGES = {'image': 'waiting for an image', 'detection': 'the detector',
            'waiting': 'waiting for earlier work', 'decoding': 'reading the image',
-           'CLIP': 'CLIP', 'search': 'the search'}
+           'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
 _REMEDIES = {'image': "raise the camera's rate", 'detection': f'{_SMALLER} detector',
              'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
-             'search': 'lower iterations or time_budget_ms'}
+             'search': 'lower iterations or time_budget_ms',
+             'keyframes': "set keyframes_file to ''"}
 
 
 class _Look(NamedTuple):

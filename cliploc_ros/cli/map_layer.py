@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Options of ``build_map`` for the layer of keyframes next to the map, and what comes of them."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from cliploc_ros.cli.sources import read_frames
+from cliploc_ros.command import positive_int
+from cliploc_ros.errors import OptionsError
+
+if TYPE_CHECKING:
+    from cliploc_ros.core.landmark_map import LandmarkMap
+
+_DEFAULT_POINTS = 600
+
+
+def add_layer_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the layer to a parser."""
+    group = parser.add_argument_group('keyframes next to the map')
+    group.add_argument('--keyframe-layer', action='store_true',
+                       help='also write NAME.keyframes.npz: local features of the images of '
+                       '--keyframes, with their places from depth or triangulated')
+    group.add_argument('--keyframe-points', type=positive_int, default=_DEFAULT_POINTS,
+                       metavar='N', help='the most points of a keyframe, 146 bytes each '
+                       '(%(default)s)')
+
+
+def check_layer_options(options: argparse.Namespace) -> None:
+    """Refuse a layer that cannot be made, before the work is done.
+
+    Raises
+    ------
+    OptionsError
+        Names the options that do not go together.
+    """
+    if not options.keyframe_layer:
+        return
+    for name in ('observations', 'update'):
+        if getattr(options, name) is not None:
+            raise OptionsError(f'--keyframe-layer is not for --{name}: keyframes need the images '
+                               'of the recording that the map is built from; give --bag, --tum or '
+                               '--rgbd')
+    if options.refine_mount:
+        raise OptionsError('--keyframe-layer is not for --refine-mount: build again with the '
+                           'corrected --mount')
+
+
+def write_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> list[str]:
+    """Write the layer of a new map where it is asked for; return what was written, in lines.
+
+    Raises
+    ------
+    MappingError
+        No image has enough points.
+    """
+    if not options.keyframe_layer:
+        return []
+    from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+    from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+    distance_m, angle_deg = options.keyframes
+    layer = build_layer(read_frames(options), landmark_map,
+                        LayerOptions(distance_m, angle_deg, options.keyframe_points))
+    path = layer_path(options.out)
+    save_layer(path, layer)
+    megabytes = path.stat().st_size / 1e6
+    return [f'keyframes: {len(layer)} with {len(layer.points)} points, {megabytes:.1f} MB '
+            f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}']

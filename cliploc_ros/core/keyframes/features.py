@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Local features of an image, and which of two images show the same point.
+
+SIFT (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root
+of Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
+2012). OpenCV finds the features; a descriptor takes 128 bytes.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+#: Identifies the descriptors: those of another kind must not be compared with these.
+KIND = 'rootsift-128-uint8'
+DIMENSIONS = 128
+# A unit vector of square roots times this fits into a byte; no entry of a real one exceeds .5.
+_SCALE = 512.0
+# Larger images are made smaller first: it bounds the time.
+_LONGEST_SIDE_PX = 800
+# A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
+# leaves out features of little contrast.
+_DARK = 160.0
+# A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
+_RATIO = 0.85
+
+
+@dataclass(frozen=True)
+class Features:
+    """The n features of an image.
+
+    Parameters
+    ----------
+    pixels : ndarray (n, 2)
+        [px] in the image as it is, distorted.
+    descriptors : ndarray (n, 128) uint8
+    strengths : ndarray (n,) float32
+        Response of the detector; the strongest is first.
+    """
+
+    pixels: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    strengths: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Return the number of features."""
+        return len(self.pixels)
+
+
+def extract(image_rgb: NDArray[np.uint8], most: int) -> Features:
+    """Return the strongest features of an image (h, w, 3), at most so many."""
+    longest = max(image_rgb.shape[:2])
+    gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, _LONGEST_SIDE_PX / longest)
+    if scale < 1.0:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    bright = float(np.percentile(gray, 99))
+    if 0.0 < bright < _DARK:
+        gray = cv2.convertScaleAbs(gray, alpha=_DARK / bright)
+    sift = cv2.SIFT.create(nfeatures=most)
+    points, descriptors = sift.detectAndCompute(gray, None)
+    if descriptors is None:
+        return Features(np.empty((0, 2)), np.empty((0, DIMENSIONS), np.uint8),
+                        np.empty(0, np.float32))
+    strengths = np.array([point.response for point in points], dtype=np.float32)
+    rows = np.argsort(-strengths, kind='stable')[:most]
+    pixels = (np.array([point.pt for point in points])[rows] + 0.5) / scale - 0.5
+    return Features(pixels, _compact(descriptors[rows]), strengths[rows])
+
+
+def _compact(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return SIFT descriptors (n, 128) as bytes: square roots of shares, times _SCALE."""
+    shares = sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.clip(np.round(_SCALE * np.sqrt(shares)), 0, 255), dtype=np.uint8)
+
+
+def unit_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return descriptors (n, d) as unit vectors."""
+    rows = descriptors.astype(np.float32)
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    return rows
+
+
+def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the pairs (k, 2) of rows of two images' descriptors that show the same point.
+
+    Each is the other's most similar one, and clearly more similar than the second of theirs.
+
+    Parameters
+    ----------
+    ours, theirs : ndarray (n, d), (m, d)
+        Unit vectors, see unit_rows.
+    """
+    if len(ours) == 0 or len(theirs) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    cosines = ours @ theirs.T
+    rows, best = np.arange(len(ours)), cosines.argmax(axis=1)
+    mutual = cosines.argmax(axis=0)[best] == rows
+    first = cosines[rows, best]
+    cosines[rows, best] = -1.0
+    second = cosines.max(axis=1)
+    # squared distances of unit vectors are 2 - 2 cos
+    clear = (1.0 - first) < _RATIO**2 * (1.0 - second)
+    kept = np.nonzero(mutual & clear)[0]
+    return np.stack([kept, best[kept]], axis=1)

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layer: keyframes with their poses, features and points, and how to find similar ones.
+
+Images are compared by the words of their features (Sivic and Zisserman, "Video Google", 2003):
+the descriptors of a layer are clustered, each cluster is a word, and two images are as similar as
+the numbers of their words. Words that many keyframes have count less.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
+
+#: Number of words. 1,024 find the keyframes of the kitchen as well as comparing all descriptors.
+WORDS = 1024
+# Descriptors that the words are learned from, and steps of k-means.
+_MOST_LEARNED, _STEPS = 50_000, 8
+# Focal lengths, as shares of the image's width, are equal to so much.
+_SAME_FOCAL = 0.02
+#: Deviations a metre from a keyframe: of points from depth, whose scale and registration are never
+#: exact (chosen on the kitchen), and of triangulated ones (a guess on the safe side).
+FROM_DEPTH, TRIANGULATED = 0.1, 0.02
+#: A pixel of the layer is kept in sixteenths.
+PIXEL_SCALE = 16.0
+
+
+@dataclass(frozen=True)
+class KeyframeLayer:
+    """K keyframes with n points in total. The large arrays may lie in a file.
+
+    Parameters
+    ----------
+    frame_id : str
+        Coordinate frame of the poses: the map's.
+    landmark_ids : tuple of str
+        The map's landmarks when the layer was made, which identify the map.
+    landmark_centers : ndarray (L, 3) float32
+        Where they were [m].
+    camera : Camera
+        That took the keyframes, of the undistorted images.
+    map_from_camera : ndarray (K, 4, 4)
+    offsets : ndarray (K + 1,) of int
+        Keyframe k has the points from offsets[k] up to offsets[k + 1].
+    pixels : ndarray (n, 2) uint16
+        Where the keyframe shows each point, undistorted [1/16 px].
+    points : ndarray (n, 3) float32
+        In the optical coordinate frame of their keyframe [m].
+    descriptors : ndarray (n, 128) uint8
+    words : ndarray (n,) uint16
+        Word of each descriptor.
+    vocabulary : ndarray (W, 128) uint8
+        The words' mean descriptors.
+    deviation_per_metre : float
+        How far a pose is off that was found from a keyframe a metre away, as a standard
+        deviation on each axis [m]: the error that its points share.
+    """
+
+    frame_id: str
+    landmark_ids: tuple[str, ...]
+    landmark_centers: NDArray[np.float32]
+    camera: Camera
+    map_from_camera: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    pixels: NDArray[np.uint16]
+    points: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    words: NDArray[np.uint16]
+    vocabulary: NDArray[np.uint8]
+    deviation_per_metre: float = FROM_DEPTH
+
+    def __len__(self) -> int:
+        """Return the number of keyframes."""
+        return len(self.map_from_camera)
+
+    def prepare(self) -> None:
+        """Compute what the first request would wait for."""
+        _ = self._profiles, self._unit_vocabulary
+
+    def camera_note(self, camera: Camera) -> str:
+        """Return how a camera differs from that of the keyframes; empty if it does not."""
+        own = self.camera
+        ours = np.array([own.fx, own.fy]) / own.width
+        theirs = np.array([camera.fx, camera.fy]) / camera.width
+        if np.abs(theirs / ours - 1.0).max() <= _SAME_FOCAL:
+            return ''
+        return (f'the camera differs from that of the keyframes: fx {camera.fx:.1f} of '
+                f'{camera.width} px, theirs {own.fx:.1f} of {own.width} px; is camera_info right?')
+
+    def rows(self, keyframe: int) -> slice:
+        """Return where the points of a keyframe are."""
+        return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
+
+    def points_in_map(self, keyframe: int) -> NDArray[np.float64]:
+        """Return the points (m, 3) of a keyframe in the map [m]."""
+        pose = self.map_from_camera[keyframe]
+        points = np.asarray(self.points[self.rows(keyframe)], dtype=np.float64)
+        return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+    def unit_descriptors(self, keyframe: int) -> NDArray[np.float32]:
+        """Return the descriptors (m, 128) of a keyframe as unit vectors."""
+        return unit_rows(np.asarray(self.descriptors[self.rows(keyframe)]))
+
+    def similarities(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return how similar each keyframe (K,) is to an image.
+
+        Parameters
+        ----------
+        descriptors : ndarray (n, 128)
+            Unit vectors of the image.
+        """
+        profiles, weights = self._profiles
+        counts = np.bincount(nearest_words(descriptors, self._unit_vocabulary),
+                             minlength=len(self.vocabulary))
+        return np.asarray(profiles @ (np.sqrt(counts) * weights).astype(np.float32))
+
+    @cached_property
+    def _unit_vocabulary(self) -> NDArray[np.float32]:
+        return unit_rows(self.vocabulary)
+
+    @cached_property
+    def _profiles(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the weighted words (K, W) of each keyframe, unit rows, and the weights (W,)."""
+        size = len(self.vocabulary)
+        profiles = np.zeros((len(self), size), dtype=np.float32)
+        for row in range(len(self)):
+            words = np.asarray(self.words[self.rows(row)], dtype=np.int64)
+            profiles[row] = np.sqrt(np.bincount(words, minlength=size)[:size])
+        # one keyframe more than there are, so that a single one has weights
+        weights = np.log((len(self) + 1.0) / np.maximum(1, (profiles > 0).sum(axis=0)))
+        profiles *= weights.astype(np.float32)
+        profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-9)
+        return profiles, weights
+
+
+def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the vocabulary (W, 128) of some descriptors (n, 128), by k-means.
+
+    The start is every n-th descriptor, so equal layers have equal words.
+    """
+    step = max(1, len(descriptors) // _MOST_LEARNED)
+    learned = unit_rows(descriptors[::step])
+    count = min(WORDS, len(learned))
+    means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
+    for _ in range(_STEPS):
+        words = nearest_words(learned, means)
+        order = np.argsort(words, kind='stable')
+        found, starts = np.unique(words[order], return_index=True)
+        sums = np.add.reduceat(learned[order], starts, axis=0)
+        means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.clip(np.round(means * 512.0), 0, 255), dtype=np.uint8)
+
+
+def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
+                  ) -> NDArray[np.int64]:
+    """Return the most similar word (n,) of each descriptor; both are unit vectors."""
+    found = [np.argmax(part @ vocabulary.T, axis=1) for part in np.array_split(
+        descriptors.reshape(-1, DIMENSIONS), 1 + len(descriptors) // 4096)]
+    return np.concatenate(found)

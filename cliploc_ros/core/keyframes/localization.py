@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Localize an image among keyframes: find similar ones, match them, solve for the pose."""
+
+import time
+from collections.abc import Sequence
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
+
+# Features of a query; keyframes that are matched: the most similar ones, then the most similar
+# ones elsewhere, so that a place that looks alike is found, and those where objects propose.
+_QUERY_FEATURES = 2000
+_SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
+# Places differ by more than 1 m or 45 degrees, as poses that do not agree.
+_MOST_RANKED = 500
+_SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
+# A keyframe sees the same as a pose if it looks the same way from near enough.
+_NEAR_M, _NEAR_DEG = 2.0, 40.0
+# Points of the inliers and everything near them are removed before a rival is looked for.
+_RIVAL_TOLERANCE = 3.0
+# Cells of the image (columns, rows), and how many points and features make one comparable.
+_CELLS = (8, 6)
+_LEAST_IN_CELL = 4
+# Errors that all points of a keyframe share: of its pose, and of its points, which matter the
+# more the further the image is from the keyframe. Chosen on the kitchen, see the study.
+_KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.45), 0.04
+
+
+class Recognized(NamedTuple):
+    """A pose by keyframes, and what speaks for and against it.
+
+    Parameters
+    ----------
+    map_from_camera : ndarray (4, 4)
+    covariance : ndarray (6, 6)
+        In the order of core.fit.covariance.
+    inliers : int
+        Number of points that agree.
+    rival : int
+        Number of points that agree with the best pose elsewhere, without those; 0 without one.
+    rival_pose : ndarray (4, 4) or None
+        That pose.
+    confirmed : float
+        Share of the parts of the image that show what the keyframes have there: 0 to 1.
+    expected : float
+        The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    keyframes : tuple of int
+        Those that points agree with, the most points first.
+    """
+
+    map_from_camera: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    inliers: int
+    rival: int
+    rival_pose: NDArray[np.float64] | None
+    confirmed: float
+    expected: float
+    keyframes: tuple[int, ...]
+
+
+class _Matched(NamedTuple):
+    """Matches of an image: feature, point in the map, keyframe, k of each."""
+
+    features: NDArray[np.int64]
+    points: NDArray[np.float64]
+    keyframes: NDArray[np.int64]
+
+    def select(self, rows: NDArray[np.int64]) -> '_Matched':
+        return _Matched(self.features[rows], self.points[rows], self.keyframes[rows])
+
+
+class KeyframeLocalizer:
+    """Localizes images in a layer of keyframes.
+
+    Parameters
+    ----------
+    layer : KeyframeLayer
+    """
+
+    def __init__(self, layer: KeyframeLayer) -> None:
+        self.layer = layer
+        layer.prepare()
+
+    def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
+                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
+                 ) -> Recognized | None:
+        """Find where an image was taken; None where no pose has enough points.
+
+        Parameters
+        ----------
+        image_rgb : ndarray (h, w, 3) uint8
+        camera : Camera
+            Of the image.
+        guesses : sequence of ndarray (4, 4)
+            Poses that objects propose; keyframes near them are matched, too.
+        deadline : float
+            No further keyframe is matched then (monotonic clock) [s].
+        """
+        features = extract(image_rgb, _QUERY_FEATURES)
+        bearings = camera.normalize_points(features.pixels)
+        known = np.isfinite(bearings).all(axis=1)
+        features, bearings = _select(features, known), bearings[known]
+        if len(features) < LEAST_INLIERS:
+            return None
+        descriptors = unit_rows(features.descriptors)
+        matched = self._match(descriptors, self._choose(descriptors, guesses), deadline)
+        best = find_pose(matched.points, bearings[matched.features], camera)
+        if best is None:
+            return None
+        inliers = matched.select(best.inliers)
+        rival, rival_pose = self._rival(matched, bearings, camera, best.map_from_camera)
+        counts = np.bincount(inliers.keyframes, minlength=len(self.layer))
+        used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
+        return Recognized(
+            best.map_from_camera,
+            best.covariance + self._shared(best.map_from_camera, counts),
+            len(np.unique(inliers.features)), rival, rival_pose,
+            *self._confirmed(best.map_from_camera, camera, features, inliers, used),
+            tuple(used.tolist()))
+
+    def _choose(self, descriptors: NDArray[np.float32], guesses: Sequence[NDArray[np.float64]]
+                ) -> list[int]:
+        """Return the keyframes to match: similar ones, and those near the guesses."""
+        poses = self.layer.map_from_camera
+        ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
+        chosen = ranks[:_SIMILAR]
+        others = (one for one in ranks[_SIMILAR:_MOST_RANKED]
+                  if not any(_same_place(poses[one], poses[other]) for other in chosen))
+        chosen += islice(others, _ELSEWHERE)
+        for guess in guesses:
+            near = _keyframes_near(poses, guess)
+            chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
+        return chosen
+
+    def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
+               ) -> _Matched:
+        features, points, keyframes = [np.empty(0, np.int64)], [np.empty((0, 3))], []
+        for keyframe in chosen:
+            if time.monotonic() > deadline:
+                break
+            pairs = match(descriptors, self.layer.unit_descriptors(keyframe))
+            inside = self.layer.points_in_map(keyframe)[pairs[:, 1]]
+            known = np.isfinite(inside).all(axis=1)
+            features.append(pairs[known, 0])
+            points.append(inside[known])
+            keyframes += [keyframe] * int(known.sum())
+        return _Matched(np.concatenate(features), np.concatenate(points),
+                        np.array(keyframes, dtype=np.int64))
+
+    def _rival(self, matched: _Matched, bearings: NDArray[np.float64], camera: Camera,
+               best: NDArray[np.float64]) -> tuple[int, NDArray[np.float64] | None]:
+        """Return the best pose elsewhere and how many features agree with it."""
+        taken = agreeing(matched.points, bearings[matched.features], invert_transform(best),
+                         _RIVAL_TOLERANCE)
+        left = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
+        other = find_pose(left.points, bearings[left.features], camera)
+        if other is None or _same_place(best, other.map_from_camera):
+            return 0, None
+        count = len(np.unique(left.features[other.inliers]))
+        return (count, other.map_from_camera) if count >= LEAST_INLIERS else (0, None)
+
+    def _confirmed(self, pose: NDArray[np.float64], camera: Camera, features: Features,
+                   inliers: _Matched, used: NDArray[np.int64]) -> tuple[float, float]:
+        """Return the share of cells with inliers, of those where keyframes expect some.
+
+        A cell without features, such as one that something covers, says nothing. The second
+        value is the share that is expected of so many inliers, whose density varies much from
+        cell to cell (a geometric distribution).
+        """
+        expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
+        for keyframe in used[:_SIMILAR].tolist():
+            pixels = _project(self.layer.points_in_map(keyframe), pose, camera)
+            expected = np.maximum(expected, _count(pixels, camera))
+        seen = _count(features.pixels, camera)
+        matched = _count(features.pixels[np.unique(inliers.features)], camera)
+        comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
+        if not comparable.any():
+            return 0.0, 0.0
+        density = len(np.unique(inliers.features)) / comparable.sum()
+        return float((matched[comparable] > 0).mean()), float(density / (1.0 + density))
+
+    def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of the errors that points of a keyframe share."""
+        used = np.nonzero(counts)[0]
+        shares = counts[used] / counts.sum()
+        poses = self.layer.map_from_camera[used]
+        distance = shares @ np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+        turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
+        angle = shares @ turns.magnitude()
+        position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
+        rotation = _KEYFRAME_RAD**2 + (_PER_RADIAN * angle) ** 2
+        return np.diag(np.repeat([position, rotation], 3))
+
+
+def _select(features: Features, rows: NDArray[np.bool_]) -> Features:
+    return Features(features.pixels[rows], features.descriptors[rows], features.strengths[rows])
+
+
+def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Return whether two poses (4, 4) agree to 1 m and 45 degrees."""
+    cosine = 0.5 * (np.sum(one[:3, :3] * other[:3, :3]) - 1.0)
+    return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < _SAME_M and cosine > _SAME_COS)
+
+
+def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the keyframes that see what a pose sees, the most similar views first."""
+    distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
+    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    costs = distances / _NEAR_M + angles / _NEAR_DEG
+    order = np.argsort(costs, kind='stable')
+    return np.asarray(order[costs[order] < 1.0])
+
+
+def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera
+             ) -> NDArray[np.float64]:
+    """Return the pixels (m, 2) of the points in front of a camera."""
+    camera_from_map = invert_transform(pose)
+    inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+    inside = inside[inside[:, 2] > 0.1]
+    return camera.project_normalized(inside[:, :2] / inside[:, 2:])
+
+
+def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
+    """Return how many pixels (m, 2) lie in each cell of the image."""
+    columns, rows = _CELLS
+    with np.errstate(invalid='ignore'):
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    place = (pixels[inside] * (columns / camera.width, rows / camera.height)).astype(np.int64)
+    place = np.minimum(place, (columns - 1, rows - 1))
+    return np.bincount(place[:, 1] * columns + place[:, 0], minlength=columns * rows)

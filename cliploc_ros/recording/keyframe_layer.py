@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of a recording: which images, which of their features, and where these are."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.features import extract, unit_rows
+from cliploc_ros.core.keyframes.layer import (
+    FROM_DEPTH,
+    PIXEL_SCALE,
+    TRIANGULATED,
+    KeyframeLayer,
+    learn_words,
+    nearest_words,
+)
+from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.datasets.depth import depths_of_points
+from cliploc_ros.datasets.frames import Frame, Frames
+from cliploc_ros.errors import MappingError, OptionsError
+
+# Features that are found in an image, before those without a point are left out.
+_MOST_FOUND = 2000
+# An image with fewer points is no keyframe.
+_LEAST_POINTS = 20
+
+
+@dataclass(frozen=True)
+class LayerOptions:
+    """Which images become keyframes, and how many points each keeps.
+
+    Parameters
+    ----------
+    distance_m, angle_deg : float
+        An image becomes a keyframe unless one of them is nearer than both. 0: every image.
+    most_points : int
+        Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
+    """
+
+    distance_m: float = 0.1
+    angle_deg: float = 5.0
+    most_points: int = 600
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no layer."""
+        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
+            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
+                               'give 0 or more')
+        if not _LEAST_POINTS <= self.most_points <= _MOST_FOUND:
+            raise OptionsError(f'{self.most_points} points of a keyframe: give {_LEAST_POINTS} '
+                               f'to {_MOST_FOUND}')
+
+
+_DEFAULT = LayerOptions()
+
+
+class _Seen(NamedTuple):
+    """A keyframe: its features (undistorted pixels, strongest first) and their depths."""
+
+    posed: PosedFeatures
+    depths: NDArray[np.float64]
+
+
+def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
+                ) -> KeyframeLayer:
+    """Return the keyframes of a recording, in the coordinate frame of its poses.
+
+    Parameters
+    ----------
+    frames : Frames
+        With depth, or posed images that overlap, which triangulate the points.
+    landmark_map : LandmarkMap
+        The map that the layer belongs to.
+    options : LayerOptions, optional
+
+    Raises
+    ------
+    MappingError
+        No image has enough points.
+    """
+    camera, seen = None, []
+    for frame in _chosen(frames, options):
+        camera = camera or _pinhole(frame.camera)
+        seen.append(_look(frame, options.most_points))
+    images = [one.posed for one in seen]
+    points = [_points(images, row, one.depths)
+              for row, one in enumerate(seen)]
+    kept = [_strongest(found, options.most_points) for found in points]
+    rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
+    if camera is None or not rows:
+        raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
+                           f'{_LEAST_POINTS} features with a place in the map; record depth, or '
+                           'images that overlap and are 5 cm or more apart')
+    return _assemble(landmark_map, camera, [images[row] for row in rows],
+                     [points[row] for row in rows], [kept[row] for row in rows],
+                     FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
+                     else TRIANGULATED)
+
+
+def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
+    """Yield the images whose view no earlier one of them has, decoded."""
+    poses: list[NDArray[np.float64]] = []
+
+    def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+        if pose is None:
+            return False
+        for other in reversed(poses):
+            distance, angle = pose_error(pose, other)
+            if distance < options.distance_m and angle < options.angle_deg:
+                return False
+        poses.append(pose)
+        return True
+    for raw in frames.read_raw(is_new):
+        yield raw.decode()
+
+
+def _pinhole(camera: Camera) -> Camera:
+    """Return the camera of the undistorted images."""
+    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def _look(frame: Frame, most: int) -> _Seen:
+    """Return the features of an image; with depth, only those that have some."""
+    assert frame.map_from_camera is not None
+    features = extract(frame.image_rgb, _MOST_FOUND)
+    bearings = frame.camera.normalize_points(features.pixels)
+    depths = np.full(len(features), np.nan)
+    known = np.isfinite(bearings).all(axis=1)
+    if frame.depth is not None:
+        depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
+        known &= np.isfinite(depths)
+        known &= np.cumsum(known) <= most
+    return _Seen(PosedFeatures(frame.map_from_camera, bearings[known],
+                               features.descriptors[known]), depths[known])
+
+
+def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float64]
+            ) -> NDArray[np.float64]:
+    """Return the points (n, 3) of a keyframe in its own coordinate frame; NaN where unknown."""
+    if np.isfinite(depths).any():
+        bearings = images[row].bearings
+        return np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
+    return triangulate(images, row)
+
+
+def _strongest(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Return the rows of the strongest features that have a point."""
+    return np.nonzero(np.isfinite(points).all(axis=1))[0][:most]
+
+
+def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedFeatures],
+              points: Sequence[NDArray[np.float64]], kept: Sequence[NDArray[np.int64]],
+              deviation_per_metre: float) -> KeyframeLayer:
+    descriptors = np.concatenate([one.descriptors[rows]
+                                  for one, rows in zip(images, kept, strict=True)])
+    pixels = np.concatenate([one.bearings[rows] for one, rows in zip(images, kept, strict=True)])
+    pixels = pixels * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    vocabulary = learn_words(descriptors)
+    return KeyframeLayer(
+        landmark_map.frame_id, landmark_map.landmark_ids,
+        landmark_map.centers.astype(np.float32), camera,
+        np.array([one.map_from_camera for one in images]),
+        np.cumsum([0, *map(len, kept)]),
+        np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
+        np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
+                       ).astype(np.float32),
+        descriptors, nearest_words(unit_rows(descriptors), unit_rows(vocabulary)
+                                   ).astype(np.uint16), vocabulary, deviation_per_metre)

@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layer of keyframes in the relocalizer: used where there is one, left out where bad."""
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.combination import combine, objects_there
+from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.errors import MapError
+
+logger = logging.getLogger(__name__)
+
+#: Value of keyframes_file for the layer next to the map, if there is one.
+NEXT_TO_MAP = 'auto'
+# Without so much time left, the objects' answer stands: extracting features cannot be stopped.
+_LEAST_S = 0.5
+# Poses of objects that propose keyframes.
+_MOST_GUESSES = 3
+
+
+class Keyframes:
+    """A layer, and the map that it belongs to.
+
+    Parameters
+    ----------
+    localizer : KeyframeLocalizer
+    landmark_map : LandmarkMap
+    """
+
+    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap) -> None:
+        self._localizer = localizer
+        self._map = landmark_map
+        self._notes: set[str] = set()
+
+    def __len__(self) -> int:
+        """Return the number of keyframes."""
+        return len(self._localizer.layer)
+
+    def join(self, found: Relocalization, image_rgb: NDArray[np.uint8], observation: Observation,
+             options: RelocalizerOptions, deadline: float) -> Relocalization:
+        """Return the answer of objects and keyframes together.
+
+        Parameters
+        ----------
+        found : Relocalization
+            By objects.
+        image_rgb : ndarray (h, w, 3) uint8
+        observation : Observation
+            Of the image.
+        options : RelocalizerOptions
+        deadline : float
+            When the request ends (monotonic clock) [s].
+        """
+        if deadline - time.monotonic() < _LEAST_S:
+            return found
+        note = self._localizer.layer.camera_note(observation.camera)
+        if note and note not in self._notes:
+            self._notes.add(note)
+            logger.warning('%s', note)
+        guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
+        seen = self._localizer.localize(image_rgb, observation.camera, guesses, deadline)
+        if seen is None:
+            return found
+        return combine(found, seen, objects_there(self._map, observation, seen.map_from_camera),
+                       options)
+
+
+def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyframes | None:
+    """Return the layer that the parameters name; None without one, or where it is bad.
+
+    A bad layer is logged with what to do, and the relocalizer goes on with the landmarks.
+    """
+    named, map_file = values['keyframes_file'], values['map_file']
+    if not named or (named == NEXT_TO_MAP and not map_file):
+        return None
+    path = layer_path(map_file) if named == NEXT_TO_MAP else Path(named)
+    if named == NEXT_TO_MAP and not path.exists():
+        return None
+    try:
+        layer = load_layer_of_map(path, landmark_map)
+        return Keyframes(KeyframeLocalizer(layer), landmark_map)
+    except MapError as error:
+        logger.error('localizing without keyframes: %s', error)
+        return None

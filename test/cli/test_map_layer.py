@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``build_map --keyframe-layer``: what it refuses, and the file that it writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.build_map import main, make_parser
+from cliploc_ros.cli.map_layer import write_layer
+from cliploc_ros.core.keyframes.layer_file import load_layer_of_map
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+WALK = ['--tum', str(ASSETS / 'mapping')]
+
+
+@pytest.mark.parametrize('others', [
+    ['--observations', 'none.npz'], [*WALK, '--update', 'old.yaml'], [*WALK, '--refine-mount']])
+def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, capsys, others):
+    out = tmp_path / 'map.yaml'
+    assert main([*others, '--keyframe-layer', '--out', str(out)]) == 1
+    assert '--keyframe-layer is not for' in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_walk_gives_a_layer_next_to_its_map(tmp_path):
+    landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    options = make_parser().parse_args([
+        *WALK, '--keyframe-layer', '--keyframe-points', '100', '--out', str(tmp_path / 'a.yaml')])
+    line, = write_layer(options, landmark_map)
+    layer = load_layer_of_map(tmp_path / 'a.keyframes.npz', landmark_map)
+    assert line.startswith(f'keyframes: {len(layer)} with {len(layer.points)} points, ')
+    assert len(layer) >= 20
+    assert np.diff(layer.offsets).max() <= 100
+    without = make_parser().parse_args([*WALK, '--out', str(tmp_path / 'b.yaml')])
+    assert write_layer(without, landmark_map) == []
+    assert not (tmp_path / 'b.keyframes.npz').exists()
+
+
+def test_images_that_do_not_overlap_give_an_error(tmp_path):
+    options = make_parser().parse_args([*WALK, '--keyframe-layer', '--keyframes', '50', '360',
+                                        '--out', str(tmp_path / 'a.yaml')])
+    with pytest.raises(MappingError, match='no keyframe: of 1 images none has'):
+        write_layer(options, LandmarkMap.from_file(ASSETS / 'map.yaml'))

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layer's file: it comes back as it was, and bad files are named."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes import layer_file
+from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
+from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, save_layer
+from cliploc_ros.errors import MapError
+
+ROOM = make_room()
+KEYFRAMES, POINTS = 6, 40
+
+
+def make_layer(room=ROOM):
+    rng = np.random.default_rng(0)
+    total = KEYFRAMES * POINTS
+    descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
+    vocabulary = learn_words(descriptors)
+    return KeyframeLayer(
+        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA,
+        np.tile(np.eye(4), (KEYFRAMES, 1, 1)), np.arange(0, total + 1, POINTS),
+        rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
+        rng.normal(size=(total, 3)).astype(np.float32), descriptors,
+        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16),
+        vocabulary)
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = layer_path(tmp_path / 'room.yaml')
+    save_layer(path, make_layer())
+    return path
+
+
+def rewrite(path, **changes):
+    """Write the file again with other arrays, or without those that are None."""
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files} | changes
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+
+
+def change_header(path, **changes):
+    with np.load(path) as content:
+        header = json.loads(str(content['header'])) | changes
+    rewrite(path, header=np.array(json.dumps(header)))
+
+
+def test_a_layer_comes_back_as_it_was(file):
+    assert file.name == 'room.keyframes.npz'
+    before, after = make_layer(), load_layer_of_map(file, ROOM)
+    assert after.camera == before.camera
+    assert after.landmark_ids == before.landmark_ids
+    for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
+                 'vocabulary'):
+        assert np.array_equal(getattr(after, name), getattr(before, name)), name
+    assert not isinstance(after.descriptors, np.memmap), 'a small file may be written over'
+
+
+def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
+    monkeypatch.setattr(layer_file, 'MOST_READ', 0)
+    layer = load_layer_of_map(file, ROOM)
+    assert isinstance(layer.descriptors, np.memmap)
+    assert np.array_equal(layer.descriptors, make_layer().descriptors)
+
+
+def test_an_edited_map_keeps_its_layer(file):
+    fewer = ROOM.select(range(1, len(ROOM)))
+    moved = replace(fewer, centers=fewer.centers + np.eye(len(fewer))[:, :1] * 3.0)
+    assert len(load_layer_of_map(file, moved)) == KEYFRAMES
+
+
+def test_the_most_similar_keyframe_has_the_same_words():
+    layer = make_layer()
+    for keyframe in range(KEYFRAMES):
+        similarities = layer.similarities(layer.unit_descriptors(keyframe))
+        assert similarities.argmax() == keyframe
+
+
+@pytest.mark.parametrize(('other', 'message'), [
+    (replace(ROOM, frame_id='odom'), "of a map in frame 'map', not 'odom'"),
+    (replace(ROOM, landmark_ids=tuple(f'x{row}' for row in range(len(ROOM)))), 'no landmark'),
+    (replace(ROOM, centers=ROOM.centers + 5.0), '8.66 m from those of the map')])
+def test_the_layer_of_another_map_is_named(file, other, message):
+    with pytest.raises(MapError, match=message) as caught:
+        load_layer_of_map(file, other)
+    assert str(file) in str(caught.value)
+    assert 'build_map --keyframe-layer' in str(caught.value)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'version': 2}, 'version 2, expected 1'),
+    ({'descriptors': 'orb-32'}, "kind 'orb-32', expected 'rootsift"),
+    ({'camera': {'width': 0, 'height': 1, 'fx': 1, 'fy': 1, 'cx': 0, 'cy': 0}}, 'camera'),
+    ({'camera': 7}, 'camera')])
+def test_other_versions_descriptors_and_cameras_are_named(file, changes, message):
+    change_header(file, **changes)
+    with pytest.raises(MapError, match=message):
+        load_layer_of_map(file, ROOM)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'points': None}, 'points'),
+    ({'points': np.zeros((3, 3), np.float32)}, r'points has shape \(3, 3\)'),
+    ({'points': np.zeros((KEYFRAMES * POINTS, 3))}, 'points has type float64'),
+    ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),
+    ({'offsets': np.array([0, 200, 40, 80, 120, 160, 240])}, 'offsets'),
+    ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'no rigid transform in row 0'),
+    ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words'),
+    ({'descriptors': np.empty((0, DIMENSIONS), np.uint8)}, 'descriptors has shape'),
+    ({'landmark_ids': np.array([object()])}, 'landmark_ids|complete')])
+def test_malformed_arrays_are_named(file, changes, message):
+    rewrite(file, **changes)
+    with pytest.raises(MapError, match=message):
+        load_layer_of_map(file, ROOM)
+
+
+@pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_named(file, share):
+    content = file.read_bytes()
+    file.write_bytes(content[:int(share * len(content))])
+    with pytest.raises(MapError, match='no complete layer'):
+        load_layer_of_map(file, ROOM)
+
+
+def test_random_damage_ends_in_an_error_or_in_a_layer(file):
+    content, rng = bytearray(file.read_bytes()), np.random.default_rng(1)
+    for _ in range(100):
+        damaged = content.copy()
+        for place in rng.integers(len(content), size=20):
+            damaged[place] = rng.integers(256)
+        file.write_bytes(damaged)
+        try:
+            layer = load_layer_of_map(file, ROOM)
+        except MapError:
+            continue
+        assert layer.offsets[-1] == len(layer.descriptors)
+
+
+def test_a_missing_or_compressed_file_and_a_failed_write_are_named(file, tmp_path):
+    with pytest.raises(MapError, match='no such file'):
+        load_layer_of_map(tmp_path / 'none.npz', ROOM)
+    with np.load(file) as content:
+        np.savez_compressed(file, **{name: content[name] for name in content.files})
+    with pytest.raises(MapError, match='compressed'):
+        load_layer_of_map(file, ROOM)
+    with pytest.raises(MapError, match='cannot be written'):
+        save_layer(tmp_path / 'missing' / 'room.npz', make_layer())
+
+
+def test_another_camera_is_noted():
+    layer = make_layer()
+    assert layer.camera_note(CAMERA) == ''
+    assert layer.camera_note(Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)) == ''
+    assert 'fx 700.0' in layer.camera_note(Camera(640, 480, 700.0, 700.0, 320.0, 240.0))

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses and points from matched features: exact cases, outliers, honest covariances."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.keyframes.features import DIMENSIONS, extract, match, unit_rows
+from cliploc_ros.core.keyframes.point_pose import find_pose
+from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+
+
+def look(rng, count=200, noise_px=0.0, offset=(0.0, 0.0, 0.0)):
+    """Return a pose, points 1 to 4 m in front of it, and their bearings."""
+    turn = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    pose = make_transform(turn, rng.normal(size=3) + offset)
+    depths = rng.uniform(1.0, 4.0, count)
+    bearings = rng.uniform((-0.6, -0.45), (0.6, 0.45), (count, 2))
+    inside = np.column_stack([bearings, np.ones(count)]) * depths[:, None]
+    points = inside @ pose[:3, :3].T + pose[:3, 3]
+    return pose, points, bearings + rng.normal(0.0, noise_px / CAMERA.fx, bearings.shape)
+
+
+@pytest.mark.parametrize('far_m', [0.0, 1e5], ids=['near', 'far from the origin'])
+def test_a_pose_is_exact_without_noise_and_despite_outliers(far_m):
+    rng = np.random.default_rng(1)
+    pose, points, bearings = look(rng, offset=(far_m, 0.0, 0.0))
+    bearings[:100] = rng.permutation(bearings[:100])
+    found = find_pose(points, bearings, CAMERA)
+    error_m, error_deg = pose_error(found.map_from_camera, pose)
+    assert error_m < 1e-4
+    assert error_deg < 1e-3
+    assert set(found.inliers) >= set(range(100, 200))
+
+
+def test_covariances_of_noisy_features_are_honest():
+    rng, squares = np.random.default_rng(2), []
+    for _ in range(60):
+        pose, points, bearings = look(rng, 60, noise_px=1.0)
+        found = find_pose(points, bearings, CAMERA)
+        squares.append(normalized_square(found.map_from_camera, found.covariance, pose))
+    # six degrees of freedom; the deviation of this mean is .45
+    assert 4.0 < np.mean(squares) < 8.0
+
+
+def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
+    rng = np.random.default_rng(3)
+    _, points, bearings = look(rng, 30)
+    assert find_pose(points[:5], bearings[:5], CAMERA) is None
+    assert find_pose(np.empty((0, 3)), np.empty((0, 2)), CAMERA) is None
+    found = find_pose(points, rng.permutation(bearings), CAMERA)
+    assert found is None or len(found.inliers) < 12
+    assert find_pose(np.ones((20, 3)), np.zeros((20, 2)), CAMERA) is None
+
+
+def test_rays_of_equal_features_meet_in_their_point():
+    rng = np.random.default_rng(4)
+    points = rng.uniform((-1, -1, 2), (1, 1, 4), (50, 3))
+    descriptors = rng.integers(0, 255, (50, DIMENSIONS)).astype(np.uint8)
+    images = []
+    for x in (0.0, 0.3, 0.6):
+        pose = make_transform(Rotation.from_rotvec([0.0, -0.1 * x, 0.0]).as_matrix(),
+                              np.array([x, 0.0, 0.0]))
+        inside = (points - pose[:3, 3]) @ pose[:3, :3]
+        images.append(PosedFeatures(pose, inside[:, :2] / inside[:, 2:], descriptors))
+    images[2].bearings[:5] += 0.1  # mismatched there, but not in the second image
+    found = triangulate(images, 0)
+    assert np.abs(found - points).max() < 1e-6
+
+
+def test_without_parallax_there_are_no_points():
+    rng = np.random.default_rng(5)
+    descriptors = rng.integers(0, 255, (20, DIMENSIONS)).astype(np.uint8)
+    bearings = rng.uniform(-0.4, 0.4, (20, 2))
+    images = [PosedFeatures(make_transform(np.eye(3), np.array([x, 0.0, 0.0])), bearings,
+                            descriptors) for x in (0.0, 0.1)]
+    assert np.isnan(triangulate(images, 0)).all()
+    assert np.isnan(triangulate(images[:1], 0)).all()
+
+
+def test_features_are_found_in_any_image():
+    rng = np.random.default_rng(6)
+    texture = rng.integers(0, 255, (30, 40, 3)).astype(np.uint8).repeat(20, 0).repeat(20, 1)
+    features = extract(texture, 300)
+    assert 100 < len(features) <= 300
+    assert (np.diff(features.strengths) <= 0).all()
+    small = extract(texture[:400, :500], 300)
+    pairs = match(unit_rows(small.descriptors), unit_rows(features.descriptors))
+    shifts = features.pixels[pairs[:, 1]] - small.pixels[pairs[:, 0]]
+    assert len(pairs) > 50
+    assert np.mean(np.abs(shifts).max(axis=1) < 0.5) > 0.9
+    for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
+                  np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
+        assert len(extract(empty, 300)) == 0
+
+
+def test_a_large_image_gives_its_own_pixels():
+    rng = np.random.default_rng(7)
+    texture = rng.integers(0, 255, (15, 20, 3)).astype(np.uint8).repeat(80, 0).repeat(80, 1)
+    features = extract(texture, 500)  # 1600 px wide
+    assert features.pixels[:, 0].max() > 1300

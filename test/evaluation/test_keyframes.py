@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of real images: the kitchen with depth, the office without."""
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.combination import ObjectsThere, combine
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.evaluation.keyframe_study.baseline import Baseline
+from cliploc_ros.evaluation.keyframe_study.changes import IMAGE_CHANGES, put_poster, twin_layer
+from cliploc_ros.evaluation.keyframes import some_frames
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+EVERY = LayerOptions(0.0, 0.0)
+OPTIONS = RelocalizerOptions(matching='class')
+NOWHERE = Relocalization(False, 'no objects')
+MAPPED, ASKED = range(0, 30, 3), range(1, 30, 6)
+
+
+@pytest.fixture(scope='module')
+def room(shared_data):
+    """Any map: the tests look at features alone."""
+    return LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
+
+
+@pytest.fixture(scope='module')
+def kitchen(shared_data):
+    return rgbd_frames(shared_data / 'seven_scenes_kitchen', FolderOptions())
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    folder = shared_data / 'tum_fr3_office'
+    return tum_frames(read_tum(folder), find_camera(None, folder)[0])
+
+
+@pytest.fixture(scope='module')
+def queries(kitchen):
+    return list(some_frames(kitchen, ASKED).read())
+
+
+@pytest.fixture(scope='module')
+def layer(kitchen, room, tmp_path_factory):
+    """Ten images of the kitchen, written and read."""
+    path = tmp_path_factory.mktemp('layer') / 'kitchen.keyframes.npz'
+    save_layer(path, build_layer(some_frames(kitchen, MAPPED), room, EVERY))
+    assert path.stat().st_size < 5e6 * len(MAPPED) / 50
+    return load_layer_of_map(path, room)
+
+
+def answer(localizer, image_rgb, camera):
+    return combine(NOWHERE, localizer.localize(image_rgb, camera), ObjectsThere(0, 0), OPTIONS)
+
+
+def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
+    localizer = KeyframeLocalizer(layer)
+    for frame in queries:
+        found = answer(localizer, frame.image_rgb, frame.camera)
+        assert found.accepted, found.reason
+        assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.1
+        assert np.sqrt(np.trace(found.covariance[:3, :3])) < 0.1
+
+
+@pytest.mark.parametrize('name', IMAGE_CHANGES)
+def test_changed_images_are_found_or_refused(layer, queries, name):
+    localizer, rng = KeyframeLocalizer(layer), np.random.default_rng(0)
+    frame = queries[0]
+    found = answer(localizer, IMAGE_CHANGES[name](frame.image_rgb, rng), frame.camera)
+    assert found.map_from_camera is not None
+    assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.25
+
+
+def test_another_room_is_refused(layer, office):
+    localizer = KeyframeLocalizer(layer)
+    for frame in some_frames(office, range(0, 17, 4)).read():
+        assert not answer(localizer, frame.image_rgb, frame.camera).accepted
+
+
+def test_a_second_room_that_looks_the_same_is_refused(layer, queries):
+    localizer = KeyframeLocalizer(twin_layer(layer))
+    for frame in queries[:3]:
+        seen = localizer.localize(frame.image_rgb, frame.camera)
+        assert seen.rival > 0.5 * seen.inliers
+        assert not combine(NOWHERE, seen, ObjectsThere(0, 0), OPTIONS).accepted
+
+
+def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
+    elsewhere = next(some_frames(kitchen, [27]).read())  # mapped
+    frame = queries[0]
+    image = put_poster(frame.image_rgb, elsewhere.image_rgb, 0.3)
+    found = answer(KeyframeLocalizer(layer), image, frame.camera)
+    assert not found.accepted or pose_error(found.map_from_camera,
+                                            frame.map_from_camera)[0] < 1.0
+
+
+def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
+    localizer = KeyframeLocalizer(layer)
+    frame = queries[0]
+    with_guess = localizer.localize(frame.image_rgb, frame.camera, [frame.map_from_camera])
+    without = localizer.localize(frame.image_rgb, frame.camera)
+    assert with_guess.inliers >= without.inliers
+
+
+def test_the_office_is_triangulated_without_depth(office, room):
+    layer = build_layer(some_frames(office, range(0, 17, 2)), room, EVERY)
+    assert (np.diff(layer.offsets) > 100).all()
+    localizer = KeyframeLocalizer(layer)
+    for frame in some_frames(office, range(1, 17, 4)).read():
+        found = answer(localizer, frame.image_rgb, frame.camera)
+        assert found.accepted, found.reason
+        assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.05
+
+
+def test_the_baseline_finds_the_kitchen(kitchen, queries):
+    baseline = Baseline(list(some_frames(kitchen, range(0, 6, 3)).read()))
+    frame = queries[0]
+    pose = baseline.localize(frame.image_rgb, frame.camera)
+    assert pose_error(pose, frame.map_from_camera)[0] < 0.1
+    assert baseline.localize(np.zeros_like(frame.image_rgb), frame.camera) is None

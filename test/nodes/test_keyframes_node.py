@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The relocalizer as a process with a layer of keyframes next to its map: the demo's room."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene import make_room, write_map
+from std_srvs.srv import Trigger
+from tester import class_matching, make_frame, transform_of
+
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ROOM = make_room()  # its objects are nowhere in the images
+UNKNOWN = Detections(np.array([[10.0, 10.0, 90.0, 90.0]]), ('z',), np.ones(1))
+
+
+def frames_of(name):
+    return tum_frames(read_tum(ASSETS / name), find_camera(None, ASSETS / name)[0])
+
+
+@pytest.fixture
+def room_map(tmp_path):
+    path = tmp_path / 'room.yaml'
+    write_map(ROOM, path)
+    save_layer(layer_path(path), build_layer(frames_of('mapping'), ROOM,
+                                             LayerOptions(0.0, 0.0, 300)))
+    return path
+
+
+def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
+        start, tester, room_map):
+    process = start('nodes.relocalizer', parameters=class_matching(room_map))
+    process.wait_for_output('ready after')
+    assert '29 keyframes' in process.output()
+    tester.connect()
+    seen = next(one for number, one in enumerate(frames_of('sequence').read()) if number == 4)
+    image, info, detections = make_frame(UNKNOWN)
+    image.width, image.height, image.step = seen.camera.width, seen.camera.height, \
+        3 * seen.camera.width
+    image.data = seen.image_rgb.tobytes()
+    info.width, info.height = seen.camera.width, seen.camera.height
+    info.k = seen.camera.matrix.ravel()
+    info.p = np.c_[seen.camera.matrix, np.zeros(3)].ravel()
+    answer = tester.relocalize((image, info, detections))
+    assert answer.success, answer.message
+    assert 'pose by keyframes' in answer.message
+    tester.wait(lambda: tester.poses, 'a pose')
+    assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
+    # boxes that the objects' search accepts, in an image of another place
+    contradicted = tester.relocalize((image, info, make_frame()[2]))
+    assert not contradicted.success
+    assert 'objects and keyframes contradict each other' in contradicted.message
+    layer_path(room_map).write_bytes(b'no layer')
+    assert tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request()).success
+    process.wait_for_output('localizing without keyframes')
+    assert not tester.relocalize((image, info, detections)).success
