@@ -43,7 +43,7 @@ def call_every_kernel() -> None:
     list(search_exhaustively(scene, Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
-    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(len(centers)))
     scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
     choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
     verify_rig(rig, np.eye(3), np.zeros(3))

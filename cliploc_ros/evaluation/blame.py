@@ -93,7 +93,7 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
     found = relocalizer.locate(frames)
     errors = [pose_error(one.map_from_camera, query.map_from_camera)[0]
               for one in found.hypotheses]
-    true_pose, matches = _refined(frames, query.map_from_camera)
+    true_pose, matches = _refined(frames, query.map_from_camera, landmark_map.position_sigmas)
     candidates = [{one.landmark for one in its
                    if [one.detection, one.landmark] in frame.scene.pairs.tolist()}
                   for frame, its in zip(frames, matches, strict=True)]
@@ -116,12 +116,13 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
     return Blame(cause, len(set().union(*candidates)))
 
 
-def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float64]
+def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float64],
+             sigmas: NDArray[np.float64]
              ) -> tuple[NDArray[np.float64], list[tuple[Match, ...]]]:
     """Return a pose (4, 4) of the last frame after refinement, and what it explains in each."""
     rig = make_rig([one.scene for one in frames],
                    cameras_from_last([one.observation for one in frames]),
-                   np.stack([one.vertical for one in frames]))
+                   np.stack([one.vertical for one in frames]), sigmas)
     camera_from_map = invert_transform(map_from_camera)
     refined = refine_rig(rig, np.ascontiguousarray(camera_from_map[:3, :3]),
                          np.ascontiguousarray(camera_from_map[:3, 3]))

@@ -38,6 +38,30 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
     return tuple(found)
 
 
+def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg: float,
+                     seed: int = 0) -> tuple[Query, ...]:
+    """Return queries with a known vertical, wrong by the same in all frames of a group.
+
+    That is the error of a sensor, or of its mount.
+
+    Parameters
+    ----------
+    queries : sequence of Query
+    groups : sequence of int
+        The group of each.
+    noise_deg : float
+        Standard deviation of the error on each of two axes [deg].
+    seed : int
+        Equal seeds give equal noise.
+    """
+    found = []
+    for query, group in zip(queries, groups, strict=True):
+        turn = np.radians(noise_deg) * np.random.default_rng([seed, abs(group), 2]).normal(size=3)
+        up = Rotation.from_rotvec(turn).apply(query.map_from_camera[2, :3])
+        found.append(replace(query, observation=replace(query.observation, up_in_camera=up)))
+    return tuple(found)
+
+
 def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: float = 0.0,
                     noise_deg: float = 0.0, seed: int = 0) -> tuple[Query, ...]:
     """Return queries with the other frames of their group, linked by odometry.

@@ -55,12 +55,16 @@ class Localized(NamedTuple):
         Number of crops that were compared with labels.
     is_cut : bool
         Whether there was no time for the other crops, which could have helped.
+    for_filter : ndarray (6, 6) or None
+        Covariance for a filter that fuses all accepted poses: in continuous mode, that of what is
+        new, see cliploc_ros.core.succession.
     """
 
     found: Relocalization
     seen: SeenImage
     compared: int
     is_cut: bool
+    for_filter: NDArray[np.float64] | None
 
 
 class Localizer:
@@ -167,7 +171,9 @@ class Localizer:
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
-        return Localized(found, SeenImage(image, seen), compared, is_cut)
+        for_filter = session.covariance_for_filter(found) \
+            if found.accepted and values['mode'] == 'continuous' else found.covariance
+        return Localized(found, SeenImage(image, seen), compared, is_cut, for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float

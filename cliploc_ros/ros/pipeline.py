@@ -130,10 +130,12 @@ class Pipeline:
             return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at,
                           is_linked)
         assert found.covariance is not None and found.map_from_camera is not None
+        assert localized.for_filter is not None
         map_from_base = found.map_from_camera @ state.camera_from_base
-        pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
-            found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
-        self._pose.publish(pose)
+        lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
+        pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
+            covariance, lever)) for covariance in (found.covariance, localized.for_filter))
+        self._pose.publish(for_filter)
         try:
             self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
                                      received_at)

@@ -57,7 +57,8 @@ def test_a_detection_of_a_second_class_finds_its_landmark(landmarks):
     assert {match.detection: match.landmark for match in both.matches} == {
         row: row for row in range(len(ROOM))}
     assert pose_error(both.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
-    assert both.hypotheses[0].support.same_class == len(ROOM)
+    # second classes count by their share
+    assert both.hypotheses[0].support.same_class == pytest.approx(len(ROOM) - 4 + 4 * 0.3 / 0.7)
     assert both.confidence >= plain.confidence
 
 

@@ -234,7 +234,7 @@ def test_no_refusal_names_a_rival_at_the_same_place(office_map, queries, observe
             assert 0.0 < found.evidence.rival <= 1.0 - best.confidence
             assert found.evidence.rival <= max(elsewhere) / (
                 found.evidence.found * found.evidence.near) + 1e-9
-    assert ambiguous > 3
+    assert ambiguous > 1
 
 
 def test_an_ambiguous_scene_shares_its_confidence(office_map, queries, observe):

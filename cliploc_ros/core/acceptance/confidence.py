@@ -24,7 +24,7 @@ from cliploc_ros.core.index.similarities import (
     pair_similarities,
     sampled_similarities,
 )
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 
 # Boxes that overlap more than this show the same object, detected twice.
 _SAME_BOX_IOU = 0.8
@@ -57,7 +57,8 @@ class Support:
         How much more similar their crops are to the labels of their landmarks than to the map's
         labels on average, in standard deviations, summed.
     same_class : float
-        Number of the objects that have a class of their landmark.
+        Number of the objects that have the class of their landmark. A class that the detector
+        takes the landmark for at times counts by its share, see ClassIndex.shares.
     unlabelled : float
         Number of the objects that were matched by class alone.
     unexplained : float
@@ -189,8 +190,9 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                                            landmarks[compared])
     return np.column_stack([
         [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks), likenesses,
-        landmark_map.classes.have(landmarks, classes[detections]), ~compared])
+        _misfits(frame.scene, map_from_camera, detections, landmarks,
+                 landmark_map.position_sigmas[landmarks]), likenesses,
+        landmark_map.classes.shares(landmarks, classes[detections]), ~compared])
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
@@ -268,11 +270,16 @@ def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[n
 
 
 def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
-             landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    outlines = project_ellipsoids(invert_transform(map_from_camera), scene.centers[landmarks],
+             landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    camera_from_map = invert_transform(map_from_camera)
+    outlines = project_ellipsoids(camera_from_map, scene.centers[landmarks],
                                   scene.shapes[landmarks])
     boxes, halves = scene.box_ellipses[detections], np.sqrt(outlines[:, [2, 4]])
-    deviations = (_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1])[:, None]
+    depths = scene.centers[landmarks] @ camera_from_map[2, :3] + camera_from_map[2, 3]
+    # the calibration's maps are no worse than the default
+    more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
+    deviations = np.hypot(_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1],
+                          more)[:, None]
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))

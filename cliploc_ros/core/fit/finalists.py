@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import (
-    REFINED_MOST,
     box_scatter,
-    odometry_covariance,
+    odometry_deviations,
     pose_covariance,
+)
+from cliploc_ros.core.fit.refined_covariance import (
+    POSE_UNKNOWN,
+    PoseCovariance,
     refined_covariance,
-    vertical_information,
 )
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig
@@ -198,13 +200,8 @@ def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> i
 
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
-                  matches: Sequence[Sequence[Match]]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose: of its refinement, or of its minimal sample.
-
-    Frames share some errors, and shared errors do not average out. Boxes of one object share the
-    error of its shape in the map: together they count as one view of it. Verticals share the
-    error of the sensor and its mount: together they count as one vertical. The error of odometry
-    is added.
+                  matches: Sequence[Sequence[Match]]) -> PoseCovariance:
+    """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
     ----------
@@ -215,24 +212,21 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
     matches : sequence of sequence of Match
         Inliers of the pose in each frame.
     """
+    if pose.information is not None:
+        if not pose.information.any():
+            return POSE_UNKNOWN
+        stamps_ns = np.array([frame.observation.stamp_ns for frame in frames])
+        return refined_covariance(rig, pose.rotation, pose.translation, stamps_ns)
     cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
-    counts = np.array([len(found) for found in matches], dtype=np.float64)
-    scatter, views = _scatter(frames, cameras, pose, matches)
-    if pose.information is None:
-        own = np.arange(len(frames)) == pose.frame
-        return _sample_covariance(frames, cameras, pose, scatter) + odometry_covariance(
-            cameras, own.astype(np.float64))
-    information = pose.information / views
-    known = int((rig.verticals[:, 6] > 0.0).sum())
-    if known > 0 and information.any():  # without enough boxes there is no information at all
-        verticals = vertical_information(cameras[:, :3, :3] @ pose.rotation, rig.verticals)
-        information += (1.0 / known - 1.0 / views) * verticals
-    return refined_covariance(information, scatter) + odometry_covariance(cameras, counts)
+    covariance = (_sample_covariance(frames, cameras, pose,
+                                     _scatter(frames, cameras, pose, matches))
+                  + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
+    return PoseCovariance(covariance, covariance)
 
 
 def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,
-             matches: Sequence[Sequence[Match]]) -> tuple[float, float]:
-    """Return the scatter of the inliers' boxes, and the mean number of views of an object."""
+             matches: Sequence[Sequence[Match]]) -> float:
+    """Return the scatter of the inliers' boxes."""
     reference_from_map = make_transform(pose.rotation, pose.translation)
     outlines, boxes = [], []
     for frame, camera, found in zip(frames, cameras, matches, strict=True):
@@ -243,8 +237,7 @@ def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose
         boxes.append(frame.scene.box_ellipses[[match.detection for match in found]])
     seen = [row for found in matches for row in {match.landmark for match in found}]
     views = max(1.0, len(seen) / max(1, len(set(seen))))
-    most = inf if pose.information is None else REFINED_MOST
-    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views, most), views
+    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views)
 
 
 def _sample_covariance(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
