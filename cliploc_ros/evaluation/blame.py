@@ -117,8 +117,7 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
 
 
 def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float64],
-             sigmas: NDArray[np.float64]
-             ) -> tuple[NDArray[np.float64], list[tuple[Match, ...]]]:
+             sigmas: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[tuple[Match, ...]]]:
     """Return a pose (4, 4) of the last frame after refinement, and what it explains in each."""
     rig = make_rig([one.scene for one in frames],
                    cameras_from_last([one.observation for one in frames]),
