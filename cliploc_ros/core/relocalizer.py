@@ -14,6 +14,7 @@ from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import (
     RIGHT_M,
     ComparedFrame,
+    Setting,
     Support,
     agreeing_poses,
     confidences,
@@ -164,7 +165,8 @@ class Relocalizer:
                                                   'camera to more objects')
         compared = self._compare(frames, rig, cameras, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
-        likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
+        likely = confidences(compared.supports, poses, self._setting(rig),
+                             handicaps=compared.handicaps)
         covariance = covariance_of(frames, rig, best, matches)
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
@@ -176,10 +178,16 @@ class Relocalizer:
         return Relocalization(
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 likely * evidence.certainty, compared.supports)),
+                                 likely * evidence.certainty, compared.supports,
+                                 compared.handicaps.tolist())),
             matches=matches[-1], evidence=evidence, covariance=covariance.whole + nearby,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+
+    def _setting(self, rig: Rig) -> Setting:
+        known = rig.verticals[:, 6].any()
+        return Setting(len(self._map),
+                       self._options.vertical_deviation_deg if known else math.inf)
 
     def _finalists(self, frames: Sequence[SearchedFrame], rig: Rig, deadline: float
                    ) -> tuple[list[Finalist], NDArray[np.bool_]]:
