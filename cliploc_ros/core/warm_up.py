@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.box_edges import jacobian_of, residuals_of
+from cliploc_ros.core.fit.refinement import one_to_one, refine_rig
 from cliploc_ros.core.fit.rig import make_rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
@@ -48,7 +49,11 @@ def call_every_kernel() -> None:
     rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(len(centers)))
     scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
     choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
-    verify_rig(rig, np.eye(3), np.zeros(3))
+    found = verify_rig(rig, np.eye(3), np.zeros(3))
+    inliers = one_to_one(rig, found, np.eye(3), np.zeros(3)).pairs
+    residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3),
+                 np.empty(4 * len(inliers) + 3))
+    jacobian_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3))
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
     are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
