@@ -87,7 +87,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
             found = session.localize(next(stages), more=stages)
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
-                replace(found.evidence, looks=1, agreeing=1), options))
+                replace(found.evidence, earlier=()), options))
             errors_m.append(np.inf if found.map_from_camera is None else
                             pose_error(found.map_from_camera, query.map_from_camera)[0])
         yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))

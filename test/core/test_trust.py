@@ -208,9 +208,11 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.999, meetings=4), {'algorithm': 'ransac'}, ''),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'bf'}, ''),
-    (Evidence(5, 0.995, looks=7, agreeing=1), {}, '1 of the last 7 frames lead to this pose'),
-    (Evidence(5, 0.995, looks=4, agreeing=2), {}, '2 of the last 4 frames lead to this pose'),
-    (Evidence(5, 0.995, looks=3, agreeing=2), {}, ''),
+    (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
+     'mean confidence 0.14 < 0.5 of the last 7 frames in this pose'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, ''),
+    (Evidence(5, 0.3), {'min_confidence': 0.2}, ''),
 ])
 def test_refusal_names_its_reason(evidence, options, reason):
     answer = refusal(evidence, RelocalizerOptions(**options))

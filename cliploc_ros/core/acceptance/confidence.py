@@ -149,13 +149,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     matches : sequence of F sequence of Match
         Inliers in each frame.
     """
-    rows: dict[int, list[NDArray[np.float64]]] = {}
+    rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
     for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):
-        distinct = _each_object_once(found, frame.bboxes_xyxy)
+        distinct = _each_object_once(found, frame.bboxes_xyxy, landmark_map.objects)
         if distinct:
             for match, row in zip(distinct, _contributions(landmark_map, frame, map_from_camera,
                                                            distinct), strict=True):
-                rows.setdefault(match.landmark, []).append(row)
+                rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
     if not rows:
         return Support()
     total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
@@ -247,12 +247,13 @@ def agreeing_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(near & (traces > _AGREEING_TRACE))
 
 
-def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> list[Match]:
-    """Return the best match of each landmark and of each box."""
+def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
+                      objects: NDArray[np.int64]) -> list[Match]:
+    """Return the best match of each landmark's object and of each box."""
     distinct: list[Match] = []
     for match in sorted(matches, key=lambda match: -match.iou):
         boxes = bboxes_xyxy[[other.detection for other in distinct]]
-        if match.landmark in [other.landmark for other in distinct]:
+        if objects[match.landmark] in objects[[other.landmark for other in distinct]]:
             continue
         if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
             continue
