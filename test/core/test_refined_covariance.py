@@ -124,9 +124,8 @@ def test_edges_off_by_the_error_of_the_map_fit_well():
                                            np.ones(len(ROOM))))
     misfits = [Relocalizer(replace(one, centers=shaken), BY_CLASS).relocalize([frame])
                .hypotheses[0].support.misfit
-               for one in (with_sigma(0.001), ROOM, with_sigma(0.08))]
-    # the calibration's maps are those of the default
-    assert misfits[0] == pytest.approx(misfits[1], rel=0.1)
+               for one in (ROOM, with_sigma(DEFAULT_SIGMA_M), with_sigma(0.08))]
+    assert misfits[0] == misfits[1]
     assert misfits[2] < 0.8 * misfits[1]
 
 
