@@ -14,31 +14,33 @@ from cliploc_ros.errors import CliplocError
 EXIT_INTERRUPTED = 130
 
 
-def run_command(command: Callable[[], int]) -> int:
+def run_command(command: Callable[[], int], failure: int = 1) -> int:
     """Run the body of an executable.
 
     Parameters
     ----------
     command : callable
         Returns the exit code.
+    failure : int
+        The exit code after a CliplocError.
 
     Returns
     -------
     int
-        The exit code: 1 after a CliplocError or a missing library, which it prints in one line
-        on stderr, and 130 when interrupted. Other exceptions keep their traceback.
+        The exit code: `failure` after a CliplocError or a missing library, which it prints in one
+        line on stderr, and 130 when interrupted. Other exceptions keep their traceback.
     """
     try:
         return command()
     except CliplocError as error:
         print('error:', ' '.join(str(error).split()), file=sys.stderr)
-        return 1
+        return failure
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('cliploc_ros'):
             raise
         print(f'error: {error.name} is not installed; pip install the extra that this command '
               'needs, see doc/install.md', file=sys.stderr)
-        return 1
+        return failure
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return EXIT_INTERRUPTED

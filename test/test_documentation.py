@@ -5,6 +5,7 @@
 import ast
 import importlib.machinery
 import importlib.util
+import json
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -143,11 +144,42 @@ def test_nav2s_example_is_of_parameters_that_there_are():
 
 
 def test_rviz_shows_what_is_published():
-    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
-    published = {topic.text for topic in policy.findall(
-        './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
     tree = yaml.safe_load((PROJECT / 'config/relocalization.rviz').read_text())
     shown = {display['Name']: display['Topic']['Value']
              for display in tree['Visualization Manager']['Displays'] if 'Topic' in display}
     assert set(shown) == {'Landmarks', 'Matches', 'Hypotheses', 'Accepted pose', 'Debug image'}
-    assert set(shown.values()) <= published
+    assert set(shown.values()) <= published_topics()
+
+
+def published_topics():
+    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
+    return {topic.text for topic in policy.findall(
+        './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
+
+
+def test_foxglove_shows_what_is_published_and_calls_what_is_served():
+    tree = json.loads((PROJECT / 'config/foxglove.json').read_text())
+    panels = tree['configById']
+    assert set(panels['3D!map']['topics']) == {
+        '/initialpose', *(f'/relocalizer/{topic}' for topic in (
+            'landmarks', 'matches', 'hypotheses', 'pose'))}
+    shown = {*panels['3D!map']['topics'], panels['Image!debug']['imageMode']['imageTopic'],
+             panels['DiagnosticStatusPanel!relocalizer']['topicToRender']}
+    assert shown <= published_topics()
+    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
+    served = {service.text for service in policy.findall('.//services[@reply="ALLOW"]/service')}
+    called = {panel['serviceName'] for name, panel in panels.items() if 'CallService' in name}
+    assert called <= served
+
+    def names(node):
+        return {node} if isinstance(node, str) else names(node['first']) | names(node['second'])
+    assert names(tree['layout']) == set(panels)
+
+
+def test_robot_localization_reads_what_is_published():
+    tree = yaml.safe_load((PROJECT / 'config/robot_localization.yaml').read_text())
+    values = tree['ekf_filter_node_map']['ros__parameters']
+    assert f'/{values["pose0"]}' in published_topics()
+    assert [len(values[name]) for name in ('odom0_config', 'pose0_config')] == [15, 15]
+    rows = {row.name: row.default for row in RELOCALIZER}
+    assert (values['odom_frame'], rows['publish_tf']) == (rows['odom_frame'], False)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from cliploc_ros.cli.wake_up import make_parser
 from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
@@ -32,11 +33,21 @@ def relocalization_launch() -> list[ast.stmt]:
     return ast.parse((LAUNCH / 'relocalization.launch.py').read_text()).body
 
 
+def literals(statements: list[ast.stmt]) -> dict:
+    """Return the values that are assigned to names, where these are literals."""
+    return {statement.targets[0].id: ast.literal_eval(statement.value)
+            for statement in statements if isinstance(statement, ast.Assign)}
+
+
 @pytest.fixture
 def constants():
-    """The values that the launch file assigns to names, where these are literals."""
-    return {statement.targets[0].id: ast.literal_eval(statement.value)
-            for statement in relocalization_launch() if isinstance(statement, ast.Assign)}
+    return literals(relocalization_launch())
+
+
+@pytest.fixture
+def of_wake_up():
+    """The arguments of the launch file that wakes up: their defaults and descriptions."""
+    return literals(ast.parse((LAUNCH / 'wake_up.launch.py').read_text()).body)['ARGUMENTS']
 
 
 @pytest.fixture
@@ -68,18 +79,29 @@ def test_every_topic_and_service_can_be_remapped(constants):
     assert set(constants['NAMES']) | {'image/compressed'} == relative
 
 
-def test_no_argument_is_taken_for_one_of_nav2(arguments):
+def test_no_argument_is_taken_for_one_of_nav2(arguments, of_wake_up):
     """An argument of a launch file that was included before would set ours."""
     assert arguments & OF_NAV2 == SHARED_WITH_NAV2
+    assert of_wake_up.keys() & OF_NAV2 <= SHARED_WITH_NAV2
 
 
-def test_the_documents_give_arguments_that_exist(arguments):
+def test_a_wake_up_is_launched_with_its_own_options(of_wake_up):
+    text = (LAUNCH / 'wake_up.launch.py').read_text()
+    options = make_parser().parse_args([])
+    assert set(re.findall(r"'--([a-z-]+)', LaunchConfiguration", text)) - {'log-level'} == {
+        name.replace('_', '-') for name in vars(options)}
+    assert of_wake_up['relocalizer'][0] == options.relocalizer
+    assert float(of_wake_up['wake_up_timeout'][0]) == options.timeout
+    assert float(of_wake_up['wake_up_turn_deg'][0]) == options.turn_deg
+
+
+def test_the_documents_give_arguments_that_exist(arguments, of_wake_up):
     given = set()
     for path in DOCUMENTS:
         # node arguments are written `-p name:=value` and `-r name:=name`
         given |= set(re.findall(r'(?<!-[pr] )\b([a-z]\w*):=', path.read_text()))
     assert len(given) > 10
-    assert given <= arguments
+    assert given <= arguments | of_wake_up.keys()
 
 
 def test_a_missing_parameter_file_is_refused(tmp_path):
@@ -128,7 +150,7 @@ def made(name: str, **given: str) -> list:
 
 @pytest.mark.needs('launch_ros')
 @pytest.mark.parametrize(('name', 'nodes'), [
-    ('relocalization.launch.py', 2), ('demo.launch.py', 0)])
+    ('relocalization.launch.py', 2), ('demo.launch.py', 0), ('wake_up.launch.py', 0)])
 def test_descriptions_are_made(name, nodes):
     assert len(made(name)) == nodes
 

@@ -22,7 +22,7 @@ SOURCES = [*MODULES, PROJECT / 'setup.py', *sorted((PROJECT / 'demo_world').rglo
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
 EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',
-               'relocalizer', 'replay', 'studio', 'tum_to_bag']
+               'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
 
 # As vision_msgs 4.1.1 of Jazzy has them, in this order.
 VISION_MSGS_FIELDS = {

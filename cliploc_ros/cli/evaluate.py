@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,9 +19,14 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.observation import Observation
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
+    from cliploc_ros.evaluation.cases import Observe
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -33,6 +39,8 @@ examples:
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
+  evaluate --bag case_20260101T120000.000_refused --map office.yaml
+      answers a request again that ~/record stored; exit code 1: another verdict
 """
 
 
@@ -144,6 +152,8 @@ def evaluate(options: argparse.Namespace) -> int:
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     landmark_map = LandmarkMap.from_file(options.map)
+    if options.bag is not None and _is_case(options):
+        return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
         random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
@@ -167,6 +177,50 @@ def evaluate(options: argparse.Namespace) -> int:
     evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
                        figures=options.figures, frames=recorded.frames)
     return 0
+
+
+def _is_case(options: argparse.Namespace) -> bool:
+    """Return whether --bag is a recorded request, without ground truth."""
+    from cliploc_ros.datasets.bag_reader import BagReader
+    from cliploc_ros.datasets.cases import is_case
+
+    with BagReader(options.bag) as reader:
+        return options.ground_truth not in reader.topics and is_case(options.bag)
+
+
+def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
+    """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
+    from cliploc_ros.datasets.cases import read_case
+    from cliploc_ros.evaluation.cases import options_of, replay_case
+
+    case = read_case(options.bag)
+    observe = _with_clip(options, landmark_map) if options_of(case).needs_similarities \
+        else _without_clip
+    replayed = replay_case(case, landmark_map, observe)
+    print(f'{options.bag}: {len(case.frames)} frames, map {case.report.get("map_hash")}\n'
+          f'recorded: {case.report.get("message")}\n'
+          f'again:    {"accepted" if replayed.again else f"refused: {replayed.reason_again}"}\n'
+          f'{"the same verdict" if replayed.is_same else "another verdict"}', flush=True)
+    return 0 if replayed.is_same else 1
+
+
+def _with_clip(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Observe':
+    """Return what compares the crops of a frame with the map."""
+    from cliploc_ros.models.map_rows import load_encoder_for_map
+    from cliploc_ros.models.observer import Observer
+
+    observer = Observer(*load_encoder_for_map(
+        clip_options(options), landmark_map, str(options.map), options.landmark_embeddings))
+
+    def observe(image: 'NDArray[np.uint8]', seen: 'Observation') -> 'Observation':
+        similarities = observer.observe(image, seen.camera, seen.detections,
+                                        seen.stamp_ns).similarities
+        return replace(seen, similarities=similarities)
+    return observe
+
+
+def _without_clip(image: 'NDArray[np.uint8]', seen: 'Observation') -> 'Observation':
+    return seen
 
 
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':

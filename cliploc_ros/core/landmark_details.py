@@ -62,6 +62,12 @@ class LandmarkDetails:
         least = LEAST_CLASS_SHARE * sum(weights.values())
         return tuple(name for name, weight in weights.items() if weight >= least)
 
+    def class_shares(self) -> tuple[tuple[str, float], ...]:
+        """Return the likely classes, each with its weight over the greatest one."""
+        weights = dict(self.class_weights or ())
+        most = max(weights.values(), default=1.0)
+        return tuple((name, weights[name] / most) for name in self.likely_classes())
+
 
 OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))
 _NUMBERS = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')

@@ -28,6 +28,10 @@ from cliploc_ros.core.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
+#: Standard deviation of a centre on each axis [m] where the map has no position_sigma: a guess for
+#: maps made by hand. Landmarks of build_map have .006 (median, TUM fr3), simulated ones .005 to
+#: .04. On the TUM map, which has none, 0 to .03 localize equally well.
+DEFAULT_SIGMA_M = 0.02
 _MAX_TEXT_LENGTH = 1000
 # Squares and fourth powers of lengths in this range neither underflow nor overflow.
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
@@ -85,12 +89,18 @@ class LandmarkMap:
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
         _ = self.shapes, self.classes, self.sorted_landmarks, self.tree, self.pairs
-        _ = self.objects
+        _ = self.objects, self.position_sigmas
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
         """Return the shape matrices (L, 6), see cliploc_ros.core.geometry.ellipsoid."""
         return shape_matrices(self.semi_axes, self.quats_xyzw)
+
+    @cached_property
+    def position_sigmas(self) -> NDArray[np.float64]:
+        """Return the standard deviation of each centre on each axis (L,) [m]."""
+        given = [one.position_sigma for one in self.details] or [None] * len(self)
+        return np.array([DEFAULT_SIGMA_M if one is None else one for one in given])
 
     @property
     def weighted_labels(self) -> tuple[WeightedLabels, ...]:
@@ -105,7 +115,9 @@ class LandmarkMap:
         """Return the landmarks by class: by their own, and by others that they are taken for."""
         others = [(row, name) for row, one in enumerate(self.details)
                   for name in one.likely_classes() if name != self.class_ids[row]]
-        return ClassIndex.of(self.class_ids, others)
+        weights = {(row, name): share for row, one in enumerate(self.details)
+                   for name, share in one.class_shares()}
+        return ClassIndex.of(self.class_ids, others, weights)
 
     @cached_property
     def sorted_landmarks(self) -> SortedLandmarks:

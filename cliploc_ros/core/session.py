@@ -20,6 +20,7 @@ from cliploc_ros.core.on_demand import localize_on_demand
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.succession import Known, succeed
 from cliploc_ros.units import NS_PER_S
 
 # A camera that moved less sees the same again: its new frame replaces the one before.
@@ -49,6 +50,7 @@ class Session:
         self._relocalizer = relocalizer
         self._frames: list[KeptFrame] = []
         self._looks = Looks()
+        self._known: Known | None = None
         self._run = -1
         self._stamp_ns = 0
         #: The newest frame that was localized, with the crops that it took.
@@ -86,7 +88,7 @@ class Session:
             self.observation = alone.observation
             return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
-            self._frames, self._looks = [], Looks()
+            self._frames, self._looks, self._known = [], Looks(), None
         self._run, self._stamp_ns = run, observation.stamp_ns
         earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
         newest, found = localize_on_demand(
@@ -97,6 +99,20 @@ class Session:
             self._looks = self._looks.with_look(observation, found.map_from_camera,
                                                 found.confidence)
         return found
+
+    def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:
+        """Return the covariance of the newest, accepted result for a filter that fuses all.
+
+        To be called once for each result that such a filter gets, see
+        cliploc_ros.core.succession. Without odometry it is that of the result.
+        """
+        assert self.observation is not None
+        odom_from_camera = self.observation.odom_from_camera
+        if odom_from_camera is None or found.covariance is None or found.map_from_camera is None:
+            return found.covariance
+        given, self._known = succeed(self._known, odom_from_camera, found.map_from_camera,
+                                     found.covariance)
+        return given
 
 
 def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit: int,

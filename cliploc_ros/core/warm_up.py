@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.index.pairs import find_repeats, make_pairs
 from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import Leaders, same_place
+from cliploc_ros.core.search.leaders import Leaders, are_near, same_place
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.strategies import (
@@ -45,12 +45,13 @@ def call_every_kernel() -> None:
     list(search_exhaustively(scene, Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
-    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(len(centers)))
     scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
     choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
     verify_rig(rig, np.eye(3), np.zeros(3))
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
     project_ellipsoids(np.eye(4), centers, shapes)
     classes = np.zeros(3, dtype=np.int64)
     find_repeats(make_pairs(centers, classes, cKDTree(centers)), classes)

@@ -134,7 +134,7 @@ def run(arguments: list[str]) -> int:
     elsewhere, _ = exchange_landmarks(landmark_map, queries, 1.0,
                                       np.random.default_rng(options.seed))
     for place, its_map in (('true map', landmark_map), ('another place', elsewhere)):
-        for least in (0.99, 0.5):
+        for least in (RelocalizerOptions.min_confidence, 0.5):
             name = f'{place}, min_confidence {least:g}'
             robots = retry(its_map, queries, RelocalizerOptions(min_confidence=least),
                            options.seed)

@@ -38,6 +38,8 @@ from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_
 
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
+# Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
+_POSE_ERROR_S = 3.0
 
 class NothingFoundError(MappingError):
     """The boxes show no landmark that is good enough for a map."""
@@ -288,8 +290,36 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
         left_out=describe_left_out(detections, draft.left_out, draft.evidence_against,
                                    draft.reasons),
         notes=tuple(notes))
+    evidence = evidence._replace(position_sigma=np.hypot(
+        evidence.position_sigma, _left_by_poses(views, changes, shown, len(landmarks.centers))))
     return BuiltMap(_make_map(detections, landmarks, shown, evidence, options), report, shown,
                     map_from_cameras(views))
+
+
+def _left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.int64],
+                   count: int) -> NDArray[np.float64]:
+    """Return by how much errors of the poses displace each landmark on each axis (count,) [m].
+
+    Refinement makes poses and landmarks agree. What a landmark's frames have in common stays: the
+    mean of as many independent errors as there are spans of time in which it was seen.
+
+    Parameters
+    ----------
+    views : Views
+    changes : ndarray (F, 6)
+        Squares of what refinement changed; 0 where the poses were taken as they are.
+    shown : ndarray (n,) of int
+        The landmark that each box shows, -1 for none.
+    count : int
+        Number of landmarks.
+    """
+    squares = np.zeros(count)
+    for row, boxes in enumerate(group_boxes(shown, count)):
+        frames = np.unique(views.frames[boxes])
+        spans = len(np.unique(views.stamps_s[frames] // _POSE_ERROR_S))
+        if spans:
+            squares[row] = changes[frames, :3].mean() / spans
+    return np.sqrt(squares)
 
 
 def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[np.int64],

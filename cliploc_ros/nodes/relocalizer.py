@@ -4,6 +4,8 @@
 
 import math
 import re
+import time
+from dataclasses import replace
 from typing import NoReturn
 
 from std_srvs.srv import Empty, Trigger
@@ -11,11 +13,13 @@ from std_srvs.srv import Empty, Trigger
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.case_recorder import CaseRecorder
+from cliploc_ros.ros.counters import RequestCounters
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
-from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.diagnostics import Health, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
@@ -39,16 +43,20 @@ class RelocalizerNode(ManagedNode):
         self._newest = LatestOnly(self.worker, self._localize_and_log)
         self._frames = FrameSource(self, self.settings['image_transport'],
                                    math.inf if continuous else LINGER_S,
-                                   self._newest.offer if continuous else lambda frame: None)
+                                   self._newest.offer if continuous else lambda frame: None,
+                                   self.settings['detections_type'])
         self._handoff = HandOff(self, self._robot.odometry)
         self._requests = Requests(self, self._frames, self._robot, self._jumps,
-                                  self._pipeline.localize, self._handoff)
+                                  self._localize_and_keep, self._handoff)
+        self._cases = CaseRecorder(bool(self.settings['record_folder']))
+        self._counters = RequestCounters()
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
         group = BoundedCallbackGroup(MAX_REQUESTS)
         for service_type, name, callback in (
                 (Trigger, '~/relocalize', self._on_relocalize),
                 (Trigger, '~/reload_map', self._on_reload_map),
+                (Trigger, '~/record', self._on_record),
                 (Empty, 'reinitialize_global_localization', self._on_reinitialize)):
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
                                 callback_group=group)
@@ -87,7 +95,7 @@ class RelocalizerNode(ManagedNode):
 
     def _forget(self) -> None:
         """Forget all input: time jumped."""
-        for part in (self._frames, self._robot, self._pipeline, self._handoff):
+        for part in (self._frames, self._robot, self._pipeline, self._handoff, self._cases):
             part.forget()
 
     def examine(self, health: Health) -> None:
@@ -95,11 +103,22 @@ class RelocalizerNode(ManagedNode):
         self._frames.examine(health, self.settings['stale_after_s'])
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
+                          **self._counters.values(),
                           'map file': self.settings['map_file'],
-                          'base frame': self.settings['base_frame']}
+                          'base frame': self.settings['base_frame'],
+                          'time limit [s]': self.settings['timeout_s'],
+                          'missing': '; '.join(self._missing())}
         if self._pipeline.localizer is not None:
             health.values |= {'map': self._pipeline.localizer.description,
+                              'map hash': self._pipeline.localizer.map_hash,
                               'device': self._pipeline.localizer.device}
+
+    def _missing(self) -> list[str]:
+        """Return what a request needs and does not find, one line each."""
+        missing = self._frames.missing()
+        if self.settings['require_localizer'] and (localizer := self._handoff.missing()):
+            missing.append(localizer)
+        return missing
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()
@@ -114,16 +133,42 @@ class RelocalizerNode(ManagedNode):
     def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Read the map again in the worker, never in the middle of a search."""
         try:
-            response.message = f'loaded: {self.worker.run(self._pipeline.reload_map)}'
+            description = self.worker.run(self._pipeline.reload_map)
+            response.message = f'loaded: {description}; map {self._map_hash}'
             response.success = True
         except CliplocError as error:
             response.message = f'not loaded: {error}'
         self.get_logger().info(f'map {response.message}')
         return response
 
+    def _on_record(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Store the last request; localizing goes on meanwhile."""
+        try:
+            response.message = self._cases.store(self.settings.snapshot())
+            response.success = True
+        except CliplocError as error:
+            response.message = f'not recorded: {error}'
+        self.get_logger().info(f'record: {response.message}')
+        return response
+
+    @property
+    def _map_hash(self) -> str:
+        return '' if self._pipeline.localizer is None else self._pipeline.localizer.map_hash
+
     def _answer(self) -> Answer:
+        began_at = time.monotonic()
         answer = self._requests.answer()
+        if not answer.map_hash:
+            answer = replace(answer, map_hash=self._map_hash)
+        self._counters.add(answer, time.monotonic() - began_at)
+        self._cases.end(answer)
         self._record(answer)
+        return answer
+
+    def _localize_and_keep(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
+        """Localize with a frame of a request, in the worker's thread."""
+        answer = self._pipeline.localize(frame, times, deadline)
+        self._cases.add(frame, answer)
         return answer
 
     def _localize_and_log(self, frame: Frame) -> None:

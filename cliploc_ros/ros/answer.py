@@ -9,6 +9,8 @@ from enum import StrEnum
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
+from cliploc_ros.ros.inputs.robot_state import RobotState
+
 
 class Verdict(StrEnum):
     """What became of a request."""
@@ -36,25 +38,32 @@ class Answer:
         None unless accepted.
     received_at : float
         When the image arrived (monotonic clock) [s]; -inf without one.
-    is_linked : bool
-        Whether odometry links the frame with those before and after it.
+    state : RobotState or None
+        What the robot knew at the stamp of the image; None without an image.
     is_cut : bool
         Whether time was too short for all crops, which could have changed the verdict.
     stages_ms : mapping of str to float
         How long each stage took [ms].
+    map_hash : str
+        Of the map that was searched, see cliploc_ros.ros.map_hash; empty without one.
     """
 
     verdict: Verdict
     detail: str
     pose: PoseWithCovarianceStamped | None = None
     received_at: float = -math.inf
-    is_linked: bool = False
+    state: RobotState | None = None
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)
+    map_hash: str = ''
+
+    @property
+    def is_linked(self) -> bool:
+        """Return whether odometry links the frame with those before and after it."""
+        return self.state is not None and self.state.place is not None
 
     @property
     def message(self) -> str:
-        """Return the verdict and its reason in one line."""
-        if self.verdict is Verdict.FAILED:
-            return self.detail
-        return f'{self.verdict}: {self.detail}'
+        """Return the verdict, its reason and the map in one line."""
+        text = self.detail if self.verdict is Verdict.FAILED else f'{self.verdict}: {self.detail}'
+        return f'{text}; map {self.map_hash}' if self.map_hash else text

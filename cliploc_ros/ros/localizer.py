@@ -33,7 +33,7 @@ from cliploc_ros.ros.conversions import (
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.map_parameters import load_map
+from cliploc_ros.ros.map_hash import load_hashed_map
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
@@ -55,12 +55,16 @@ class Localized(NamedTuple):
         Number of crops that were compared with labels.
     is_cut : bool
         Whether there was no time for the other crops, which could have helped.
+    for_filter : ndarray (6, 6) or None
+        Covariance for a filter that fuses all accepted poses: in continuous mode, that of what is
+        new, see cliploc_ros.core.succession.
     """
 
     found: Relocalization
     seen: SeenImage
     compared: int
     is_cut: bool
+    for_filter: NDArray[np.float64] | None
 
 
 class Localizer:
@@ -75,11 +79,15 @@ class Localizer:
     options : RelocalizerOptions
     device : str
         Where the observer's network runs.
+    map_hash : str
+        See cliploc_ros.ros.map_hash.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
-                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str) -> None:
+                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
+                 map_hash: str) -> None:
         self.device = device
+        self.map_hash = map_hash
         self._map = landmark_map
         self._observer = observer
         self._options = options
@@ -111,7 +119,7 @@ class Localizer:
             Names what to fix in the map; this localizer stays as it was.
         """
         options = relocalizer_options(values)
-        landmark_map = load_map(node, values['map_file'])
+        landmark_map, map_hash = load_hashed_map(node, values['map_file'])
         relocalizer = Relocalizer(landmark_map, options)
         observer = self._observer
         if observer is not None:
@@ -119,7 +127,8 @@ class Localizer:
             observer = observer.with_labels(embed_map(
                 _clip_options(values), landmark_map, values['map_file'],
                 values['landmark_embeddings']))
-        return Localizer(landmark_map, observer, relocalizer, options, self.device)
+        return Localizer(landmark_map, observer, relocalizer, options, self.device,
+                         map_hash)
 
     def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -167,7 +176,9 @@ class Localizer:
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
-        return Localized(found, SeenImage(image, seen), compared, is_cut)
+        for_filter = session.covariance_for_filter(found) \
+            if found.accepted and values['mode'] == 'continuous' else found.covariance
+        return Localized(found, SeenImage(image, seen), compared, is_cut, for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float
@@ -221,7 +232,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     if values['cache_dir']:
         KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
     options = relocalizer_options(values)
-    landmark_map = load_map(node, values['map_file'])
+    landmark_map, map_hash = load_hashed_map(node, values['map_file'])
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
@@ -231,7 +242,7 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
             values['landmark_embeddings'])
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
-    return Localizer(landmark_map, observer, relocalizer, options, device)
+    return Localizer(landmark_map, observer, relocalizer, options, device, map_hash)
 
 
 def _clip_options(values: Mapping[str, Any]) -> ClipOptions:

@@ -17,6 +17,7 @@ from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
+from cliploc_ros.ros.inputs.detection_types import DETECTION_TYPES
 from cliploc_ros.ros.inputs.vertical import SOURCES
 from cliploc_ros.ros.node.parameters import ParameterRow, Value
 
@@ -105,12 +106,15 @@ RELOCALIZER = (
                  'not.'),
     ParameterRow('min_inliers', 3, 'Refuse a pose with fewer inliers.', low=3,
                  high=1000),
-    ParameterRow('min_confidence', 0.99, 'Refuse a pose that is less likely to be within 1 m of '
+    ParameterRow('min_confidence', 0.97, 'Refuse a pose that is less likely to be within 1 m of '
                  'the truth.', low=0.0, high=1.0),
     ParameterRow('fuse_frames', 5, 'Localize with up to this many frames together where odom '
                  'links them; 1: each frame alone.', low=1, high=MAX_FRAMES),
     ParameterRow('fuse_window_s', 5.0, 'Drop frames older than this from fusion.', unit='s',
                  low=0.1, high=60.0),
+    ParameterRow('detections_type', 'vision_msgs', 'Package of the type of detections: '
+                 'vision_msgs/Detection2DArray or yolo_msgs/DetectionArray (yolo_ros).',
+                 choices=DETECTION_TYPES, read_only=True),
     ParameterRow('class_map', '', "The map's names for another detector's classes, such as "
                  "'tvmonitor=tv, pottedplant=potted plant'."),
     ParameterRow('crops', 'on_demand', 'Crops that CLIP sees: all, or on demand: the most '
@@ -136,6 +140,10 @@ RELOCALIZER = (
     _IMAGE_TRANSPORT,
     _AUTOSTART,
     _STALE_AFTER,
+    ParameterRow('record_folder', '', 'Folder where ~/record stores the last request; empty: keep '
+                 'no frames.', read_only=True),
+    ParameterRow('record_limit_mb', 1000, 'Record nothing more once that folder holds this much.',
+                 unit='MiB', low=1, high=1_000_000),
     ParameterRow('rectified', False, 'The image is rectified: use P of camera_info and no '
                  'distortion.'),
     ParameterRow('base_frame', '', 'Coordinate frame to publish the pose of; empty: the camera.'),

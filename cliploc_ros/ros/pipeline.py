@@ -112,7 +112,7 @@ class Pipeline:
         header = Header(stamp=image.stamp, frame_id=localizer.map_frame)
         answer = replace(
             self._answer(header, localized, state, frame.received_at, in_words(stages_ms)),
-            is_cut=localized.is_cut, stages_ms=stages_ms)
+            is_cut=localized.is_cut, stages_ms=stages_ms, map_hash=localizer.map_hash)
         self._show(image, header, localizer, localized, state, answer)
         return answer
 
@@ -124,16 +124,17 @@ class Pipeline:
     def _answer(self, header: Header, localized: Localized, state: RobotState,
                 received_at: float, times: str) -> Answer:
         """Publish an accepted pose; return the verdict in words."""
-        found, is_linked = localized.found, state.place is not None
+        found = localized.found
         summary = f'[{_summary(localized)}; {times}]'
         if not found.accepted:
-            return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at,
-                          is_linked)
+            return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at, state)
         assert found.covariance is not None and found.map_from_camera is not None
+        assert localized.for_filter is not None
         map_from_base = found.map_from_camera @ state.camera_from_base
-        pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
-            found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
-        self._pose.publish(pose)
+        lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
+        pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
+            covariance, lever)) for covariance in (found.covariance, localized.for_filter))
+        self._pose.publish(for_filter)
         try:
             self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
                                      received_at)
@@ -142,7 +143,7 @@ class Pipeline:
                                             throttle_duration_sec=_LOG_PERIOD_S)
         x, y, z = map_from_base[:3, 3]
         return Answer(Verdict.ACCEPTED, f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
-                                        f'{summary}', pose, received_at, is_linked)
+                                        f'{summary}', pose, received_at, state)
 
     def _show(self, image: Header, header: Header, localizer: Localizer, localized: Localized,
               state: RobotState, answer: Answer) -> None:

@@ -93,5 +93,6 @@ def pair_iou(scene: Scene, detection: int, outline: NDArray[np.float64]) -> floa
 def verify(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
            ) -> Verified:
     """Return what a pose explains in one frame, by the kernel: a rig of one."""
-    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None])
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None],
+                   np.zeros(len(scene.centers)))
     return verify_rig(rig, rotation, translation)

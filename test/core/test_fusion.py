@@ -69,7 +69,7 @@ def rig_of(room, poses, verticals=None, **noise):
     if verticals is None:
         verticals = np.tile(VERTICAL_UNKNOWN, (len(poses), 1))
     return make_rig([see(room, pose, **noise) for pose in poses], camera_from_reference,
-                    verticals)
+                    verticals, np.zeros(len(room)))
 
 
 def split(map_from_camera):
@@ -114,7 +114,8 @@ def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
                                   RelocalizerOptions(matching='class'))[0])
     assert [len(scene.groups.starts) - 1 for scene in scenes] == [3, 0, 1, 1]
     cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
-    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
+    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)),
+                   many.position_sigmas)
     place = 3
     reference = walk[-1].copy()
     reference[0, 3] += 30.0 * place
@@ -128,7 +129,8 @@ def test_frames_that_saw_nothing_take_no_part(room, walk):
     relative = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
     scenes = [see(room, walk[0]), see(room, walk[1], rows=slice(0, 0)),
               see(room, walk[2], rows=slice(2, 3)), see(room, walk[3], rows=slice(0, 0))]
-    rig = make_rig(scenes, relative, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)))
+    rig = make_rig(scenes, relative, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)),
+                   np.zeros(len(room)))
     perfect = verify_rig(rig, *split(walk[-1]))
     np.testing.assert_array_equal(perfect.landmarks, [*range(len(room)), 2])
     refined = refine_rig(rig, *split(walk[-1]))
@@ -142,7 +144,7 @@ def test_the_gradient_is_that_of_differences(room, walk, rng):
     verticals = np.array([[*(invert_transform(pose)[:3, :3] @ up), *up, 0.02] for pose in walk])
     rig = rig_of(room, walk, verticals, noise_px=3.0, rng=rng)
     rotation, translation = split(shaken(walk[-1], rng, 0.1, 2.0))
-    inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
+    inliers = one_to_one(rig, verify_rig(rig, rotation, translation), rotation, translation)
     assert inliers.starts[-1] == len(inliers.pairs) > 2 * len(room)
 
     def residuals_at(pose):

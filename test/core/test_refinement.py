@@ -32,7 +32,8 @@ def see(room, noise_px=0.0, rng=None):
 
 def refine(scene, rotation, translation, vertical):
     """One frame alone is a rig of one."""
-    return refine_rig(make_rig([scene], np.eye(4)[None], vertical[None]), rotation, translation)
+    rig = make_rig([scene], np.eye(4)[None], vertical[None], np.zeros(len(scene.centers)))
+    return refine_rig(rig, rotation, translation)
 
 
 def shaken(rng, metres, degrees):
@@ -122,7 +123,8 @@ def test_nothing_to_go_by_changes_nothing(room):
 
 def test_derivatives_are_those_of_differences(room, rng):
     scene = see(room)
-    pairs = np.concatenate([scene.box_ellipses, room.centers, room.shapes], axis=1)
+    pairs = np.concatenate([scene.box_ellipses, room.centers, room.shapes,
+                            np.full((len(room), 1), 0.02)], axis=1)
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]

@@ -253,3 +253,17 @@ def test_a_look_without_odometry_stands_alone(camera):
     unlinked = replace(frame(1.0), odom_from_camera=None)
     assert camera.looks.confidences_in(unlinked, pose()) == ()
     assert len(camera.looks.with_look(unlinked, pose(), 1.0)) == 1
+
+
+def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
+    session = Session(RELOCALIZER)
+    deviations = []
+    for seconds, run in ((0, 0), (1, 0), (2, 1)):
+        found = session.localize(frame(seconds), run, 5, 5.0)
+        assert found.accepted
+        given = session.covariance_for_filter(found)
+        deviations.append(np.sqrt(np.diag(given) / np.diag(found.covariance)).min())
+    assert deviations[0] == deviations[2] == 1.0
+    assert deviations[1] > 10.0
+    alone = session.localize(replace(frame(3), odom_from_camera=None))
+    np.testing.assert_array_equal(session.covariance_for_filter(alone), alone.covariance)

@@ -10,10 +10,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.fit.covariance import odometry_covariance, vertical_information
-from cliploc_ros.core.fit.refinement import linearize_rig, one_to_one, residuals_of_rig
-from cliploc_ros.core.fit.rig import make_rig
-from cliploc_ros.core.fit.verification import verify_rig
+from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -24,7 +21,6 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import make_queries
@@ -151,28 +147,9 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
         knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
         for shares in (at_once, one_by_one))
     print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
-    assert four == pytest.approx(one, rel=1e-3)
-
-
-def test_the_information_of_verticals_is_that_of_the_refinement(room, walk):
-    verticals = np.array([[*(pose[:3, :3].T @ UP), *UP, 0.02] for pose in walk])
-    verticals[1, :3] = Rotation.from_rotvec([0.03, 0.02, 0.0]).apply(verticals[1, :3])
-    verticals[2] = VERTICAL_UNKNOWN
-    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
-    scenes = [Relocalizer(room, OPTIONS).search(see(room, pose)).scene for pose in walk]
-    informations = []
-    for known in (verticals, np.zeros_like(verticals)):
-        rig = make_rig(scenes, cameras, known)
-        pose = invert_transform(walk[-1])
-        rotation, translation = pose[:3, :3].copy(), pose[:3, 3].copy()
-        inliers = one_to_one(rig, verify_rig(rig, rotation, translation))
-        in_front, residuals = residuals_of_rig(inliers, rotation, translation)
-        assert in_front
-        information, _ = linearize_rig(inliers, rotation, translation, residuals)
-        informations.append(information)
-    rotations = cameras[:, :3, :3] @ invert_transform(walk[-1])[:3, :3]
-    np.testing.assert_allclose(vertical_information(rotations, verticals),
-                               informations[0] - informations[1], atol=1e-6)
+    # refinement trusts four verticals more than one, and the boxes less
+    assert four == pytest.approx(one, rel=0.06)
+    assert four >= one
 
 
 def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
@@ -186,17 +163,12 @@ def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
     assert spreads[0] < spreads[1] < spreads[2]
 
 
-def test_the_covariance_of_odometry():
-    """Two frames of equal weight: half of the deviation of the one that is displaced."""
-    cameras = np.tile(np.eye(4), (2, 1, 1))
-    assert not odometry_covariance(cameras, np.array([3.0, 3.0])).any(), 'did not move'
-    cameras[0] = make_transform(Rotation.from_euler('z', 10, degrees=True).as_matrix(),
-                                np.array([0.5, 0.0, 0.0]))
-    added = np.sqrt(np.diag(odometry_covariance(cameras, np.array([3.0, 3.0]))))
-    assert added[:3] == pytest.approx(0.5 * (0.005 + 0.03 * 0.5))
-    assert added[3:] == pytest.approx(0.5 * np.radians(0.25 + 0.03 * 10.0))
-    assert not odometry_covariance(cameras, np.array([0.0, 3.0])).any(), 'explains nothing'
-    assert not odometry_covariance(cameras, np.zeros(2)).any()
+def test_the_deviations_of_odometry():
+    assert not odometry_deviations(np.eye(4)).any(), 'did not move'
+    deviations = odometry_deviations(make_transform(
+        Rotation.from_euler('z', 10, degrees=True).as_matrix(), np.array([0.5, 0.0, 0.0])))
+    assert deviations[:3] == pytest.approx(0.005 + 0.03 * 0.5)
+    assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0))
 
 
 def test_two_rooms_alike_are_ambiguous_in_any_number_of_frames(room, walk):

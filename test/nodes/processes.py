@@ -20,7 +20,8 @@ PROJECT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 60.0
 # These imports take most of a start: two seconds, nine with PyTorch.
 _IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
-            'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer']
+            'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer',
+            'cliploc_ros.ros.wake_up.waking']
 
 
 @cache
@@ -124,11 +125,15 @@ class Process:
         fields = self._proc('stat').read_text().rsplit(')', 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
+    def send(self, number):
+        """Send a signal."""
+        os.kill(self._process.pid, number)
+
     def stop(self, signal_number=signal.SIGINT):
         """Signal the process; return its exit code and the time until it ended [s]."""
         start = time.monotonic()
         if self.alive:
-            os.kill(self._process.pid, signal_number)
+            self.send(signal_number)
         try:
             code = self._process.wait(20)
         except subprocess.TimeoutExpired:

@@ -13,8 +13,10 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 from tester import RELIABLE, make_frame, transform_of
 
+from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -26,6 +28,7 @@ from cliploc_ros.core.geometry.transforms import (
     transform_from_pose,
 )
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.cases import read_case
 from cliploc_ros.ros.conversions import pose_to_msg
 
 ROOM = make_room()
@@ -141,6 +144,19 @@ def test_a_request_that_goes_on_ends_with_the_node(own_relocalizer, tester, robo
     code, seconds = process.stop()
     assert code == 0 and seconds < 2.0, process.output()
     assert 'Traceback' not in process.output()
+
+
+def test_a_recorded_turn_replays_with_its_odometry(own_relocalizer, tester, robot, room_map,
+                                                   tmp_path):
+    own_relocalizer(record_folder=tmp_path, **PARAMETERS)
+    assert robot.ask(turn_deg_s=20.0).success
+    assert tester.call(Trigger, '/relocalizer/record', Trigger.Request()).success
+    (case,) = tmp_path.glob('case_*')
+    frames = read_case(case).frames
+    assert len(frames) > 1
+    assert all(frame.odom_from_camera is not None for frame in frames)
+    # no view alone is enough: only with odometry is the verdict the same
+    assert evaluate(['--bag', str(case), '--map', str(room_map)]) == 0
 
 
 def test_no_view_alone_is_enough(looking, tester):

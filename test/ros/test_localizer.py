@@ -57,9 +57,10 @@ def timer():
 
 def test_a_perfect_view_gives_the_true_pose(localizer, values):
     times = timer()
-    found, view, compared, is_cut = localizer.localize(make_frame(), values,
-                                                       RobotState(np.eye(4)), times)
+    found, view, compared, is_cut, for_filter = localizer.localize(
+        make_frame(), values, RobotState(np.eye(4)), times)
     assert (compared, is_cut) == (0, False)
+    np.testing.assert_array_equal(for_filter, found.covariance)
     assert view.image_rgb.shape == (CAMERA.height, CAMERA.width, 3)
     distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
     assert found.accepted and distance_m < 0.05 and angle_deg < 1.0

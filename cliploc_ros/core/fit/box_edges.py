@@ -3,9 +3,10 @@
 """The residuals that refinement minimizes in one frame: outlines should touch their boxes' edges.
 
 The minimal pose fits three box centres; refinement fits the edges of all inliers. Each match has
-four residuals, as a share of the box's size, because the errors of detector and map grow with the
-object. Cauchy's weights limit outliers (Triggs et al., "Bundle Adjustment", 1999).
-cliploc_ros.core.fit.refinement sums the frames.
+four residuals, in deviations: a share of the box's size, because the errors of detector and shape
+grow with the object, and the landmark's position_sigma as the camera sees it. Cauchy's weights
+limit outliers (Triggs et al., "Bundle Adjustment", 1999). cliploc_ros.core.fit.refinement sums the
+frames.
 
 Of the residuals tried on the 258 recorded frames, edges solved most frames with the least error:
 better than Wasserstein's distance of ellipses, the level sets of Zins et al. ("Level Set-Based
@@ -21,9 +22,10 @@ import numpy as np
 from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
 
-# Standard deviation of an edge: a share of the mean of its box's two sides, plus a constant on the
-# plane z = 1, about a pixel. The share is near the median error of boxes and fitted maps on the
-# recorded frames, which also served for fitting; the constant is a guess.
+# Standard deviation of an edge at a landmark of known position: a share of the mean of its box's
+# two sides, plus a constant on the plane z = 1, about a pixel. The share is near the median error
+# of boxes and fitted maps on the recorded frames, which also served for fitting; the constant is a
+# guess.
 RELATIVE_DEVIATION = 0.06
 LEAST_DEVIATION = 0.003
 
@@ -37,8 +39,9 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
 
     Parameters
     ----------
-    pairs : ndarray (m, 13)
-        Box ellipse (4,), centre (3,) and shape (6,) of the landmark of each match.
+    pairs : ndarray (m, 14)
+        Box ellipse (4,), centre (3,) and shape (6,) of the landmark, and edge_deviation of each
+        match.
     vertical : ndarray (7,)
         See VERTICAL_UNKNOWN.
     rotation, translation : ndarray (3, 3), (3,)
@@ -49,10 +52,10 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
     for row in range(len(pairs)):
         box = pairs[row]
         in_front, cx, cy, exx, _, eyy = project_ellipsoid(
-            rotation, translation, pairs[row, 4:7], pairs[row, 7:])
+            rotation, translation, pairs[row, 4:7], pairs[row, 7:13])
         if not in_front:
             return False
-        deviation = _deviation(box)
+        deviation = box[13]
         half_x, half_y = sqrt(exx), sqrt(eyy)
         residuals[4 * row] = ((cx - half_x) - (box[0] - box[2])) / deviation
         residuals[4 * row + 1] = ((cx + half_x) - (box[0] + box[2])) / deviation
@@ -69,10 +72,27 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
 
 
 @compiled
-def _deviation(box):
-    """Return the standard deviation assumed of a box's edges."""
+def edge_deviation(box, center, sigma, rotation, translation):
+    """Return the standard deviation of a match's edges on the plane z = 1.
+
+    It is that of the pose at which the match was found. If it followed the pose, a camera that
+    moves away from uncertain landmarks would lower the cost.
+
+    Parameters
+    ----------
+    box, center : ndarray (4,), (3,)
+        Box ellipse, and centre of the landmark [m].
+    sigma : float
+        Standard deviation of the centre on each axis [m].
+    rotation, translation : ndarray (3, 3), (3,)
+        Of camera_from_map.
+    """
     # the sum of the semi-axes is the mean of the sides
-    return RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION
+    own = RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION
+    depth = (rotation[2, 0] * center[0] + rotation[2, 1] * center[1] + rotation[2, 2] * center[2]
+             + translation[2])
+    seen = sigma / depth if depth > 0.0 else 0.0
+    return sqrt(own * own + seen * seen)
 
 
 @compiled
@@ -103,8 +123,8 @@ def jacobian_of(pairs, vertical, rotation, translation):
     """Return the derivatives (4 * m + 3, 6) of the residuals, see residuals_of and linearize."""
     jacobian = np.zeros((4 * len(pairs) + 3, 6))
     for row in range(len(pairs)):
-        _differentiate(pairs[row, 4:7], pairs[row, 7:], rotation, translation,
-                       _deviation(pairs[row]), jacobian[4 * row:4 * row + 4])
+        _differentiate(pairs[row, 4:7], pairs[row, 7:13], rotation, translation, pairs[row, 13],
+                       jacobian[4 * row:4 * row + 4])
     if vertical[6] > 0.0:
         _differentiate_vertical(vertical, rotation, jacobian[4 * len(pairs):])
     return jacobian

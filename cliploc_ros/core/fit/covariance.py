@@ -1,16 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The covariance of a pose, from how well the boxes of its inliers fit."""
-
-from math import inf
+"""The covariance of a pose that is not refined, and what a covariance says."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
-from cliploc_ros.core.fit.box_edges import RELATIVE_DEVIATION
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 # Scatter of box centres assumed before any box is seen, as a share of the box, and how many
@@ -18,32 +15,27 @@ from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 _PRIOR_SCATTER = 0.1
 _PRIOR_WEIGHT = 6.0
 # Neighbouring edges share errors of box and map, so fewer edges are independent than counted.
-# Both factors are chosen on the 258 TUM frames that also fitted the confidence: with them 94 to
-# 95 % of the accepted poses lie in their 95 % ellipsoids. The second one is for refined poses.
+# Chosen on the 258 TUM frames that also fitted the confidence: with it 94 to 95 % of the accepted
+# poses lie in their 95 % ellipsoids.
 _VARIANCE_INFLATION = 2.0
-_REFINED_INFLATION = 1.35
-#: Larger errors of a box, as a share of its size, are outliers. Refinement gives them hardly any
-#: weight already, so they count as this much in the scatter of a refined pose. Chosen on the TUM
-#: frames and the demo's world, together with the factor above.
-REFINED_MOST = 4.0 * RELATIVE_DEVIATION
 # The least deviation of a box centre on the plane z = 1: about a twentieth of a pixel.
 _MIN_DEVIATION = 1e-4
 # Finite-difference steps of position [m] and rotation [rad].
 _STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
-# Variance of a direction that the boxes do not fix: m^2 and rad^2.
-_PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
-
+#: Variance of a direction that the boxes do not fix: m^2 and rad^2.
+PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
 # Deviation of odometry between two frames, on each axis: a floor, which covers stamps and
 # interpolation, and a share of the way. The shares are guesses: wheels and visual odometry drift
-# by 1 to 5 % of distance and angle. The floors were chosen on the TUM frames, see
-# odometry_covariance.
+# by 1 to 5 % of distance and angle. The floors were chosen on the TUM frames.
 _ODOMETRY_FLOOR_M = 0.005
 _ODOMETRY_FLOOR_RAD = np.radians(0.25)
 _ODOMETRY_DRIFT = 0.03
+# A camera that moves less stands still: rounding [m and rad].
+_STANDS_STILL = 1e-9
 
 
 def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64],
-                views: float = 1.0, most: float = inf) -> float:
+                views: float = 1.0) -> float:
     """Return the standard deviation of box centres, as a share of the box's size.
 
     Parameters
@@ -54,13 +46,11 @@ def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64]
         Centre and semi-axes of the ellipses inscribed in the inliers' boxes.
     views : float
         Mean number of inliers that show the same object; together they count as one.
-    most : float
-        Greater errors, as a share of the box, count as this much; see REFINED_MOST.
     """
     size = 2.0 * box_ellipses[:, 2:]
-    center_errors = np.clip((ellipses[:, :2] - box_ellipses[:, :2]) / size, -most, most)
+    center_errors = (ellipses[:, :2] - box_ellipses[:, :2]) / size
     # An edge moves by half of what its box grows.
-    size_errors = np.clip((np.sqrt(ellipses[:, [2, 4]]) - box_ellipses[:, 2:]) / size, -most, most)
+    size_errors = (np.sqrt(ellipses[:, [2, 4]]) - box_ellipses[:, 2:]) / size
     squares = (np.nansum(center_errors**2) + np.nansum(size_errors**2)) / views
     # Six of the centres' errors are zero by construction: P3P fits three centres exactly.
     freedom = max(0.0, center_errors.size / views - 6) + size_errors.size / views
@@ -104,7 +94,7 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
                          for step in np.diag(_STEPS)], axis=1)
     variances = _VARIANCE_INFLATION * np.maximum(box_sizes.ravel() * scatter, _MIN_DEVIATION)**2
     information = (jacobian.T @ (jacobian / variances[:, None])
-                   + np.diag(1.0 / np.array(_PRIOR_VARIANCES)))
+                   + np.diag(1.0 / np.array(PRIOR_VARIANCES)))
     if vertical[6] > 0.0:  # it measures the rotation about level axes
         up = vertical[3:6]
         information[3:, 3:] += (np.eye(3) - np.outer(up, up)) / vertical[6] ** 2
@@ -112,80 +102,25 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
     return (covariance + covariance.T) / 2
 
 
-def refined_covariance(information: NDArray[np.float64], scatter: float
-                       ) -> NDArray[np.float64]:
-    """Return the covariance of a pose that was refined on its inliers.
+def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the deviations (6,) of odometry between two frames: 0 if the camera did not move.
 
     Parameters
     ----------
-    information : ndarray (6, 6)
-        Of the last linearized system, whose residuals are in assumed deviations, see refine_rig.
-    scatter : float
-        See box_scatter; where it exceeds the assumed deviation, it stretches the covariance.
+    first_from_second : ndarray (4, 4)
+        Motion of the camera by odometry.
 
     Returns
     -------
-    ndarray (6, 6)
-        As of pose_covariance.
+    ndarray (6,)
+        On each axis, of position [m] and rotation [rad].
     """
-    stretch = _REFINED_INFLATION * max(1.0, scatter / RELATIVE_DEVIATION) ** 2
-    prior = np.diag(1.0 / np.array(_PRIOR_VARIANCES))
-    covariance = np.linalg.inv(information / stretch + prior)
-    return np.asarray((covariance + covariance.T) / 2)
-
-
-def vertical_information(rotations: NDArray[np.float64], verticals: NDArray[np.float64]
-                         ) -> NDArray[np.float64]:
-    """Return what all frames' verticals contribute to the information of refine_rig.
-
-    A camera turned by w about axes of the map sees the vertical at R (up + up x w), so the
-    Jacobian is R [up]x / sigma. The weights are the refinement's (Cauchy).
-
-    Parameters
-    ----------
-    rotations : ndarray (F, 3, 3)
-        camera_from_map of each frame.
-    verticals : ndarray (F, 7)
-        See make_rig; frames without a vertical contribute nothing.
-
-    Returns
-    -------
-    ndarray (6, 6)
-        Zero but for the rotation.
-    """
-    information = np.zeros((6, 6))
-    for rotation, vertical in zip(rotations, verticals, strict=True):
-        if vertical[6] > 0.0:
-            up_in_camera, up, deviation = vertical[:3], vertical[3:6], vertical[6]
-            residuals = (rotation @ up - up_in_camera) / deviation
-            jacobian = rotation @ np.cross(np.eye(3), up) / deviation
-            information[3:, 3:] += jacobian.T @ (jacobian / (1.0 + residuals[:, None] ** 2))
-    return information
-
-
-def odometry_covariance(camera_from_reference: NDArray[np.float64], weights: NDArray[np.float64]
-                        ) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) that errors of odometry between fused frames add to a pose.
-
-    Each frame is displaced against the reference frame, by a floor and by a share of the way
-    between the two. A fused pose is a mean over its frames, and frames that follow each other
-    share their displacement. So the deviations are averaged, not the variances: this is an upper
-    bound. A frame alone adds nothing.
-
-    Parameters
-    ----------
-    camera_from_reference : ndarray (F, 4, 4)
-    weights : ndarray (F,)
-        Weight of each frame in the pose: the number of its inliers.
-    """
-    if not weights.any():
-        return np.zeros((6, 6))
-    distances_m = np.linalg.norm(camera_from_reference[:, :3, 3], axis=1)
-    angles = Rotation.from_matrix(camera_from_reference[:, :3, :3]).magnitude()
-    others = (distances_m > 0.0) | (angles > 0.0)
-    deviations = np.stack([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * distances_m,
-                           _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angles]) * others
-    return np.diag(np.repeat((deviations @ weights / weights.sum()) ** 2, 3))
+    way_m = float(np.linalg.norm(first_from_second[:3, 3]))
+    angle = float(Rotation.from_matrix(first_from_second[:3, :3]).magnitude())
+    if way_m < _STANDS_STILL and angle < _STANDS_STILL:
+        return np.zeros(6)
+    return np.repeat([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * way_m,
+                      _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angle], 3)
 
 
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
@@ -219,8 +154,7 @@ def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[
     covariance : ndarray (6, 6)
         As of pose_covariance.
     """
-    turn = Rotation.from_matrix(truth[:3, :3] @ map_from_camera[:3, :3].T).as_rotvec()
-    error = np.concatenate([truth[:3, 3] - map_from_camera[:3, 3], turn])
+    error = pose_difference(map_from_camera, truth)
     return float(error @ np.linalg.solve(covariance, error))
 
 

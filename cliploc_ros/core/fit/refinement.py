@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.compiled import compiled
-from cliploc_ros.core.fit.box_edges import linearize, residuals_of, robust_cost
+from cliploc_ros.core.fit.box_edges import (
+    edge_deviation,
+    linearize,
+    residuals_of,
+    robust_cost,
+)
 from cliploc_ros.core.fit.rig import camera_pose
 from cliploc_ros.core.fit.verification import verify_rig
 
@@ -56,8 +61,10 @@ class Inliers(NamedTuple):
 
     Parameters
     ----------
-    pairs : ndarray (m, 13)
+    pairs : ndarray (m, 14)
         See residuals_of.
+    landmarks : ndarray (m,) of int
+        Their rows in the map.
     starts : ndarray (F + 1,)
         Where each frame's begin.
     cameras, verticals : ndarray (F, 3, 4), (F, 7)
@@ -65,6 +72,7 @@ class Inliers(NamedTuple):
     """
 
     pairs: NDArray[np.float64]
+    landmarks: NDArray[np.int64]
     starts: NDArray[np.int64]
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
@@ -85,7 +93,7 @@ def refine_rig(rig, rotation, translation):
         if vertical[6] > 0.0:
             least = 2
     for _ in range(_ROUNDS):
-        inliers = one_to_one(rig, found)
+        inliers = one_to_one(rig, found, rotation, translation)
         if len(inliers.pairs) < least:
             break
         new_rotation, new_translation = _minimize(inliers, rotation, translation)
@@ -97,7 +105,7 @@ def refine_rig(rig, rotation, translation):
         rotation, translation, found = new_rotation, new_translation, new
         if settled:
             break
-    inliers = one_to_one(rig, found)
+    inliers = one_to_one(rig, found, rotation, translation)
     information = np.zeros((6, 6))
     if len(inliers.pairs) >= least:
         in_front, residuals = residuals_of_rig(inliers, rotation, translation)
@@ -107,12 +115,14 @@ def refine_rig(rig, rotation, translation):
 
 
 @compiled
-def one_to_one(rig, found):
+def one_to_one(rig, found, rotation, translation):
     """Return the inliers of a verified pose; of several detections of a landmark, the best."""
     scene, frames = rig.scene, rig.starts.boxes
-    pairs, starts = np.empty((len(found.ious), 13)), np.zeros(len(frames), dtype=np.int64)
+    pairs, starts = np.empty((len(found.ious), 14)), np.zeros(len(frames), dtype=np.int64)
+    landmarks = np.empty(len(pairs), dtype=np.int64)
     count = 0
     for frame in range(len(frames) - 1):
+        own_rotation, own_translation = camera_pose(rig.cameras[frame], rotation, translation)
         for detection in range(frames[frame], frames[frame + 1]):
             landmark = found.landmarks[detection]
             best = _best_detection(found, detection, frames[frame], frames[frame + 1])
@@ -124,9 +134,12 @@ def one_to_one(rig, found):
                 pairs[count, 4 + column] = scene.centers[landmark, column]
             for column in range(6):
                 pairs[count, 7 + column] = scene.shapes[landmark, column]
+            pairs[count, 13] = edge_deviation(scene.box_ellipses[best], scene.centers[landmark],
+                                              rig.sigmas[landmark], own_rotation, own_translation)
+            landmarks[count] = landmark
             count += 1
         starts[frame + 1] = count
-    return Inliers(pairs[:count], starts, rig.cameras, rig.verticals)
+    return Inliers(pairs[:count], landmarks[:count], starts, rig.cameras, rig.verticals)
 
 
 @compiled
@@ -145,7 +158,7 @@ def _best_detection(found, detection, first, last):
 @compiled
 def residuals_of_rig(inliers, rotation, translation):
     """Return whether all landmarks are in front of their cameras, and all frames' residuals."""
-    pairs, starts, cameras, verticals = inliers
+    pairs, _, starts, cameras, verticals = inliers
     residuals = np.empty(4 * len(pairs) + 3 * len(cameras))
     for frame in range(len(cameras)):
         own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)
@@ -160,7 +173,7 @@ def residuals_of_rig(inliers, rotation, translation):
 @compiled
 def linearize_rig(inliers, rotation, translation, residuals):
     """Return information and gradient of all frames, in steps of the reference."""
-    pairs, starts, cameras, verticals = inliers
+    pairs, _, starts, cameras, verticals = inliers
     information, gradient = np.zeros((6, 6)), np.zeros(6)
     for frame in range(len(cameras)):
         own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)

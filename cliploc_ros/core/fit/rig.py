@@ -50,16 +50,19 @@ class Rig(NamedTuple):
         Rotation and translation of each camera_from_reference.
     verticals : ndarray (F, 7)
         See VERTICAL_UNKNOWN.
+    sigmas : ndarray (L,)
+        Standard deviation of each landmark's centre on each axis [m].
     """
 
     scene: Scene
     starts: FrameStarts
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
 
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
-             verticals: NDArray[np.float64]) -> Rig:
+             verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
     """Return the rig of some frames.
 
     Parameters
@@ -69,6 +72,8 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     camera_from_reference : ndarray (F, 4, 4)
     verticals : ndarray (F, 7)
         See VERTICAL_UNKNOWN.
+    sigmas : ndarray (L,)
+        See Rig.
     """
     first = scenes[0]
     joined = first._replace(
@@ -81,7 +86,7 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
     starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
     return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
-               np.ascontiguousarray(verticals))
+               np.ascontiguousarray(verticals), sigmas)
 
 
 def _sizes(scene: Scene) -> list[int]:

@@ -55,6 +55,12 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> tup
     return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
 
 
+def pose_difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the step (6,) from one pose to another: position [m], rotation about fixed axes."""
+    turn = Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).as_rotvec()
+    return np.concatenate([other[:3, 3] - one[:3, 3], turn])
+
+
 def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
                     ) -> NDArray[np.float64]:
     """Return a pose's covariance after its origin moved rigidly by a lever.

@@ -3,7 +3,7 @@
 """The landmarks of a map by detector class."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -26,16 +26,20 @@ class ClassIndex:
         Landmarks grouped by class, in the map's order within a class.
     starts : ndarray (C + 1,) of int
         Where each class begins in landmarks.
+    weights : mapping
+        Of (landmark, class), its share over that of the landmark's most frequent class, 0 to 1;
+        missing ones count 1.
     """
 
     numbers: Mapping[str, int]
     of_landmarks: NDArray[np.int64]
     landmarks: NDArray[np.int64]
     starts: NDArray[np.int64]
+    weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
-    def of(landmark_classes: Sequence[str], others: Sequence[tuple[int, str]] = ()
-           ) -> 'ClassIndex':
+    def of(landmark_classes: Sequence[str], others: Sequence[tuple[int, str]] = (),
+           weights: Mapping[tuple[int, str], float] | None = None) -> 'ClassIndex':
         """Return the index of a map's classes.
 
         Parameters
@@ -44,6 +48,8 @@ class ClassIndex:
             Own class of each landmark.
         others : sequence of (int, str)
             A landmark and another class of it, each pair once.
+        weights : mapping, optional
+            Of a landmark and a class of it, see ClassIndex.
         """
         names = [*landmark_classes, *(name for _, name in others)]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -51,7 +57,9 @@ class ClassIndex:
         count = len(landmark_classes)
         landmarks = np.append(np.arange(count), [row for row, _ in others]).astype(np.int64)
         return ClassIndex(numbers, classes[:count], landmarks[np.lexsort((landmarks, classes))],
-                          np.append(0, np.cumsum(np.bincount(classes))).astype(np.int64))
+                          np.append(0, np.cumsum(np.bincount(classes))).astype(np.int64),
+                          {(row, numbers[name]): weight
+                           for (row, name), weight in (weights or {}).items()})
 
     @cached_property
     def members(self) -> NDArray[np.int64]:
@@ -71,6 +79,16 @@ class ClassIndex:
         keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
         return np.asarray((self.of_landmarks[landmarks] == classes)
                           | np.isin(keys, self._other_keys))
+
+    def shares(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
+               ) -> NDArray[np.float64]:
+        """Return how often landmarks (p,) have classes (p,), over their most frequent class.
+
+        1 where nothing is known but that they have it, 0 where they do not have it.
+        """
+        known = [self.weights.get(pair, 1.0) for pair in zip(landmarks.tolist(), classes.tolist(),
+                                                             strict=True)]
+        return np.asarray(self.have(landmarks, classes) * np.array(known, dtype=np.float64))
 
     @cached_property
     def _other_keys(self) -> NDArray[np.int64]:

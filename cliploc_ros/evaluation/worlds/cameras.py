@@ -56,6 +56,28 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
     return found
 
 
+def walk_through(place: Place, objects: Objects, images: int, rng: np.random.Generator
+                 ) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (images, 4, 4) of a robot that stands, turns and drives.
+
+    It stands for the first quarter of the images, turns on the spot for the second, and then
+    drives along a curve.
+    """
+    height, pitch = rng.uniform(*_HEIGHT_M), np.radians(rng.uniform(*_PITCH_DEG))
+    position, yaw = _look(place, objects, rng)
+    turn = np.radians(rng.uniform(*_TURN_DEG)) * rng.choice((-1.0, 1.0))
+    found = np.empty((images, 4, 4))
+    for number in range(images):
+        roll, nod = np.radians(_ROLL_DEG) * rng.normal(size=2) if 4 * number >= images else (0, 0)
+        found[number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+        if 4 * number >= images:
+            yaw += turn
+        if 2 * number >= images:
+            step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
+            position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
+    return found
+
+
 def _look(place: Place, objects: Objects, rng: np.random.Generator
           ) -> tuple[NDArray[np.float64], float]:
     """Return a spot (2,) and a direction [rad] in which there are things to see."""

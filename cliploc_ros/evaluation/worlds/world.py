@@ -13,9 +13,14 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
 from cliploc_ros.evaluation.worlds.appearance import Encoder
-from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE, make_camera, make_groups
+from cliploc_ros.evaluation.worlds.cameras import (
+    GROUP_SIZE,
+    make_camera,
+    make_groups,
+    walk_through,
+)
 from cliploc_ros.evaluation.worlds.detector import Detector, detect
-from cliploc_ros.evaluation.worlds.places import KINDS
+from cliploc_ros.evaluation.worlds.places import KINDS, Place
 from cliploc_ros.evaluation.worlds.surveyor import MapErrors, Survey, survey
 from cliploc_ros.evaluation.worlds.things import Objects, make_objects
 from cliploc_ros.units import NS_PER_S
@@ -60,7 +65,7 @@ class _Scene(NamedTuple):
     biases: NDArray[np.float64]
 
 
-def make_world(kind: str, seed: int, groups: int = 4) -> World:
+def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -70,17 +75,49 @@ def make_world(kind: str, seed: int, groups: int = 4) -> World:
     seed : int
     groups : int
         Places from which the robot looks, five images each.
+    sigma_m : float, optional
+        Standard deviation of the map's positions on each axis [m]; drawn by default.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    place, scene = _make_scene(kind, sigma_m, rng)
+    camera = make_camera(rng)
+    poses = make_groups(place, scene.objects, groups, rng).reshape(-1, 4, 4)
+    return _seen(kind, scene, camera, poses, rng)
+
+
+def make_walk(kind: str, seed: int, images: int) -> World:
+    """Return a world and the images of one walk through it, a second apart.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    seed : int
+        Its objects and map are those of make_world.
+    images : int
+    """
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    place, scene = _make_scene(kind, None, rng)
+    camera = make_camera(rng)
+    return _seen(kind, scene, camera, walk_through(place, scene.objects, images, rng), rng)
+
+
+def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator
+                ) -> tuple[Place, _Scene]:
     place = KINDS[kind](rng)
     objects = make_objects(place.things, rng)
     encoder = Encoder.random(rng)
-    scene = _Scene(objects, objects.shapes, survey(objects, MapErrors.random(rng), rng),
-                   Detector.random(objects, rng), encoder,
-                   encoder.vectors(objects.class_ids, objects.models, rng),
-                   encoder.biases(len(objects.class_ids), rng))
-    camera = make_camera(rng)
-    poses = make_groups(place, objects, groups, rng).reshape(-1, 4, 4)
+    errors = MapErrors.random(rng)
+    if sigma_m is not None:
+        errors = errors._replace(sigma_m=sigma_m)
+    return place, _Scene(objects, objects.shapes, survey(objects, errors, rng),
+                         Detector.random(objects, rng), encoder,
+                         encoder.vectors(objects.class_ids, objects.models, rng),
+                         encoder.biases(len(objects.class_ids), rng))
+
+
+def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
+          rng: np.random.Generator) -> World:
     return World(kind, scene.found.landmark_map, tuple(
         Query(number, _look(scene, camera, pose, number, rng), pose)
         for number, pose in enumerate(poses)))

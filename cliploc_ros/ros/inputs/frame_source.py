@@ -18,6 +18,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.detection_types import detection_type
 from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates
@@ -75,14 +76,18 @@ class FrameSource:
         as long as the source is open.
     on_frame : callable
         Called with each complete frame in the executor's thread.
+    detections : str
+        Package of the type of the detections, see DETECTION_TYPES.
     """
 
     def __init__(self, node: Node, transport: str, linger_s: float,
-                 on_frame: Callable[[Frame], None]) -> None:
+                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs') -> None:
         self._node = node
         self._image_type = Image if transport == 'raw' else CompressedImage
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
+        self._package = detections
+        self._detections = detection_type('vision_msgs')
         self._linger_s = linger_s
         self._on_frame = on_frame
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
@@ -105,8 +110,15 @@ class FrameSource:
         return self._resolved('image')
 
     def open(self) -> None:
-        """Allow calls of next_frame."""
+        """Allow calls of next_frame.
+
+        Raises
+        ------
+        OptionsError
+            The type of the detections is not installed.
+        """
         with self._changed:
+            self._detections = detection_type(self._package)
             self._closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
@@ -155,6 +167,11 @@ class FrameSource:
                                    f'{self._why_none(after)}')
             return frame
 
+    def missing(self) -> list[str]:
+        """Return for each input that nothing publishes a line that says what to do."""
+        return [self._silence(name) for name in self._topics
+                if self._node.count_publishers(self._resolved(name)) == 0]
+
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
@@ -185,7 +202,8 @@ class FrameSource:
         self._subscribed_at = time.monotonic()
         for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
                                             ('camera_info', CameraInfo, qos.CAMERA_INFO),
-                                            ('detections', Detection2DArray, qos.DETECTIONS_IN)):
+                                            ('detections', self._detections.message_type,
+                                             qos.DETECTIONS_IN)):
             self._subscriptions.append(AdaptiveSubscription(
                 self._node, message_type, self._topics[name], self._receiver(name), profile))
 
@@ -204,7 +222,7 @@ class FrameSource:
 
     def _receiver(self, name: str) -> Callable[[Any], None]:
         def receive(msg: Any) -> None:
-            self._take(name, msg)
+            self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
         return receive
 
     def _take(self, name: str, msg: Any) -> None:

@@ -80,6 +80,13 @@ class HandOff:
         """Withhold the pose of the hand-over under way: time jumped."""
         self._jumped_at = time.monotonic()
 
+    def missing(self) -> str:
+        """Return that there is no localizer, and what to do; empty if there is one."""
+        if self._publisher.get_subscription_count():
+            return ''
+        return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL), or '
+                'set require_localizer: false')
+
     def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
                   deadline: float, received_at: float) -> None:
         """Publish a pose on `initialpose`, and return when the localizer had time to settle.
@@ -125,14 +132,11 @@ class HandOff:
 
     def _wait_for_localizer(self, deadline: float) -> None:
         """Raise unless somebody subscribes `initialpose`, or soon does."""
-        def subscribed() -> bool:
-            return bool(self._publisher.get_subscription_count())
         with self._changed:
-            self._changed.wait_for(lambda: subscribed() or self._stopped.is_set(),
+            self._changed.wait_for(lambda: self._stopped.is_set() or not self.missing(),
                                    min(_SUBSCRIBER_PATIENCE_S, _left_s(deadline)))
-        if not subscribed():
-            raise NoLocalizerError(f'nobody subscribes {self._publisher.topic_name}: start the '
-                                   'localizer (AMCL), or set require_localizer: false')
+        if missing := self.missing():
+            raise NoLocalizerError(missing)
 
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""

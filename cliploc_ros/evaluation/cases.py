@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Answer a recorded request again, without ROS: a failure in the field as a test case."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.on_demand import stages_of
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.session import Session
+from cliploc_ros.datasets.bag_messages import detections_of
+from cliploc_ros.datasets.cases import Case, CaseFrame
+from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.messages import camera_from_msg, image_from_msg
+
+#: Takes an image (h, w, 3), red first, and an observation; returns it with its similarities.
+Observe = Callable[[NDArray[np.uint8], Observation], Observation]
+
+
+class Replayed(NamedTuple):
+    """A recorded answer and the one that was found again.
+
+    Parameters
+    ----------
+    accepted, again : bool
+    reason, reason_again : str
+        Empty where accepted.
+    """
+
+    accepted: bool
+    again: bool
+    reason: str
+    reason_again: str
+
+    @property
+    def is_same(self) -> bool:
+        """Return whether the verdict is the same."""
+        return self.accepted == self.again
+
+
+def options_of(case: Case) -> RelocalizerOptions:
+    """Return the options that a case was recorded with; no clock cuts the search.
+
+    Raises
+    ------
+    DatasetError
+        The case does not hold them.
+    """
+    given = case.report.get('options')
+    known = {field.name for field in fields(RelocalizerOptions)}
+    try:
+        options = {name: value for name, value in given.items() if name in known}  # type: ignore
+        options['height_range_m'] = tuple(options['height_range_m'])
+        return replace(RelocalizerOptions(**options), time_budget_s=math.inf)
+    except (AttributeError, KeyError, TypeError, OptionsError) as error:
+        raise DatasetError(f'the options of this case are broken: {error}') from error
+
+
+def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe) -> Replayed:
+    """Answer a case again with a map: as it was recorded, or with another one.
+
+    Parameters
+    ----------
+    case : Case
+    landmark_map : LandmarkMap
+    observe : callable
+
+    Raises
+    ------
+    CliplocError
+        A message or the report is broken.
+    """
+    options, parameters = options_of(case), _parameters(case)
+    session = Session(Relocalizer(landmark_map, options))
+    found = None
+    for frame in case.frames:
+        observation = observe(*_seen(frame, parameters))
+        found = _localize(session, observation, landmark_map, options, parameters)
+    assert found is not None  # a case has a frame
+    accepted = case.report.get('found') == 'accepted'
+    reason = '' if accepted else str(case.report.get('reason', '')).rpartition(' [')[0]
+    return Replayed(accepted, found.accepted, reason, found.reason)
+
+
+def _localize(session: Session, observation: Observation, landmark_map: LandmarkMap,
+              options: RelocalizerOptions, parameters: Mapping[str, Any]) -> Relocalization:
+    stages = stages_of(landmark_map, observation, options)
+    if observation.odom_from_camera is None:
+        return session.localize(next(stages), more=stages)
+    return session.localize(next(stages), 0, parameters['fuse_frames'],
+                            parameters['fuse_window_s'], stages)
+
+
+def _seen(frame: CaseFrame, parameters: Mapping[str, Any]
+          ) -> tuple[NDArray[np.uint8], Observation]:
+    """Return the image and the observation of a frame, as the node makes it."""
+    image = image_from_msg(frame.message('image'))
+    height, width = image.shape[:2]
+    camera = camera_from_msg(frame.message('camera_info'), (width, height),
+                             parameters['rectified'])
+    detections = detections_of(frame.message('detections'))
+    names = _class_map(parameters['class_map'])
+    detections = replace(detections, class_ids=tuple(
+        names.get(name, name) for name in detections.class_ids))
+    return image, Observation(
+        camera, detections.usable(width, height, parameters['max_detections']),
+        stamp_ns=frame.stamp_ns, up_in_camera=frame.up_in_camera,
+        odom_from_camera=frame.odom_from_camera)
+
+
+def _parameters(case: Case) -> Mapping[str, Any]:
+    parameters = case.report.get('parameters')
+    needed = {'rectified', 'class_map', 'max_detections', 'fuse_frames', 'fuse_window_s'}
+    if not isinstance(parameters, dict) or not needed <= parameters.keys():
+        raise DatasetError(f'the parameters of this case are broken: it needs {sorted(needed)}')
+    return parameters
+
+
+def _class_map(text: str) -> dict[str, str]:
+    """Return the map's class names by the detector's, which the node has checked."""
+    pairs = (pair.partition('=') for pair in text.split(',') if pair.strip())
+    return {theirs.strip(): ours.strip() for theirs, _, ours in pairs}

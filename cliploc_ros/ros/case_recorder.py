@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps the frames of the last request, and stores them as a recording when that is asked for."""
+
+import threading
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Image
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.parameter_tables import relocalizer_options
+
+if TYPE_CHECKING:
+    from cliploc_ros.datasets.cases import Case, CaseFrame
+
+# As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
+_MAX_FRAMES = 20
+_MAX_BYTES = 256 * 2**20
+_MIB = 2**20
+
+
+class NoCaseError(CliplocError):
+    """There is nothing to record; the message says why."""
+
+
+class _Seen(NamedTuple):
+    frame: Frame
+    answer: Answer
+
+
+class CaseRecorder:
+    """The last frames that requests looked at; older ones are forgotten.
+
+    Parameters
+    ----------
+    keeps : bool
+        Whether to keep frames at all: false costs no memory.
+    """
+
+    def __init__(self, keeps: bool) -> None:
+        self._keeps = keeps
+        self._lock = threading.Lock()
+        self._seen: deque[_Seen] = deque(maxlen=_MAX_FRAMES)
+        self._last = Answer(Verdict.FAILED, 'no request yet')
+
+    def add(self, frame: Frame, answer: Answer) -> None:
+        """Keep a frame and what was found in it."""
+        if not self._keeps:
+            return
+        with self._lock:
+            self._seen.append(_Seen(frame, answer))
+            while sum(len(one.frame.image.data) for one in self._seen) > _MAX_BYTES \
+                    and len(self._seen) > 1:
+                self._seen.popleft()
+
+    def end(self, answer: Answer) -> None:
+        """Keep the answer of a request."""
+        with self._lock:
+            self._last = answer
+
+    def forget(self) -> None:
+        """Forget all frames."""
+        with self._lock:
+            self._seen.clear()
+
+    def store(self, values: Mapping[str, Any]) -> str:
+        """Store the last request in record_folder; return what was stored, in one line.
+
+        Parameters
+        ----------
+        values : mapping
+            The relocalizer's parameters.
+
+        Raises
+        ------
+        NoCaseError
+            No request, or none that saw a frame.
+        CliplocError
+            The folder is not given, full, or cannot be written.
+        """
+        if not values['record_folder']:
+            raise OptionsError('record_folder is empty: set it at the start, to a folder with '
+                               'room for record_limit_mb')
+        try:
+            from cliploc_ros.datasets.cases import Case, write_case
+        except ImportError as error:
+            raise OptionsError(f'recording needs rosbags ({error}): pip install rosbags'
+                               ) from error
+        seen, last = self._linked()
+        folder = _made_folder(values['record_folder'])
+        case = Case(tuple(_case_frame(one) for one in seen), _report(seen[-1], last, values))
+        _check_room(folder, case, values['record_limit_mb'])
+        now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
+        path = folder / f'case_{now}_{last.verdict}'
+        write_case(path, case)
+        return f'{path}: {len(case.frames)} frames; {last.message}'
+
+    def _linked(self) -> tuple[list[_Seen], Answer]:
+        """Return the frames that the last answer may rest on, the oldest first, and the answer.
+
+        Odometry links a frame to those before it. Without it a frame stands alone.
+        """
+        with self._lock:
+            seen, last = list(self._seen), self._last
+        newest = next((place for place in reversed(range(len(seen)))
+                       if seen[place].frame.received_at == last.received_at), None)
+        if newest is None:
+            raise NoCaseError(f'nothing to record: the last request saw no frame: {last.message}')
+        oldest = newest
+        while oldest > 0 and _run(seen[newest]) is not None \
+                and _run(seen[oldest - 1]) == _run(seen[newest]):
+            oldest -= 1
+        return seen[oldest:newest + 1], last
+
+
+def _run(seen: _Seen) -> int | None:
+    """Return the run of odometry that places a frame; None without one."""
+    state = seen.answer.state
+    return None if state is None or state.place is None else state.place.run
+
+
+def _case_frame(seen: _Seen) -> 'CaseFrame':
+    from cliploc_ros.datasets.cases import CaseFrame
+
+    frame, state = seen.frame, seen.answer.state
+    place = None if state is None else state.place
+    kind = 'Image' if isinstance(frame.image, Image) else 'CompressedImage'
+    return CaseFrame(
+        stamp_ns(frame.image.header.stamp), f'sensor_msgs/msg/{kind}',
+        image=bytes(serialize_message(frame.image)),
+        camera_info=bytes(serialize_message(frame.camera_info)),
+        detections=bytes(serialize_message(_upright(frame.detections))),
+        up_in_camera=None if state is None else state.up_in_camera,
+        odom_from_camera=None if place is None else place.odom_from_camera)
+
+
+def _upright(msg: Detection2DArray) -> Detection2DArray:
+    """Return detections without turned boxes, which only rclpy's reader understands."""
+    if all(one.bbox.center.theta == 0.0 for one in msg.detections):
+        return msg
+    return detections_to_msg(detections_from_msg(msg), msg.header)
+
+
+def _report(newest: _Seen, last: Answer, values: Mapping[str, Any]) -> dict[str, Any]:
+    return {'verdict': str(last.verdict), 'message': last.message,
+            'found': str(newest.answer.verdict), 'reason': newest.answer.detail,
+            'map_hash': newest.answer.map_hash, 'parameters': dict(values),
+            'options': asdict(relocalizer_options(values))}
+
+
+def _made_folder(name: str) -> Path:
+    folder = Path(name).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetError(f'record_folder: {folder}: {error.strerror}') from error
+    return folder
+
+
+def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
+    """Raise unless the case fits into what the recordings of the folder may take."""
+    size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
+               for frame in case.frames)
+    used = sum(file.stat().st_size for file in folder.rglob('*') if file.is_file())
+    if used + size > limit_mb * _MIB:
+        raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
+                           f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: move '
+                           'recordings away, or raise it')

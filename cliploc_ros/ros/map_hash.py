@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The hash that names a map in answers and diagnostics: which one a robot of a fleet has."""
+
+import hashlib
+from pathlib import Path
+
+from rclpy.node import Node
+
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.errors import MapError
+from cliploc_ros.ros.map_parameters import load_map
+
+_DIGITS = 12
+# A file that is replaced while it is read is read again.
+_ATTEMPTS = 3
+
+
+def load_hashed_map(node: Node, map_file: str) -> tuple[LandmarkMap, str]:
+    """Load a map and return it with its hash.
+
+    The hash of a file is the beginning of what `sha256sum` prints. A map in parameters has the
+    hash of its landmarks.
+
+    Raises
+    ------
+    MapError
+        See load_map; or the file changes again and again.
+    """
+    for _ in range(_ATTEMPTS):
+        before = _file_hash(map_file)
+        landmark_map = load_map(node, map_file)
+        if not map_file:
+            return landmark_map, _hash(_content(landmark_map))
+        if before == _file_hash(map_file):
+            return landmark_map, before
+    raise MapError(f'{map_file}: changes while it is read: write another file and rename it')
+
+
+def _file_hash(map_file: str) -> str:
+    """Return the hash of a file; empty where load_map says what is wrong."""
+    try:
+        return _hash(Path(map_file).read_bytes())
+    except (OSError, ValueError):
+        return ''
+
+
+def _content(landmark_map: LandmarkMap) -> bytes:
+    return b''.join([
+        repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+              landmark_map.class_ids)).encode(),
+        landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+        landmark_map.quats_xyzw.tobytes()])
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]

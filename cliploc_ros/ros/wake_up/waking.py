@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Wake a robot up: request its pose, turn between the looks, until accepted or time is up."""
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from cliploc_ros.ros.answer import Verdict
+from cliploc_ros.ros.wake_up.status import SILENT_S, RelocalizerStatus
+from cliploc_ros.ros.wake_up.turning import Turning
+
+_SPIN_S = 0.05
+# What is there is not seen at once.
+_DISCOVERY_S = 2.0
+# Between looks of a robot that does not turn.
+_PAUSE_S = 1.0
+# What an answer may take on its way beyond the relocalizer's own limit.
+_ON_ITS_WAY_S = 5.0
+
+
+class Outcome(IntEnum):
+    """How a wake-up ended: the exit code."""
+
+    ACCEPTED = 0
+    REFUSED = 1
+    NOT_READY = 2
+
+
+@dataclass(frozen=True)
+class WakeUpOptions:
+    """Options of a wake-up.
+
+    Parameters
+    ----------
+    relocalizer : str
+        Name of the relocalizer, relative to the namespace or absolute.
+    timeout_s : float
+        No turn begins later; a look does only after a turn.
+    turn_deg : float
+        Turn by this much between looks; 0: do not turn.
+    """
+
+    relocalizer: str = 'relocalizer'
+    timeout_s: float = 60.0
+    turn_deg: float = 45.0
+
+
+class WakeUp(Node):
+    """Requests poses of one relocalizer and prints one line for each look.
+
+    Parameters
+    ----------
+    options : WakeUpOptions
+    interrupted : threading.Event
+        Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
+        and nothing would cancel it.
+    """
+
+    def __init__(self, options: WakeUpOptions, interrupted: threading.Event) -> None:
+        super().__init__('wake_up', start_parameter_services=False)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._service = self.resolve_service_name(f'{options.relocalizer}/relocalize')
+        self._client = self.create_client(Trigger, self._service)
+        self._status = RelocalizerStatus(self, self._service.removesuffix('/relocalize'))
+        self._turning = Turning(self, self._wait, math.radians(options.turn_deg))
+        self._began_at = time.monotonic()
+        self._options = options
+        self._interrupted = interrupted
+        self._said: dict[str, str] = {}
+
+    def run(self) -> Outcome:
+        """Look until a pose is accepted or time is up; end a turn under way in any case.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            The event is set; no turn is under way.
+        """
+        try:
+            return self._look_about()
+        finally:
+            self._interrupted = threading.Event()  # this one is handled
+            self._turning.stop()
+
+    def _look_about(self) -> Outcome:
+        looks, turned = 0, ''
+        while not (problem := self._until_ready()):
+            looks += 1
+            verdict, message = self._look()
+            print(f'look {looks} [{self._elapsed_s:.1f} s]{turned}: {message}', flush=True)
+            if verdict is Verdict.ACCEPTED:
+                return Outcome.ACCEPTED
+            if self._is_time_up:
+                if verdict is Verdict.REFUSED:
+                    return _end(Outcome.REFUSED, f'refused: {looks} looks in '
+                                f'{self._elapsed_s:.0f} s, no pose is certain enough')
+                problem = message
+                break
+            turned = self._turn() if verdict is Verdict.REFUSED else self._rest()
+        return _end(Outcome.NOT_READY, f'not ready: {problem}')
+
+    def _until_ready(self) -> str:
+        """Wait until the relocalizer can take a request; return what it lacks when time is up."""
+        while True:
+            problem = self._problem()
+            if self._elapsed_s > _DISCOVERY_S:
+                self._say('waiting', problem)
+            if not problem or self._is_time_up:
+                return problem
+            self._spin()
+
+    def _problem(self) -> str:
+        """Return why there can be no request now; empty if there can."""
+        if not self._client.service_is_ready():
+            return (f'nothing serves {self._service}: start the relocalizer, or name it with '
+                    '--relocalizer or a namespace')
+        return self._status.problem()
+
+    def _look(self) -> tuple[Verdict, str]:
+        """Request the pose once; return the verdict and the answer."""
+        begun_at, future = time.monotonic(), self._client.call_async(Trigger.Request())
+
+        def is_over() -> bool:
+            waited_s = time.monotonic() - begun_at
+            return bool(future.done() or self._status.silent_s > SILENT_S
+                        or waited_s > self._status.time_limit_s + _ON_ITS_WAY_S)
+        self._wait(is_over, math.inf)
+        if future.done():
+            message = future.result().message
+            return _verdict_of(message), message
+        self._client.remove_pending_request(future)
+        return Verdict.FAILED, self._status.problem() or (
+            f'no answer within {time.monotonic() - begun_at:.0f} s: the relocalizer was started '
+            'anew, or the network lost it')
+
+    def _turn(self) -> str:
+        """Turn before the next look, where that is possible; return what was done."""
+        obstacle = self._turning.obstacle()
+        self._say('not turning', obstacle)
+        if obstacle:
+            return self._rest()
+        turn = self._turning.turn()
+        if turn.problem:
+            self._rest()  # the next turn would fail as well, at once
+        return f', {turn}'
+
+    def _rest(self) -> str:
+        self._wait(lambda: False, _PAUSE_S)
+        return ''
+
+    @property
+    def _elapsed_s(self) -> float:
+        return time.monotonic() - self._began_at
+
+    @property
+    def _is_time_up(self) -> bool:
+        return self._elapsed_s > self._options.timeout_s
+
+    def _say(self, topic: str, text: str) -> None:
+        """Print a text once, until it changes."""
+        if text and self._said.get(topic) != text:
+            print(f'{topic}: {text}', flush=True)
+        self._said[topic] = text
+
+    def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        """Process callbacks until a condition holds, for some time at most."""
+        end = time.monotonic() + patience_s
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self._spin()
+        return True
+
+    def _spin(self) -> None:
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+        self._executor.spin_once(timeout_sec=_SPIN_S)
+
+
+def _verdict_of(message: str) -> Verdict:
+    """Return the verdict that an answer begins with."""
+    return next((verdict for verdict in Verdict if message.startswith(f'{verdict}: ')),
+                Verdict.FAILED)
+
+
+def _end(outcome: Outcome, text: str) -> Outcome:
+    print(text, file=sys.stderr, flush=True)
+    return outcome

@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of landmarks in refinement, covariance and confidence, in a simulated room."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.fit.box_edges import LEAST_DEVIATION, RELATIVE_DEVIATION, edge_deviation
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.fit.refined_covariance import refined_covariance
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.landmark_map import DEFAULT_SIGMA_M
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
+
+ROOM = make_room()
+BY_CLASS = RelocalizerOptions(matching='class')
+
+
+def boxes_at(map_from_camera, noise_px=0.0, rng=None):
+    outlines = project_ellipsoids(invert_transform(map_from_camera), ROOM.centers, ROOM.shapes)
+    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
+
+
+def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None):
+    """The pose of the last camera in a map with these centres, and its covariances."""
+    scenes = [make_scene(CAMERA.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
+                         ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
+              for pose in poses]
+    rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
+                   np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.full(len(ROOM), sigma))
+    start = invert_transform(poses[-1])
+    found = refine_rig(rig, start[:3, :3].copy(), start[:3, 3].copy())
+    stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
+    return (invert_transform(make_transform(found.rotation, found.translation)),
+            refined_covariance(rig, found.rotation, found.translation, stamps))
+
+
+def turning(count):
+    return [MAP_FROM_CAMERA @ make_transform(Rotation.from_euler(
+        'y', 2.0 * step, degrees=True).as_matrix(), np.zeros(3)) for step in range(count)]
+
+
+@pytest.mark.parametrize('frames', [1, 4])
+def test_errors_of_landmarks_are_covered_if_the_map_states_them(frames):
+    rng, sigma = np.random.default_rng(3), 0.1
+    squares = {'stated': [], 'default': []}
+    for _ in range(150):
+        centers = ROOM.centers + rng.normal(0, sigma, ROOM.centers.shape)
+        seed = int(rng.integers(1000))
+        for name, given in (('stated', sigma), ('default', DEFAULT_SIGMA_M)):
+            pose, covariance = fitted(turning(frames), centers, given,
+                                      np.random.default_rng(seed), 2.0)
+            squares[name].append(normalized_square(pose, covariance.matched,
+                                                   MAP_FROM_CAMERA if frames == 1
+                                                   else turning(frames)[-1]))
+    shares = {name: (np.array(one) < chi2.ppf(0.95, 6)).mean() for name, one in squares.items()}
+    print(f'\n{frames} frames, landmarks off by {sigma} m: {shares} in the 95 % ellipsoids')
+    # 150 draws of .95 reach .91; errors of 10 cm are not small, either
+    assert shares['stated'] >= 0.88
+    assert shares['default'] <= 0.6
+
+
+def test_errors_of_landmarks_do_not_average_out_over_frames():
+    one, four = (fitted([MAP_FROM_CAMERA] * count, ROOM.centers, 0.2)[1].matched
+                 for count in (1, 4))
+    np.testing.assert_allclose(four, one, rtol=0.1, atol=1e-6)
+
+
+def test_the_covariance_holds_the_chance_that_an_object_is_wrong():
+    _, covariance = fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)
+    added = covariance.whole - covariance.matched
+    assert np.linalg.eigvalsh(added).min() > -1e-9
+    assert np.trace(added[:3, :3]) > 0.01 * np.trace(covariance.matched[:3, :3])
+    displaced = ROOM.centers.copy()
+    displaced[4] += [0.15, 0.1, 0.0]
+    _, contradicted = fitted([MAP_FROM_CAMERA], displaced, 0.02)
+    more = contradicted.whole - contradicted.matched
+    assert np.trace(more[:3, :3]) > np.trace(added[:3, :3])
+
+
+def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
+    """The reference first, last or between: steps add up outwards from it."""
+    way = [MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([0.3 * step, 0.0, 0.0]))
+           for step in (0, 1, 2, 1)]
+    middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1].matched
+    end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1].matched
+    assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
+
+
+def test_an_edge_is_as_uncertain_as_box_and_landmark():
+    box, center = np.array([0.1, 0.0, 0.2, 0.1]), np.array([0.0, 0.0, 4.0])
+    own = RELATIVE_DEVIATION * 0.3 + LEAST_DEVIATION
+    assert edge_deviation(box, center, 0.0, np.eye(3), np.zeros(3)) == pytest.approx(own)
+    seen = edge_deviation(box, center, 0.2, np.eye(3), np.zeros(3))
+    assert seen == pytest.approx(np.hypot(own, 0.05))
+
+
+def with_sigma(sigma):
+    return replace(ROOM, details=(LandmarkDetails(position_sigma=sigma),) * len(ROOM))
+
+
+def test_edges_off_by_the_error_of_the_map_fit_well():
+    rng = np.random.default_rng(0)
+    shaken = ROOM.centers + rng.normal(0, 0.08, ROOM.centers.shape)
+    frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
+                                           np.ones(len(ROOM))))
+    misfits = [Relocalizer(replace(one, centers=shaken), BY_CLASS).relocalize([frame])
+               .hypotheses[0].support.misfit
+               for one in (with_sigma(0.001), ROOM, with_sigma(0.08))]
+    # the calibration's maps are those of the default
+    assert misfits[0] == pytest.approx(misfits[1], rel=0.1)
+    assert misfits[2] < 0.8 * misfits[1]
+
+
+def test_a_map_without_errors_gets_the_default():
+    assert (ROOM.position_sigmas == DEFAULT_SIGMA_M).all()
+    some = replace(ROOM, details=(LandmarkDetails(position_sigma=0.3),
+                                  *[LandmarkDetails()] * (len(ROOM) - 1)))
+    assert some.position_sigmas[0] == 0.3 and (some.position_sigmas[1:] == DEFAULT_SIGMA_M).all()

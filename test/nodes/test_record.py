@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A request that went wrong in the field becomes a test case; counters and the map's hash."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from scene import make_room, see_room
+from std_srvs.srv import Trigger
+from tester import make_frame
+
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.cases import read_case
+from cliploc_ros.datasets.rosbag import BagWriter
+from cliploc_ros.errors import DatasetError
+
+
+def four_of(rows=(0, 3, 6, 9)):
+    """A frame with four objects of one class, in wrong places: nothing fits."""
+    seen = see_room(make_room()).select(np.array(rows))
+    boxes = seen.bboxes_xyxy[::-1] + np.array([0.0, 40.0, 0.0, 40.0])
+    return make_frame(type(seen)(boxes, seen.class_ids, seen.scores))
+
+
+def record(tester):
+    return tester.call(Trigger, '/relocalizer/record', Trigger.Request())
+
+
+def hash_of(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+@pytest.fixture
+def replay(capsys):
+    """Answer a case again with the executable evaluate; return its exit code and output."""
+    def run(case, landmark_map):
+        capsys.readouterr()
+        code = evaluate(['--bag', str(case), '--map', str(landmark_map)])
+        return code, capsys.readouterr().out
+    return run
+
+
+def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester, room_map,
+                                                        tmp_path, replay):
+    own_relocalizer(record_folder=tmp_path / 'cases', algorithm='auto')
+    answer = tester.relocalize(four_of())
+    assert answer.message.startswith('refused: ')
+    stored = record(tester)
+    assert stored.success, stored.message
+    (case,) = (tmp_path / 'cases').iterdir()
+    assert case.name.endswith('_refused')
+    assert stored.message == f'{case}: 1 frames; {answer.message}'
+    code, output = replay(case, room_map)
+    assert code == 0, output
+    assert output.endswith('the same verdict\n')
+    reason = answer.message.removeprefix('refused: ').rpartition(' [')[0]
+    assert f'again:    refused: {reason}\n' in output
+    assert f'map {hash_of(room_map)}' in answer.message
+    assert f'map {hash_of(room_map)}\n' in output
+    # topics are those of the nodes, so that any tool shows the case
+    with BagReader(case) as reader:
+        assert {'/image', '/camera_info', '/detections', '/verdict'} <= reader.topics.keys()
+        image = reader.deserialize(next(reader.messages(['/image'])))
+    assert bytes(image.data) == bytes(four_of()[0].data)
+
+
+def test_an_accepted_pose_and_a_map_that_refuses_it(own_relocalizer, tester, room_map, tmp_path,
+                                                    replay):
+    own_relocalizer(record_folder=tmp_path)
+    assert tester.relocalize(make_frame()).success
+    assert record(tester).success
+    (case,) = tmp_path.glob('case_*_accepted')
+    assert replay(case, room_map)[0] == 0
+    other = tmp_path / 'other.yaml'
+    other.write_text(room_map.read_text().replace('class_id: ', 'class_id: other_'))
+    code, output = replay(case, other)
+    assert code == 1
+    assert output.endswith('another verdict\n')
+
+
+def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
+    folder = tmp_path / 'cases'
+    own_relocalizer(record_folder=folder, record_limit_mb=1, timeout_s=1.0)
+    assert record(tester).message == (
+        'not recorded: nothing to record: the last request saw no frame: no request yet')
+    assert tester.relocalize(make_frame()).success
+    assert record(tester).success  # 0.9 MiB
+    full = record(tester)
+    assert not full.success
+    assert 'this case would take 1 MiB more, record_limit_mb is 1: move' in full.message
+    assert len(list(folder.iterdir())) == 1
+    assert 'no fresh frame' in tester.answer(tester.ask()).message
+    assert 'the last request saw no frame: no fresh frame' in record(tester).message
+
+
+def test_a_folder_that_cannot_be_made(own_relocalizer, tester, tmp_path):
+    (tmp_path / 'file').touch()
+    process = own_relocalizer(record_folder=tmp_path / 'file/cases')
+    assert tester.relocalize(make_frame()).success
+    assert 'Not a directory' in record(tester).message
+    assert tester.relocalize(make_frame()).success
+    assert 'Traceback' not in process.output()
+
+
+def test_a_broken_case_is_named(tmp_path):
+    text = {'/verdict': 'std_msgs/msg/String'}
+    with BagWriter(tmp_path / 'bare') as writer:
+        for name, msgtype in text.items():
+            writer.add_topic(name, msgtype)
+    with pytest.raises(DatasetError, match='neither /image nor /image/compressed'):
+        read_case(tmp_path / 'bare')
+
+
+def test_a_fleet_collects_counters_and_the_hash(own_relocalizer, tester, room_map):
+    own_relocalizer()
+    heard = []
+    subscription = tester.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+    for frame in (make_frame(), make_frame(see_room(make_room()).select(np.array([0, 1]))),
+                  four_of()):
+        tester.relocalize(frame)
+
+    def values():
+        return {value.key: value.value for value in heard[-1].status[0].values} if heard else {}
+    tester.wait(lambda: values().get('requests') == '3', 'the counters')
+    counted = values()
+    tester.destroy_subscription(subscription)
+    assert (counted['requests accepted'], counted['requests refused']) == ('1', '2')
+    assert counted['refused: too few objects'] == '1'
+    assert sum(int(value) for key, value in counted.items() if key.startswith('refused: ')) == 2
+    assert 0.0 < float(counted['requests longest [s]']) <= float(counted['requests total [s]'])
+    assert counted['map hash'] == hash_of(room_map)
+    # by default no frame is kept
+    assert record(tester).message.startswith('not recorded: record_folder is empty: set it')

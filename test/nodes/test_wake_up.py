@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable wake_up with a real relocalizer and, where nav2_msgs is there, a real `spin`."""
+
+import itertools
+import math
+import re
+import signal
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from processes import wait_for
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.task import Future
+from scene import make_room, see_room
+from tester import RELIABLE, class_matching, make_frame
+
+ACCEPTED, REFUSED, NOT_READY, INTERRUPTED = 0, 1, 2, 130
+LOOK = (r'^look (\d+) \[[0-9.]+ s\](, (?:not )?turned by .*?)?: '
+        r'((?:accepted|refused|withheld): .*)$')
+
+
+def looks(process):
+    """What was printed for each look: its number, what was turned before, and the answer."""
+    return [(int(number), turned, answer) for number, turned, answer in re.findall(
+        LOOK, process.output(), re.MULTILINE)]
+
+
+def poor_frame():
+    """A frame with two objects: too few for a pose."""
+    return make_frame(see_room(make_room()).select(np.array([0, 1])))
+
+
+@pytest.fixture
+def end(tester):
+    """Publish frames until a wake-up has ended; return its exit code."""
+    def run(process, frame=lambda: ()):
+        def work():
+            tester.publish(frame())
+            tester.spin()
+        wait_for(lambda: not process.alive, 'the end of the wake-up', work=work)
+        print(process.output())
+        return process.stop()[0]
+    return run
+
+
+@pytest.fixture
+def wake_up_until(start, end):
+    """Wake up with more and more time, as a busy machine needs it, until that shows a text."""
+    def run(text, *arguments, frame=lambda: ()):
+        for timeout_s in (3, 12, 48):
+            process = start('cli.wake_up', *arguments, '--timeout', timeout_s)
+            code = end(process, frame)
+            if text in process.output():
+                break
+        return process, code
+    return run
+
+
+class Spinner:
+    """A server of Nav2's spin for a robot that sees nothing before it has turned enough.
+
+    Each goal takes the next of the outcomes: 'turn', 'collide', 'refuse' or 'hang' until it is
+    cancelled; the last one repeats.
+    """
+
+    def __init__(self, tester, *outcomes):
+        from nav2_msgs.action import Spin
+        self._spin, self._outcomes = Spin, list(outcomes)
+        self.yaw, self.goals, self.cancelled = 0.0, [], Future()
+        self.server = ActionServer(tester, Spin, 'spin', self._execute, goal_callback=self._take,
+                                   cancel_callback=self._cancel)
+
+    def _take(self, goal):
+        self.goals.append(goal)
+        return GoalResponse.REJECT if self._outcomes[0] == 'refuse' else GoalResponse.ACCEPT
+
+    def _cancel(self, handle):
+        self.cancelled.set_result(True)
+        return CancelResponse.ACCEPT
+
+    async def _execute(self, handle):
+        outcome = self._outcomes.pop(0) if len(self._outcomes) > 1 else self._outcomes[0]
+        if outcome == 'hang':
+            await self.cancelled
+            handle.canceled()
+        elif outcome == 'collide':
+            handle.abort()
+            return self._spin.Result(error_code=self._spin.Result.COLLISION_AHEAD,
+                                     error_msg='Collision Ahead')
+        else:
+            self.yaw += handle.request.target_yaw
+            handle.succeed()
+        return self._spin.Result()
+
+
+@pytest.fixture
+def serve_spin(tester):
+    """Serve the action spin in the test's node."""
+    started = []
+
+    def run(*outcomes):
+        started.append(Spinner(tester, *outcomes))
+        return started[-1]
+    yield run
+    for spinner in started:
+        spinner.server.destroy()
+
+
+def test_a_sure_pose_is_accepted_with_the_first_look(relocalizer, start, end):
+    process = start('cli.wake_up')
+    assert end(process, make_frame) == ACCEPTED
+    ((number, turned, answer),) = looks(process)
+    assert (number, turned) == (1, '')
+    assert answer.startswith('accepted: x 0.3')
+
+
+def test_refusals_end_when_time_is_up(relocalizer, wake_up_until, tester):
+    process, code = wake_up_until('look 2 ', '--turn-deg', 0, frame=poor_frame)
+    assert code == REFUSED
+    answers = looks(process)
+    assert [number for number, _, _ in answers] == [*range(1, len(answers) + 1)]
+    assert len(answers) > 1
+    assert all(answer.startswith('refused: 2 detections') for _, _, answer in answers)
+    assert process.output().count('not turning: switched off') == 1
+    assert f'refused: {len(answers)} looks in ' in process.output()
+    assert not tester.initial_poses
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_the_robot_turns_until_it_sees_enough(relocalizer, start, end, serve_spin):
+    spinner = serve_spin('turn', 'collide', 'turn')
+    process = start('cli.wake_up', '--turn-deg', 30)
+    # after a collision it turns to the other side: past where it began
+    assert end(process, lambda: make_frame() if spinner.yaw < -0.4 else poor_frame()) == ACCEPTED
+    steps = [math.degrees(goal.target_yaw) for goal in spinner.goals]
+    # an image from before a turn may still be on its way: another turn
+    assert steps[:4] == pytest.approx([30.0, 30.0, -30.0, -30.0])
+    turns = [turned for _, turned, _ in looks(process) if turned]
+    assert len(turns) == len(steps)
+    assert all(goal.time_allowance.sec == 10 for goal in spinner.goals)
+    assert turns[:4] == [
+        ', turned by 30 deg',
+        ', not turned by 30 deg (aborted: collision ahead, Collision Ahead, code 703)',
+        ', turned by -30 deg', ', turned by -30 deg']
+    *others, last = [answer.split(':')[0] for _, _, answer in looks(process)]
+    assert (set(others), last) == ({'refused'}, 'accepted')
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_a_server_that_refuses_every_turn(relocalizer, wake_up_until, serve_spin):
+    spinner = serve_spin('refuse')
+    process, code = wake_up_until('(refused by /spin)', frame=poor_frame)
+    assert code == REFUSED
+    sides = [turned for _, turned, _ in looks(process) if turned]
+    assert sides == [f', not turned by {side} deg (refused by /spin)'
+                     for _, side in zip(sides, itertools.cycle((45, -45)), strict=False)]
+    assert spinner.yaw == 0.0
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spin):
+    spinner = serve_spin('hang')
+    process = start('cli.wake_up')
+
+    def work():
+        tester.publish(poor_frame())
+        tester.spin()
+    wait_for(lambda: spinner.goals, 'a turn', work=work)
+    process.send(signal.SIGTERM)
+    assert end(process) == INTERRUPTED
+    assert spinner.cancelled.done()
+    tester.wait(lambda: tester.listened_to() == 0, 'the poor frames to be gone')
+    assert tester.relocalize(make_frame()).success
+
+
+def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map):
+    process = start('cli.wake_up', '--timeout', 60, '--ros-args', '-r', '__ns:=/bare')
+    process.wait_for_output('waiting: nothing serves /bare/relocalizer/relocalize: start the ')
+    start('nodes.relocalizer', '--ros-args', '-r', '__ns:=/bare',
+          parameters=class_matching(room_map))
+    image, info, detections = make_frame()
+    made, publishers = [], {}
+    try:
+        for topic, message in (('image', image), ('camera_info', info),
+                               ('detections', detections)):
+            process.wait_for_output(f'waiting: no {topic}: nobody publishes /bare/{topic}; remap')
+            publishers[topic] = tester.create_publisher(type(message), f'/bare/{topic}', RELIABLE)
+        process.wait_for_output('waiting: nobody subscribes /bare/initialpose: start the localiz')
+        made.append(tester.create_subscription(
+            PoseWithCovarianceStamped, '/bare/initialpose', lambda _: None, RELIABLE))
+
+        def publish():
+            for topic, message in zip(publishers, (image, info, detections), strict=True):
+                publishers[topic].publish(message)
+            return ()
+        assert end(process, publish) == ACCEPTED
+    finally:
+        for publisher in publishers.values():
+            tester.destroy_publisher(publisher)
+        for subscription in made:
+            tester.destroy_subscription(subscription)
+
+
+def test_without_a_relocalizer_it_is_not_ready(start, end):
+    process = start('cli.wake_up', '--relocalizer', '/nowhere/relocalizer', '--timeout', 1)
+    assert end(process) == NOT_READY
+    assert process.output().endswith(
+        'not ready: nothing serves /nowhere/relocalizer/relocalize: start the relocalizer, or '
+        'name it with --relocalizer or a namespace\n')
+
+
+def test_a_relocalizer_that_cannot_start_says_why(start, wake_up_until):
+    start('nodes.relocalizer', '--ros-args', '-r', '__ns:=/lost',
+          parameters=class_matching('/nowhere/map.yaml')).wait_for_output('[ERROR]')
+    process, code = wake_up_until('No such file', '--relocalizer', '/lost/relocalizer')
+    assert code == NOT_READY
+    assert re.search('not ready: /lost/relocalizer is (unconfigured|configuring): '
+                     '/nowhere/map.yaml: No such file', process.output())
+
+
+def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_map):
+    relocalizer = start('nodes.relocalizer', '--ros-args', '-r', 'relocalizer:__node:=brief',
+                        parameters=class_matching(room_map, timeout_s=60.0))
+    process = start('cli.wake_up', '--timeout', 8, '--relocalizer', 'brief')
+    tester.wait(lambda: any(one.node_name == 'brief' for one in
+                            tester.get_subscriptions_info_by_topic('/image')), 'the request')
+    relocalizer.stop(signal.SIGKILL)
+    assert end(process) == NOT_READY
+    assert re.search(r'look 1 \[\d+\.\d s\]: /brief has been silent for \d s: it died; start '
+                     'it again', process.output())
+
+
+def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer, start, tester):
+    process = start('cli.wake_up')
+    tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the request')
+    process.stop(signal.SIGKILL)
+    assert tester.relocalize(make_frame()).success
+
+
+@pytest.mark.parametrize('arguments', [
+    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181'),
+    ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken')])
+def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end, arguments):
+    process = start('cli.wake_up', *arguments)
+    assert end(process) == NOT_READY
+    assert 'error: ' in process.output()
+    assert 'Traceback' not in process.output()
+
+

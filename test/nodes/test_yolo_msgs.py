@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Detections of yolo_ros: yolo_msgs where it is installed, a clear message where it is not."""
+
+import os
+from types import SimpleNamespace as Fields
+
+import pytest
+from processes import wait_for
+from rclpy.serialization import serialize_message
+from tester import RELIABLE, class_matching, make_frame
+
+from cliploc_ros.ros.inputs.detection_types import from_yolo_msg
+
+
+def as_yolo(msg, array=Fields, detection=Fields):
+    """Return detections with the fields of a yolo_msgs/DetectionArray."""
+    made = []
+    for one in msg.detections:
+        guess, box = one.results[0].hypothesis, one.bbox
+        made.append(detection(class_id=0, class_name=guess.class_id, score=guess.score, id=''))
+        made[-1].bbox = made[-1].bbox if hasattr(made[-1], 'bbox') else Fields(
+            center=Fields(position=Fields(), theta=0.0), size=Fields())
+        made[-1].bbox.center.position.x = box.center.position.x
+        made[-1].bbox.center.position.y = box.center.position.y
+        made[-1].bbox.size.x, made[-1].bbox.size.y = box.size_x, box.size_y
+    return array(header=msg.header, detections=made)
+
+
+def test_all_that_counts_is_kept():
+    expected = make_frame()[2]
+    assert serialize_message(from_yolo_msg(as_yolo(expected))) == serialize_message(expected)
+
+
+def test_a_detection_without_a_name_keeps_its_number():
+    yolo = as_yolo(make_frame()[2])
+    yolo.detections[0].class_name, yolo.detections[0].class_id = '', 41
+    assert from_yolo_msg(yolo).detections[0].results[0].hypothesis.class_id == '41'
+
+
+@pytest.mark.needs('yolo_msgs')
+def test_a_request_with_detections_of_yolo_ros(own_relocalizer, tester):
+    from yolo_msgs.msg import Detection, DetectionArray
+    process = own_relocalizer('--ros-args', '-r', 'detections:=yolo/detections',
+                              detections_type='yolo_msgs')
+    publisher = tester.create_publisher(DetectionArray, 'yolo/detections', RELIABLE)
+    image, info, detections = make_frame()
+    yolo = as_yolo(detections, DetectionArray, Detection)
+    try:
+        future = tester.ask()
+
+        def work():
+            tester.publish([image, info])
+            publisher.publish(yolo)
+            tester.spin()
+        wait_for(future.done, 'an answer', work=work)
+        assert future.result().success, process.output()
+    finally:
+        tester.destroy_publisher(publisher)
+
+
+def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):
+    (tmp_path / 'yolo_msgs.py').write_text("raise ImportError('not here')")
+    process = start('nodes.relocalizer', parameters=class_matching(
+        room_map, detections_type='yolo_msgs'), PYTHONPATH=os.pathsep.join(
+            [str(tmp_path), os.environ.get('PYTHONPATH', '')]))
+    process.wait_for_output('[ERROR]')
+    tester.connect()
+    assert 'detections_type: yolo_msgs is not installed' in process.output()
+    assert 'yolo_msgs is not installed' in tester.answer(tester.ask()).message
+    assert 'Traceback' not in process.output()

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Refusals by kind, and the hash of a map."""
+
+import hashlib
+
+import pytest
+from scene import make_room, write_map
+
+from cliploc_ros.core.acceptance.verdict import Evidence, refusal
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import MapError
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.counters import RequestCounters, refusal_kind
+from cliploc_ros.ros.map_hash import load_hashed_map
+
+
+@pytest.mark.parametrize(('kind', 'evidence'), [
+    ('too few objects', Evidence(2, 1.0)),
+    ('search too short', Evidence(9, 1.0, coverage=0.1, tried=400)),
+    ('search too short', Evidence(9, 1.0, meetings=0.0, tried=900, coverage=0.5)),
+    ('looks alike', Evidence(9, 1.0, distinct=0.5, twin=(1.0, 2.0, 3.0))),
+    ('position uncertain', Evidence(9, 1.0, near=0.5, deviation_m=2.0)),
+    ('ambiguous', Evidence(9, 0.5, rival=0.5)),
+    ('objects unexplained', Evidence(4, 0.5, unexplained=6.0)),
+    ('frames disagree', Evidence(9, 1.0, looks=4, agreeing=1)),
+])
+def test_every_refusal_has_its_kind(kind, evidence):
+    reason = refusal(evidence, RelocalizerOptions())
+    assert reason
+    assert refusal_kind(reason) == kind
+
+
+def test_counts_add_up():
+    counters = RequestCounters()
+    counters.add(Answer(Verdict.ACCEPTED, 'x 1.00'), 0.5)
+    counters.add(Answer(Verdict.REFUSED, 'a reason that nobody knows'), 2.0)
+    counters.add(Answer(Verdict.FAILED, 'no fresh frame'), 1.0)
+    values = counters.values()
+    assert values['requests'] == 3
+    assert [values[f'requests {verdict}'] for verdict in Verdict] == [1, 1, 0, 1]
+    assert values['refused: other'] == 1
+    assert (values['requests total [s]'], values['requests longest [s]']) == ('3.500', '2.000')
+
+
+def test_the_hash_of_a_file_is_that_of_sha256sum(tmp_path):
+    path = tmp_path / 'map.yaml'
+    write_map(make_room(), path)
+    loaded, digest = load_hashed_map(None, str(path))
+    assert len(loaded) == 12
+    assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(digest)
+    assert len(digest) == 12
+    path.write_text(path.read_text() + '# another one\n')
+    assert load_hashed_map(None, str(path))[1] != digest
+    with pytest.raises(MapError, match='No such file'):
+        load_hashed_map(None, str(tmp_path / 'none.yaml'))
