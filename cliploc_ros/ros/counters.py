@@ -9,10 +9,10 @@ from cliploc_ros.ros.answer import Answer, Verdict
 
 # Of each kind of refusal what its reason contains; the first that fits counts.
 _KINDS = (
-    ('looks alike', 'looks alike'),
+    ('looks alike', 'look alike'),
     ('position uncertain', 'position uncertain'),
     ('ambiguous', 'ambiguous'),
-    ('frames disagree', 'lead to this pose'),
+    ('frames disagree', 'frames in this pose'),
     ('search too short', 'search stopped'),
     ('search too short', 'too few to find rivals'),
     ('search too short', 'pose met only'),

@@ -23,7 +23,7 @@ from cliploc_ros.ros.map_hash import load_hashed_map
     ('position uncertain', Evidence(9, 1.0, near=0.5, deviation_m=2.0)),
     ('ambiguous', Evidence(9, 0.5, rival=0.5)),
     ('objects unexplained', Evidence(4, 0.5, unexplained=6.0)),
-    ('frames disagree', Evidence(9, 1.0, looks=4, agreeing=1)),
+    ('frames disagree', Evidence(9, 1.0, earlier=(0.0, 0.0, 0.0))),
 ])
 def test_every_refusal_has_its_kind(kind, evidence):
     reason = refusal(evidence, RelocalizerOptions())

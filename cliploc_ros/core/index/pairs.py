@@ -21,6 +21,8 @@ from cliploc_ros.core.compiled import compiled
 # not give the turn. 100,000 landmarks take 30 MB.
 _NEIGHBOURS = 10
 _LENGTH_M = (0.3, 3.0)
+# Larger maps have fewer neighbours of each landmark, down to two, which a repeat needs.
+_MOST_PAIRS, _LEAST_NEIGHBOURS = 2_000_000, 2
 # Pairs are alike if distance and height differ by less than this, also the side of a bin [m].
 _ALIKE_M = 0.25
 _LENGTH_BINS, _RISE_BINS = 14, 28
@@ -40,7 +42,7 @@ class LandmarkPairs(NamedTuple):
 
     Parameters
     ----------
-    neighbours : ndarray (L, 10) of int
+    neighbours : ndarray (L, k) of int
         Neighbours of each landmark; -1 for none.
     centers, classes : ndarray (L, 3), (L,)
         Of the landmarks.
@@ -82,8 +84,9 @@ def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: c
                ) -> LandmarkPairs:
     """Return the pairs of landmarks (L, 3) of some classes (L,), whose tree is given."""
     count = len(centers)
-    neighbours = np.full((count, _NEIGHBOURS), count, dtype=np.int32)
-    ranks = np.arange(2, min(_NEIGHBOURS + 1, count) + 1)
+    columns = max(_LEAST_NEIGHBOURS, min(_NEIGHBOURS, _MOST_PAIRS // count))
+    neighbours = np.full((count, columns), count, dtype=np.int32)
+    ranks = np.arange(2, min(columns + 1, count) + 1)
     if len(ranks):
         neighbours[:, :len(ranks)] = tree.query(centers, ranks,
                                                 distance_upper_bound=_LENGTH_M[1])[1]
