@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
+from cliploc_ros.core.index.duplicates import objects_of
+from cliploc_ros.core.index.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
@@ -35,6 +37,10 @@ _MAX_TEXT_LENGTH = 1000
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
 _MAX_COORDINATE_M = 1e7
 _MAX_QUATERNION_NORM_ERROR = 0.01
+# Distance of two classes in the tree that has the class as a fourth coordinate.
+_CLASS_DISTANCE_M = 10.0
+# A landmark is compared with so many of its class, nearer than this, to find duplicates.
+_COMPARED, _NEAR_M = 3, 0.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,8 @@ class LandmarkMap:
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
-        _ = (self.shapes, self.classes, self.sorted_landmarks, self.tree, self.position_sigmas)
+        _ = self.shapes, self.classes, self.sorted_landmarks, self.tree, self.pairs
+        _ = self.objects, self.position_sigmas
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -121,6 +128,57 @@ class LandmarkMap:
     def tree(self) -> cKDTree:
         """Return the centres, to find the landmarks near a spot."""
         return cKDTree(self.centers)
+
+    @cached_property
+    def pairs(self) -> LandmarkPairs:
+        """Return pairs of neighbours, to find what the map has more than once."""
+        return make_pairs(self.centers, self.classes.of_landmarks, self.tree)
+
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """Return the number of each landmark's object (L,): duplicates share one."""
+        rows = np.arange(len(self))
+        ranks = [*range(2, min(_COMPARED + 1, len(self)) + 1)]
+        if not ranks:
+            return rows
+        near = self._tree_of_classes.query(self._with_class(self.centers, rows), ranks,
+                                           distance_upper_bound=_NEAR_M)[1]
+        first, column = np.nonzero(near < len(self))
+        return objects_of(self.centers, self.shapes,
+                          np.column_stack([first, near[first, column]]))
+
+    @cached_property
+    def _tree_of_classes(self) -> cKDTree:
+        return cKDTree(self._with_class(self.centers, np.arange(len(self))))
+
+    def of_class_near(self, spots: NDArray[np.float64], landmarks: NDArray[np.int64],
+                      near_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the landmark nearest to each spot, of those of a landmark's class.
+
+        Parameters
+        ----------
+        spots : ndarray (..., n, 3)
+        landmarks : ndarray (n,) of int
+            One for each spot.
+        near_m : float
+            How near it must be, below 10 [m].
+
+        Returns
+        -------
+        nearest : ndarray (..., n) of int
+            0 where there is none.
+        found : ndarray (..., n) of bool
+        """
+        distances, rows = self._tree_of_classes.query(self._with_class(spots, landmarks),
+                                                      distance_upper_bound=near_m)
+        found = np.isfinite(distances)
+        return np.where(found, rows, 0), found
+
+    def _with_class(self, spots: NDArray[np.float64], landmarks: NDArray[np.int64]
+                    ) -> NDArray[np.float64]:
+        """Return spots (..., n, 3) and the class of a landmark for each, as points (..., n, 4)."""
+        classes = np.broadcast_to(self.classes.of_landmarks[landmarks], spots.shape[:-1])
+        return np.concatenate([spots, _CLASS_DISTANCE_M * classes[..., None]], axis=-1)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> 'LandmarkMap':

@@ -28,12 +28,15 @@ class Hypothesis:
         uncertain as that of the best hypothesis.
     support : Support
         Basis of the confidence.
+    handicap : float
+        Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.attitude.
     """
 
     map_from_camera: NDArray[np.float64]
     score: float
     confidence: float
     support: Support
+    handicap: float = 0.0
 
 
 @dataclass(frozen=True)

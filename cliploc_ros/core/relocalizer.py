@@ -14,13 +14,14 @@ from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import (
     RIGHT_M,
     ComparedFrame,
+    Setting,
     Support,
     agreeing_poses,
     confidences,
     support,
     utilities,
 )
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, look_alike
+from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
@@ -32,12 +33,14 @@ from cliploc_ros.core.fit.finalists import (
     Match,
     covariance_of,
     find_finalists,
+    first_of_each_place,
     matches_of,
     meetings_of,
 )
+from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
-from cliploc_ros.core.joined_map import place_of
+from cliploc_ros.core.joined_map import Place, place_of
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -52,6 +55,7 @@ from cliploc_ros.errors import OptionsError
 #: time grows with the square; and the tenth view of the same objects adds little.
 MAX_FRAMES = 10
 _NO_LOOKS = Looks()
+_NONE = np.empty(0, dtype=np.int64)
 # Factor on the covariance where it decides. On simulated worlds (seeds 0 to 39) a factor of 1
 # accepts 8 more of 241 single images, and 2 of these are wrong.
 _CAUTION = 1.35
@@ -148,7 +152,7 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        cameras = _cameras_from_last([one.observation for one in frames])
+        cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
             return _nothing_found(frames, budget, f'{detections} detections give fewer than '
@@ -162,20 +166,30 @@ class Relocalizer:
                                                   'camera to more objects')
         compared = self._compare(frames, rig, cameras, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
-        likely = confidences(compared.supports, poses, handicaps=compared.handicaps)
+        likely = confidences(compared.supports, poses, self._setting(rig),
+                             handicaps=compared.handicaps)
         covariance = covariance_of(frames, rig, best, matches)
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
-        evidence = self._evidence(frames, compared, likely, covariance.matched,
-                                  looks.with_look(frames[-1].observation, poses[0]))
+        distinct, twin = self._distinct(frames, rig, cameras, compared)
+        evidence = replace(self._evidence(frames, compared, likely, covariance.matched),
+                           earlier=looks.confidences_in(frames[-1].observation, poses[0]),
+                           distinct=distinct, place=place_of(self._map, poses[0]).position,
+                           twin=twin and twin.position, twin_map=twin.name if twin else '')
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 likely * evidence.certainty, compared.supports)),
+                                 likely * evidence.certainty, compared.supports,
+                                 compared.handicaps.tolist())),
             matches=matches[-1], evidence=evidence, covariance=covariance.whole + nearby,
             tried=_tried(frames), best_iteration=best.iteration, coverage=_coverage(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+
+    def _setting(self, rig: Rig) -> Setting:
+        known = rig.verticals[:, 6].any()
+        return Setting(len(self._map),
+                       self._options.vertical_deviation_deg if known else math.inf)
 
     def _finalists(self, frames: Sequence[SearchedFrame], rig: Rig, deadline: float
                    ) -> tuple[list[Finalist], NDArray[np.bool_]]:
@@ -197,7 +211,7 @@ class Relocalizer:
 
     def _compare(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
                  finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]) -> '_Compared':
-        """Return the finalists with their supports, the likeliest first.
+        """Return the finalists with their supports, the likeliest first, one of each place.
 
         Poses that ignore the known vertical come last. Without refinement the greatest score is
         first, as in the paper.
@@ -209,7 +223,9 @@ class Relocalizer:
             else tilt_handicaps(poses, self._options.tilt_deviation_deg)
         order = list(range(len(finalists)))
         if self._options.refine:
-            order = np.lexsort((handicaps - utilities(supports), ~is_upright)).tolist()
+            likeliest = np.argsort(handicaps - utilities(supports), kind='stable')
+            order = [row for known in (True, False) for row in first_of_each_place(
+                likeliest[is_upright[likeliest] == known].tolist(), finalists, MAX_DISTINCT)]
         return _Compared([finalists[row] for row in order], poses[order],
                          [matches[row] for row in order], [supports[row] for row in order],
                          handicaps[order])
@@ -228,24 +244,43 @@ class Relocalizer:
         return [support(self._map, compared, pose @ last_from_cameras, found)
                 for pose, found in zip(poses, matches, strict=True)]
 
+    def _distinct(self, frames: Sequence[SearchedFrame], rig: Rig, cameras: NDArray[np.float64],
+                  compared: '_Compared') -> tuple[float, Place | None]:
+        """Return the probability that no place that looks alike has the best pose's camera.
+
+        Next to it is where the camera would be at the likeliest of these places.
+        """
+        matched = np.array(sorted({one.landmark for found in compared.matches[0]
+                                   for one in found}), dtype=np.int64)
+        elsewhere = ~agreeing_poses(compared.poses)[0]
+        poses = find_twins(self._map, compared.poses[0], matched, compared.poses[elsewhere])
+        low, high = self._options.height_range_m
+        twins = [self._fitted(rig, pose) for pose in poses if low <= pose[2, 3] <= high]
+        if not twins:
+            return 1.0, None
+        poses = np.array([one.map_from_camera for one in twins])
+        supports = self._supports(frames, cameras, poses, [matches_of(rig, one) for one in twins])
+        chance, likeliest = chance_distinct(compared.supports[0], supports)
+        return chance, place_of(self._map, poses[likeliest])
+
+    def _fitted(self, rig: Rig, map_from_camera: NDArray[np.float64]) -> Finalist:
+        """Return a pose (4, 4) that no search met, refined like those that it met."""
+        pose = invert_transform(map_from_camera)
+        start = Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
+        if not self._options.refine:
+            return start
+        return start._replace(**refine_rig(rig, start.rotation, start.translation)._asdict())
+
     def _evidence(self, frames: Sequence[SearchedFrame], compared: '_Compared',
-                  likely: NDArray[np.float64], covariance: NDArray[np.float64], looks: Looks
-                  ) -> Evidence:
+                  likely: NDArray[np.float64], covariance: NDArray[np.float64]) -> Evidence:
         """Return the evidence for the best pose, the first of all."""
         coverage, best, supports = _coverage(frames), compared.finalists[0], compared.supports
         elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
         rivals = likely[elsewhere]
-        matched = np.array(sorted({one.landmark for found in compared.matches[0]
-                                   for one in found}), dtype=np.int64)
-        twins = elsewhere[look_alike(self._map, compared.poses[0], matched,
-                                     compared.poses[elsewhere])]
-        twin = place_of(self._map, compared.poses[twins[0]]) if len(twins) else None
         rival = elsewhere[np.argmax(rivals)] if len(elsewhere) else 0
         return Evidence(
             supports[0].inliers, likely[0],
             min(max(rivals, default=0.0), 1.0 - likely[0]),
-            distinct=chance_distinct(supports[0], [supports[row] for row in twins]),
-            twin=twin and twin.position, twin_map=twin.name if twin else '',
             rival_map=place_of(self._map, compared.poses[rival]).name,
             # the covariance of a minimal sample is too rough to decide
             near=1.0 if best.information is None else share_within(
@@ -255,8 +290,7 @@ class Relocalizer:
             tried=sum(one.known_tried for one in frames),
             meetings=math.inf if is_exhaustive(coverage, self._options)
             else meetings_of(frames, best, compared.matches[0]),
-            unexplained=supports[0].unexplained, looks=len(looks),
-            agreeing=looks.agreeing)
+            unexplained=supports[0].unexplained)
 
 
 class _Compared(NamedTuple):
@@ -295,7 +329,7 @@ def _coverage(frames: Sequence[SearchedFrame]) -> float:
     return min(one.progress.coverage for one in frames)
 
 
-def _cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
     """Return each camera from the last (F, 4, 4), by odometry."""
     if not 1 <= len(observations) <= MAX_FRAMES:
         raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')

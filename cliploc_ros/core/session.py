@@ -3,7 +3,7 @@
 """Localizing frame after frame of one moving camera: what the relocalizer node does.
 
 A session fuses each frame with the last few that odometry links to it, and accepts a pose only
-where the successive looks agree.
+where the successive looks are sure of it on average.
 """
 
 from collections.abc import Iterable, Sequence
@@ -96,7 +96,8 @@ class Session:
         self._frames = [*earlier, KeptFrame(newest, anchor)]
         self.observation = newest.observation
         if found.map_from_camera is not None:
-            self._looks = self._looks.with_look(observation, found.map_from_camera)
+            self._looks = self._looks.with_look(observation, found.map_from_camera,
+                                                found.confidence)
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

@@ -10,6 +10,7 @@ compiles them, as script/setup does.
 import logging
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.compiled import warm_up
@@ -18,8 +19,9 @@ from cliploc_ros.core.fit.rig import make_rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.index.pairs import find_repeats, make_pairs
 from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import Leaders, same_place
+from cliploc_ros.core.search.leaders import Leaders, are_near, same_place
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.strategies import (
@@ -49,7 +51,10 @@ def call_every_kernel() -> None:
     verify_rig(rig, np.eye(3), np.zeros(3))
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
     project_ellipsoids(np.eye(4), centers, shapes)
+    classes = np.zeros(3, dtype=np.int64)
+    find_repeats(make_pairs(centers, classes, cKDTree(centers)), classes)
 
 
 def main() -> None:

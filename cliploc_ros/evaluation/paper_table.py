@@ -56,8 +56,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
              '(one of bf and auto, which draw no samples); ± is the standard deviation over '
              'trials, at 1 m.',
-             f'Confidences are fitted on {FITTED_ON}: on these frames, precision and recall are '
-             'not held out.']
+             f'Confidences are fitted on {FITTED_ON}.']
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'
               for one in summaries if 0.0 < one.crops_share < 1.0]

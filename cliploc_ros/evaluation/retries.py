@@ -87,7 +87,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
             found = session.localize(next(stages), more=stages)
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
-                replace(found.evidence, looks=1, agreeing=1), options))
+                replace(found.evidence, earlier=()), options))
             errors_m.append(np.inf if found.map_from_camera is None else
                             pose_error(found.map_from_camera, query.map_from_camera)[0])
         yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))
@@ -134,7 +134,7 @@ def run(arguments: list[str]) -> int:
     elsewhere, _ = exchange_landmarks(landmark_map, queries, 1.0,
                                       np.random.default_rng(options.seed))
     for place, its_map in (('true map', landmark_map), ('another place', elsewhere)):
-        for least in (0.99, 0.5):
+        for least in (RelocalizerOptions.min_confidence, 0.5):
             name = f'{place}, min_confidence {least:g}'
             robots = retry(its_map, queries, RelocalizerOptions(min_confidence=least),
                            options.seed)

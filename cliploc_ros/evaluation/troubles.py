@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.landmark_details import LandmarkDetails
 from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
 
 _BOX_SIDE_PX = (20.0, 200.0)
+_MOVED_M = (0.3, 3.0)
 
 World = tuple[LandmarkMap, Sequence[Query]]
 Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
@@ -68,6 +69,41 @@ def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
                    for query in queries]
 
 
+def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                 rng: np.random.Generator) -> World:
+    """Move a share of the landmarks to other spots at their height, 0.3 to 3 m away."""
+    count = len(landmark_map)
+    chosen = rng.permutation(count)[:round(share * count)]
+    angles, steps = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(*_MOVED_M, count)
+    moved = landmark_map.centers.copy()
+    moved[chosen, :2] += (steps * np.stack([np.cos(angles), np.sin(angles)])).T[chosen]
+    return replace(landmark_map, centers=moved), queries
+
+
+def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+                     rng: np.random.Generator) -> World:
+    """Add a second landmark of the same object next to each one, in random directions."""
+    steps = rng.normal(size=landmark_map.centers.shape)
+    steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
+    return _with_copies(landmark_map, queries, steps)
+
+
+def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[Query], gap_m: float,
+                   rng: np.random.Generator) -> World:
+    """Add a room that equals the mapped one, beside it."""
+    width = float(np.ptp(landmark_map.centers[:, 0]))
+    return _with_copies(landmark_map, queries, np.array([width + gap_m, 0.0, 0.0]))
+
+
+def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count: float,
+                      rng: np.random.Generator) -> World:
+    """Replace the boxes of each query by random ones of the map's classes."""
+    return landmark_map, [replace(query, observation=_random_boxes(
+        query.observation, landmark_map, int(count), rng), neighbours=tuple(
+            _random_boxes(one, landmark_map, int(count), rng) for one in query.neighbours))
+        for query in queries]
+
+
 def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                     rng: np.random.Generator) -> World:
     """Drop a share of the boxes."""
@@ -78,6 +114,45 @@ def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share
                       rng: np.random.Generator) -> World:
     """Add random boxes, a number for each true one, that look like random landmarks."""
     return landmark_map, [_with_invented(query, share, rng) for query in queries]
+
+
+def _with_copies(landmark_map: LandmarkMap, queries: Sequence[Query], steps: NDArray[np.float64]
+                 ) -> World:
+    """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
+    count = len(landmark_map)
+    rows = [*range(count), *range(count)]
+    copies = landmark_map.select(rows)
+    ids = (*landmark_map.landmark_ids, *(f'{one}_copy' for one in landmark_map.landmark_ids))
+    centers = np.concatenate([landmark_map.centers, landmark_map.centers + steps])
+    return replace(copies, landmark_ids=ids, centers=centers), [
+        replace(query, observation=_of_columns(query.observation, rows),
+                neighbours=tuple(_of_columns(one, rows) for one in query.neighbours))
+        for query in queries]
+
+
+def _of_columns(observation: Observation, columns: list[int]) -> Observation:
+    """Return an observation with the similarities of some landmarks."""
+    return observation if observation.similarities is None else replace(
+        observation, similarities=np.ascontiguousarray(
+            np.asarray(observation.similarities)[:, columns]))
+
+
+def _random_boxes(observation: Observation, landmark_map: LandmarkMap, count: int,
+                  rng: np.random.Generator) -> Observation:
+    """Return an observation of random boxes, each of which looks like a random landmark."""
+    camera, similarities = observation.camera, observation.similarities
+    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
+    shown = rng.integers(len(landmark_map), size=count)
+    looks = None
+    if similarities is not None:
+        known = np.asarray(similarities)
+        rows = known[rng.integers(len(known), size=count)] if len(known) \
+            else np.zeros((count, len(landmark_map)), dtype=np.float32)
+        looks = np.ascontiguousarray(rng.permuted(rows, axis=1))
+    return replace(observation, detections=Detections(
+        boxes, tuple(landmark_map.class_ids[row] for row in shown), np.full(count, 0.8)),
+        similarities=looks)
 
 
 def _of_rows(details: tuple[LandmarkDetails, ...], rows: NDArray[np.int64]

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import Support, confidences, utilities
+from cliploc_ros.core.acceptance.confidence import Setting, Support, confidences, utilities
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.options import RelocalizerOptions
@@ -43,10 +43,10 @@ def test_the_heading_does_not_matter_nor_a_deviation_of_zero():
 
 
 def test_a_handicap_takes_confidence_and_gives_it_to_the_rival():
-    supports, poses = [Support(4, 2.5, 6.0, 8.0, 3)] * 2, np.tile(np.eye(4), (2, 1, 1))
+    supports, poses = [Support(4, 2.5, 6.0, 8.0, 6.0)] * 2, np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 5.0
-    level = confidences(supports, poses)
-    upside_down = confidences(supports, poses, handicaps=np.array([WRONG_MOUNT, 0.0]))
+    level = confidences(supports, poses, Setting(40))
+    upside_down = confidences(supports, poses, Setting(40), handicaps=np.array([WRONG_MOUNT, 0.0]))
     assert level[0] == pytest.approx(level[1])
     assert upside_down[0] < 0.02 < level[1] < upside_down[1]
 
@@ -71,9 +71,10 @@ def test_the_share_within_a_distance_is_that_of_drawn_positions(deviations_m, rn
 def test_a_pose_of_uncertain_position_is_refused_and_says_so():
     certain = Evidence(5, 0.9999, near=0.9999, deviation_m=0.1)
     vague = replace(certain, near=0.95, deviation_m=0.514)
-    assert refusal(certain, RelocalizerOptions()) == ''
+    options = RelocalizerOptions(min_confidence=0.99)
+    assert refusal(certain, options) == ''
     assert vague.confidence == pytest.approx(0.9499, abs=1e-4)
-    reason = refusal(vague, RelocalizerOptions())
+    reason = refusal(vague, options)
     assert reason.startswith('confidence 0.94 < 0.99; position uncertain by 0.51 m; turn the')
 
 

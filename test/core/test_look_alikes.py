@@ -3,19 +3,25 @@
 """Places that look alike, found in the map, and what tells them apart."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import Support
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, look_alike
+from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
-from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
 
 CLASSES = ('chair', 'cup', 'book', 'tv')
+NOWHERE = np.empty((0, 4, 4))
 
 
 def make_map(centers, classes):
@@ -25,89 +31,214 @@ def make_map(centers, classes):
                                                                 (len(centers), 1)))
 
 
+def move_of(turn_deg, shift):
+    return make_transform(Rotation.from_euler('z', turn_deg, degrees=True).as_matrix(),
+                          np.array(shift, dtype=float))
+
+
+def moved(points, move):
+    return points @ move[:3, :3].T + move[:3, 3]
+
+
+def shift_along(x_m):
+    return np.array([x_m, 0.0, 0.0])
+
+
+def one_room(seed=1, count=12):
+    rng = np.random.default_rng(seed)
+    return rng.uniform((-2, -2, 0), (2, 2, 2), (count, 3)), [CLASSES[row % 4]
+                                                            for row in range(count)]
+
+
 def two_rooms(turn_deg=0.0, missing=0, noise_m=0.0, seed=1):
     """Return a map of two equal rooms, and the pose in the second one that matches the origin."""
-    rng = np.random.default_rng(seed)
-    room = rng.uniform((-2, -2, 0), (2, 2, 2), (12, 3))
-    move = make_transform(Rotation.from_euler('z', turn_deg, degrees=True).as_matrix(),
-                          np.array([9.0, 3.0, 0.0]))
-    twin = room @ move[:3, :3].T + move[:3, 3] + noise_m * rng.normal(size=room.shape)
-    classes = [CLASSES[row % 4] for row in range(12)]
-    return (make_map(np.concatenate([room, twin[missing:]]), classes + classes[missing:]), move)
+    room, classes = one_room(seed)
+    move = move_of(turn_deg, (9, 3, 0))
+    twin = moved(room, move) + noise_m * np.random.default_rng(seed).normal(size=room.shape)
+    return make_map(np.concatenate([room, twin[missing:]]), classes + classes[missing:]), move
 
 
-@pytest.mark.parametrize('turn_deg', [0.0, 90.0, 180.0])
+@pytest.mark.parametrize('turn_deg', [0.0, 90.0, 180.0, 243.0])
 @pytest.mark.parametrize('missing', [0, 4])
-def test_two_equal_rooms_look_alike_from_both(turn_deg, missing):
+def test_two_equal_rooms_are_twins_that_no_search_met(turn_deg, missing):
     rooms, move = two_rooms(turn_deg, missing, noise_m=0.03)
-    here = np.eye(4)
-    matched = np.arange(missing, 12)
-    assert look_alike(rooms, here, matched, move[None]).tolist() == [True]
-    assert look_alike(rooms, move, matched + 12 - missing, here[None]).tolist() == [True]
+    here, matched = np.eye(4), np.arange(missing, 12)
+    for pose, seen, twin in ((here, matched, move), (move, matched + 12 - missing, here)):
+        found = find_twins(rooms, pose, seen, NOWHERE)
+        distance_m, angle_deg = pose_error(found[0], twin)
+        assert distance_m < 0.1
+        assert angle_deg < 3.0
 
 
-def test_other_poses_do_not_look_alike():
+def test_a_room_of_its_own_has_no_twin():
+    room, classes = one_room()
+    assert len(find_twins(make_map(room, classes), np.eye(4), np.arange(12), NOWHERE)) == 0
     rooms, move = two_rooms()
-    flat = make_transform(Rotation.from_euler('x', 90, degrees=True).as_matrix(), move[:3, 3])
-    beside = move.copy()
-    beside[0, 3] += 1.0
-    others = np.stack([move, beside, flat, make_transform(np.eye(3), np.array([50.0, 0, 0]))])
-    found = look_alike(rooms, np.eye(4), np.arange(12), others)
-    assert found.tolist() == [True, False, False, False]
+    other = make_map(rooms.centers, [*classes, *['bottle'] * 12])
+    assert len(find_twins(other, np.eye(4), np.arange(12), move[None])) == 0
+
+
+def test_a_symmetric_hall_is_its_own_twin():
+    half, classes = one_room()
+    half[:, 0] += 3.0
+    hall = make_map(np.concatenate([half, moved(half, move_of(180, (0, 0, 0)))]), classes * 2)
+    pose = move_of(0, (2, 0, 1))
+    found = find_twins(hall, pose, np.arange(12), NOWHERE)
+    assert pose_error(found[0], move_of(180, (0, 0, 0)) @ pose)[0] < 0.01
+
+
+def test_the_bays_of_a_corridor_are_twins():
+    bay, classes = one_room(count=6)
+    corridor = make_map(np.concatenate([bay + shift_along(4.5 * number) for number in range(5)]),
+                        classes * 5)
+    found = find_twins(corridor, move_of(0, (9, 0, 1)), np.arange(12, 18), NOWHERE)
+    assert len(found) == 3
+    shifts = found[:, :3, 3] - [9, 0, 1]
+    assert np.allclose(shifts[:, 0] / 4.5, np.round(shifts[:, 0] / 4.5), atol=1e-6)
+    assert (np.abs(shifts[:, 0]) > 1.0).all()
+    assert np.allclose(shifts[:, 1:], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize('offset_m', [0.01, 0.1, 0.5])
+def test_a_doubled_map_is_not_its_own_twin(offset_m):
+    room, classes = one_room()
+    doubled = make_map(np.concatenate([room, room + offset_m]), classes * 2)
+    found = find_twins(doubled, np.eye(4), np.arange(12), NOWHERE)
+    assert len(found) == 0
+
+
+def test_a_map_doubled_some_metres_away_has_a_twin():
+    room, classes = one_room()
+    doubled = make_map(np.concatenate([room, room + np.array([3.0, 1.0, 0.0])]), classes * 2)
+    found = find_twins(doubled, np.eye(4), np.arange(12), NOWHERE)
+    assert np.allclose(found[0, :3, 3], [3.0, 1.0, 0.0], atol=1e-6)
+
+
+def test_poses_that_a_search_met_are_compared_too():
+    """Landmarks in a row above each other have no pairs with a direction."""
+    pile = np.array([[0.0, 0.0, 0.2 * row] for row in range(6)])
+    piles = make_map(np.concatenate([pile, pile + shift_along(5.0)]), CLASSES[:2] * 6)
+    assert len(find_repeats(piles.pairs, np.arange(6)).votes) == 0
+    met = move_of(0, (5.2, 0.1, 0.1))
+    found = find_twins(piles, np.eye(4), np.arange(6), met[None])
+    assert np.allclose(found[0, :3, 3], [5, 0, 0], atol=1e-6)
+    lying = make_transform(Rotation.from_euler('x', 90, degrees=True).as_matrix(), met[:3, 3])
+    assert len(find_twins(piles, np.eye(4), np.arange(6), lying[None])) == 0
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+def test_maps_of_few_landmarks(count):
+    few = make_map([[float(row), 0, 0] for row in range(count)], ['chair'] * count)
+    for matched in (np.arange(count), np.empty(0, dtype=np.int64)):
+        assert find_twins(few, np.eye(4), matched, np.eye(4)[None]).shape == (0, 4, 4)
+
+
+def test_landmarks_at_one_spot_and_far_away():
+    """No pair has a direction; coordinates are as large as a map may have."""
+    spot = make_map(np.full((200, 3), 1e7), ['chair'] * 200)
+    pose = move_of(0, (1e7, 1e7, 1e7))
+    assert find_twins(spot, pose, np.arange(5), NOWHERE).shape == (0, 4, 4)
 
 
 def test_what_was_matched_must_look_alike_too():
     """Half a room has a twin; the camera saw the other half."""
     rooms, move = two_rooms(missing=6)
-    assert look_alike(rooms, np.eye(4), np.arange(6, 12), move[None]).tolist() == [True]
-    assert look_alike(rooms, np.eye(4), np.arange(6), move[None]).tolist() == [False]
-    nothing = np.empty(0, dtype=np.int64)
-    assert look_alike(rooms, np.eye(4), nothing, move[None]).tolist() == [False]
-
-
-def test_the_same_objects_of_other_classes_do_not_look_alike():
-    rooms, move = two_rooms()
-    other = make_map(rooms.centers, [*rooms.class_ids[:12], *['bottle'] * 12])
-    assert look_alike(other, np.eye(4), np.arange(12), move[None]).tolist() == [False]
-
-
-def test_a_map_of_fewer_landmarks_than_are_compared():
-    few = make_map([[1.0, 0, 0]], ['chair'])
-    seen = np.array([0])
-    assert look_alike(few, np.eye(4), seen, np.eye(4)[None]).tolist() == [False]
-    assert look_alike(few, np.eye(4), seen, np.empty((0, 4, 4))).tolist() == []
+    assert pose_error(find_twins(rooms, np.eye(4), np.arange(6, 12), NOWHERE)[0], move)[0] < 0.1
+    assert len(find_twins(rooms, np.eye(4), np.arange(6), move[None])) == 0
 
 
 def test_only_labels_tell_places_apart():
     own = Support(inliers=6, score=5.0, likeness=12.0)
-    assert chance_distinct(own, []) == 1.0
-    assert chance_distinct(own, [Support(inliers=3, score=2.0, likeness=12.0)]) == 0.5
-    assert chance_distinct(own, [Support(inliers=3, score=2.0, likeness=0.0)]) > 0.99
-    assert chance_distinct(own, [Support(likeness=1e9)]) < 1e-6
+    assert chance_distinct(own, [Support(inliers=3, score=2.0, likeness=12.0)]) == (0.5, 0)
+    differing = Support(inliers=3, score=2.0, likeness=0.0)
+    assert chance_distinct(own, [differing])[0] > 0.99
+    chance, likeliest = chance_distinct(own, [differing, Support(likeness=1e9), differing])
+    assert (chance < 1e-6, likeliest) == (True, 1)
 
 
-def test_a_refusal_names_the_other_place():
-    evidence = Evidence(6, 0.9999, distinct=0.6, twin=(9.0, 3.0, 1.234))
-    reason = refusal(evidence, RelocalizerOptions())
-    assert reason.startswith('confidence 0.59 < 0.99; the place around x 9.00 y 3.00 z 1.23 m')
-    assert 'turn the camera' in reason
+def test_a_refusal_names_both_places():
+    evidence = Evidence(6, 0.9999, distinct=0.6, place=(1.0, -2.0, 0.5), twin=(9.0, 3.0, 1.234))
+    reason = refusal(evidence, RelocalizerOptions(min_confidence=0.99))
+    assert reason == ('confidence 0.59 < 0.99; (1.0, -2.0, 0.5) and (9.0, 3.0, 1.2) m look alike; '
+                      'turn the camera to objects that differ')
+    assert len(f'refused: {reason}') < 130
 
 
+def doubled_room(offset):
+    room = make_room()
+    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{one}_2' for one in
+                                                            room.landmark_ids)),
+                   labels=room.labels * 2, class_ids=room.class_ids * 2,
+                   centers=np.concatenate([room.centers, room.centers + offset]),
+                   semi_axes=np.tile(room.semi_axes, (2, 1)),
+                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
+
+
+def seen(differing=0):
+    """What a camera sees in the first of two rooms, of which some labels differ."""
+    similarities = np.full((12, 24), 0.2, dtype=np.float32)
+    similarities[np.arange(12), np.arange(12)] = 0.3
+    similarities[np.arange(differing, 12), np.arange(12 + differing, 24)] = 0.3
+    return Observation(CAMERA, see_room(make_room()), similarities)
+
+
+def test_two_identical_rooms_are_refused_until_labels_differ():
+    relocalizer = Relocalizer(doubled_room(shift_along(10.0)), RelocalizerOptions())
+    found = [relocalizer.relocalize([seen(differing)]) for differing in (0, 1, 2, 6)]
+    assert [one.accepted for one in found] == [False, False, False, True]
+    first = found[0]
+    assert first.evidence.distinct == pytest.approx(0.5, abs=0.01)
+    places = sorted([first.evidence.place[0], first.evidence.twin[0]])
+    assert places == pytest.approx([0.3, 10.3], abs=0.05)
+    for x_m in places:
+        assert f'({x_m:.1f}, ' in first.reason
+    distinct = [one.evidence.distinct for one in found]
+    assert distinct == sorted(distinct)
+    for one in found[1:]:
+        assert pose_error(one.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+@pytest.mark.parametrize('offset_m', [0.0, 0.01])
+def test_a_room_with_every_landmark_doubled_is_still_accepted(offset_m):
+    """Duplicates count as one object, and a pose is not its own rival."""
+    doubled = doubled_room(shift_along(offset_m))
+    assert doubled.objects.max() == 11
+    found = Relocalizer(doubled, RelocalizerOptions()).relocalize([seen()])
+    assert found.accepted, found.reason
+    assert found.evidence.inliers == 12
+    assert found.evidence.twin is None
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+def test_duplicates_are_of_one_class_and_overlap():
+    boxes = make_map([[0, 0, 0], [0.05, 0, 0], [0.12, 0, 0], [1, 0, 0], [0, 0, 0]],
+                     ['book', 'book', 'book', 'book', 'cup'])
+    assert boxes.objects.tolist() == [0, 0, 0, 1, 2], 'duplicates of duplicates'
+    beside = make_map([[0, 0, 0], [0.2, 0, 0]], ['book', 'book'])
+    assert beside.objects.tolist() == [0, 1]
+    assert make_map([[0, 0, 0]], ['book']).objects.tolist() == [0]
+
+
+@pytest.mark.clock
 def test_a_large_map_costs_little(record_property):
     rng = np.random.default_rng(0)
     centers = rng.uniform((0, 0, 0), (200, 200, 3), (100_000, 3))
-    large = make_map(centers, rng.choice(CLASSES, len(centers)))
+    large = make_map(centers, rng.choice([f'class {number}' for number in range(20)],
+                                         len(centers)))
     start = time.process_time()
     large.prepare()
     prepared = time.process_time() - start
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, :3, 3] = rng.uniform(20, 180, (12, 3))
-    look_alike(large, poses[0], np.arange(12), poses[1:])
+    find_twins(large, poses[0], np.arange(12), poses[1:])
     start = time.process_time()
-    for _ in range(10):
-        look_alike(large, poses[0], np.arange(12), poses[1:])
-    took = (time.process_time() - start) / 10
-    record_property('figures', f'100,000 landmarks: prepared in {prepared:.2f} s, 11 other '
-                               f'places compared in {1e3 * took:.1f} ms')
+    for pose in poses:
+        find_twins(large, pose, large.tree.query(pose[:3, 3], 12)[1], poses[:3])
+    took = (time.process_time() - start) / len(poses)
+    pairs = large.pairs
+    size = sum(one.nbytes for one in pairs) - centers.nbytes
+    record_property('figures', f'100,000 landmarks: prepared in {prepared:.2f} s, '
+                               f'{size / 1e6:.0f} MB of pairs; twins in {1e3 * took:.1f} ms')
     assert prepared < 2.0
-    assert took < 0.03
+    assert size < 40e6
+    assert took < 0.01

@@ -96,7 +96,7 @@ def test_an_early_stop_is_surer_than_the_last_one():
     asked = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
     frame, found = localize(asked)
     assert found.accepted and len(frame.observation.compared) > 0
-    frame, found = localize(replace(asked, min_confidence=1.0 - 100.0 * (1.0 - sure)))
+    frame, found = localize(replace(asked, min_confidence=1.0 - 300.0 * (1.0 - sure)))
     assert found.accepted and len(frame.observation.compared) == 0
     frame, found = localize(replace(OPTIONS, min_confidence=1.0))
     assert not found.accepted and len(frame.observation.compared) == len(SEEN)

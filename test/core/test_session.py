@@ -169,7 +169,7 @@ def test_a_pose_that_earlier_looks_contradict_is_refused(session):
     for number in range(1, 7):
         found = drive(session, number, 1.0 * number)
         assert not found.accepted and found.hypotheses
-    assert found.reason.startswith('1 of the last 7 frames lead to this pose')
+    assert found.reason.startswith('mean confidence 0.14 < 0.5 of the last 7 frames in this pose')
 
 
 def test_looks_persist_across_requests_while_odometry_links_them(session):
@@ -193,10 +193,12 @@ class Camera:
     def __init__(self):
         self.looks = Looks()
 
-    def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0):
-        """Whether most looks agree with one that finds the camera at x_m, yaw_deg."""
-        self.looks = self.looks.with_look(frame(seconds, degrees, metres), pose(yaw_deg, x_m))
-        return 2 * self.looks.agreeing > len(self.looks)
+    def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0, confidence=1.0):
+        """Return the mean confidence of all looks in one that finds the camera at x_m, yaw_deg."""
+        observation = frame(seconds, degrees, metres)
+        earlier = self.looks.confidences_in(observation, pose(yaw_deg, x_m))
+        self.looks = self.looks.with_look(observation, pose(yaw_deg, x_m), confidence)
+        return (sum(earlier) + confidence) / (len(earlier) + 1)
 
 
 @pytest.fixture
@@ -205,47 +207,52 @@ def camera():
 
 
 def test_looks_that_agree(camera):
-    assert camera.look(0.0, 0.0)
-    assert camera.look(0.1, 0.1)
-    assert camera.looks.agreeing == len(camera.looks) == 2
+    assert camera.look(0.0, 0.0) == 1.0
+    assert camera.look(0.1, 0.1) == 1.0
+    assert len(camera.looks) == 2
 
 
 def test_one_look_of_many_does_not_agree(camera):
     for number in range(6):
         camera.look(number / 10, 2.0 * number)
-    assert not camera.look(0.7, 3.1)
-    assert (camera.looks.agreeing, len(camera.looks)) == (1, 7)
-    assert not camera.look(0.8, 3.1, yaw_deg=30.0), 'turned by more than 20 degrees'
-    assert camera.looks.agreeing == 1
+    assert camera.look(0.7, 3.1) == pytest.approx(1 / 7)
+    assert camera.look(0.8, 3.1, yaw_deg=30.0) == pytest.approx(1 / 8), 'turned by 30 degrees'
 
 
-def test_most_looks_agree(camera):
-    camera.look(0.0, 9.0)
-    assert not camera.look(0.1, 1.0)
-    assert camera.look(0.2, 1.2), 'two of three'
+def test_sure_looks_outweigh_unsure_ones(camera):
+    camera.look(0.0, 9.0, confidence=0.2)
+    assert camera.look(0.1, 1.0) == 0.5
+    assert camera.look(0.2, 1.2, confidence=0.8) == pytest.approx(0.6)
+    assert camera.look(0.3, 9.0) == pytest.approx(0.3)
+
+
+def test_a_robot_that_keeps_looking_gains_nothing_from_unsure_looks(camera):
+    means = [camera.look(number / 10, 0.0, confidence=0.3) for number in range(40)]
+    assert max(means) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(('turned_deg', 'driven_m'), [(0.0, 0.0), (10.0, 0.0), (10.0, 0.8)])
 def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
     for number in range(10):
         degrees, metres = number % 2 * turned_deg, number * driven_m
-        assert camera.look(number / 10, metres, degrees, degrees, metres)
+        assert camera.look(number / 10, metres, degrees, degrees, metres) == 1.0
     stuck = [camera.look(1.0 + number / 10, 0.0, 0.0, 4.0 * number, 8.0 + number)
              for number in range(1, 10)]
-    assert not any(stuck), 'poses that do not move although the robot does'
+    assert max(stuck) < 0.5, 'poses that do not move although the robot does'
 
 
 def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
     for number in range(100):
         camera.look(number / 10, 9.0)
-    agree = [camera.look(10.0 + number / 10, 1.0) for number in range(15)]
-    assert agree == [False] * 10 + [True] * 5
+    means = [camera.look(10.0 + number / 10, 1.0) for number in range(15)]
+    assert [mean >= 0.5 for mean in means] == [False] * 9 + [True] * 6
 
 
 def test_a_look_without_odometry_stands_alone(camera):
     camera.look(0.0, 9.0)
-    alone = camera.looks.with_look(replace(frame(1.0), odom_from_camera=None), pose())
-    assert (alone.agreeing, len(alone)) == (1, 1)
+    unlinked = replace(frame(1.0), odom_from_camera=None)
+    assert camera.looks.confidences_in(unlinked, pose()) == ()
+    assert len(camera.looks.with_look(unlinked, pose(), 1.0)) == 1
 
 
 def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import ComparedFrame, Support, confidences, support
+from cliploc_ros.core.acceptance.confidence import (
+    ComparedFrame,
+    Setting,
+    Support,
+    confidences,
+    support,
+)
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.covariance import pose_covariance
@@ -127,7 +133,8 @@ def test_labels_and_classes_support_a_pose(measure, compared, queries, office_ma
     count = len(office_map)
     # one of all columns is 1, the others are 0
     assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
-    assert (found.same_class, found.unlabelled) == (1, 0)
+    own = office_map.class_ids.count(office_map.class_ids[4])
+    assert (found.rarity, found.unlabelled) == (pytest.approx(np.log(count / own)), 0)
     by_class = measure([compared._replace(
         similarities=None, similarity_rows=np.full(4, -1))], poses, matches)
     assert (by_class.likeness, by_class.unlabelled) == (0.0, 1)
@@ -149,28 +156,40 @@ def poses_at(*positions):
     return poses
 
 
-STRONG, WEAK = Support(7, 5.0, 10.0, 14.0, 7), Support(3, 1.5, 10.0, 2.0, 2)
+STRONG, WEAK = Support(7, 5.0, 10.0, 14.0, 14.0), Support(3, 1.5, 10.0, 2.0, 4.0)
+ROOM = Setting(40)
 
 
 def test_confidence_is_shared_by_poses_that_differ():
-    alone = confidences([STRONG], poses_at(0))[0]
-    first, second = confidences([STRONG, STRONG], poses_at(0, 5))
+    alone = confidences([STRONG], poses_at(0), ROOM)[0]
+    first, second = confidences([STRONG, STRONG], poses_at(0, 5), ROOM)
     assert alone > 0.99
     assert first == pytest.approx(second)
     assert 0.45 < first <= 0.5
 
 
 def test_poses_that_agree_speak_for_each_other():
-    assert confidences([STRONG, STRONG], poses_at(0, 0.6)).min() > 0.99
+    assert confidences([STRONG, STRONG], poses_at(0, 0.6), ROOM).min() > 0.99
     turned = poses_at(0, 0.6)
     turned[1, :3, :3] = Rotation.from_euler('z', 90, degrees=True).as_matrix()
-    assert confidences([STRONG, STRONG], turned).max() <= 0.5
+    assert confidences([STRONG, STRONG], turned, ROOM).max() <= 0.5
+
+
+def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
+    fair = Support(4, 3.0, 8.0, 6.0, 8.0)
+    small, large, level, vague = (confidences([fair], poses_at(0), setting)[0] for setting in (
+        Setting(20), Setting(2000), Setting(2000, 1.0), Setting(2000, 45.0)))
+    assert large < level < small
+    assert vague == large
+    # a better vertical than any that the fit has seen says no more than the best of those
+    assert (confidences([fair], poses_at(0), Setting(2000, 0.01))
+            == confidences([fair], poses_at(0), Setting(2000, 0.5)))
 
 
 def test_little_support_is_little_confidence():
-    weak, rival = confidences([WEAK, WEAK], poses_at(0, 5))
+    weak, rival = confidences([WEAK, WEAK], poses_at(0, 5), ROOM)
     assert weak + rival < 0.3
-    assert confidences([Support()], poses_at(0))[0] < 0.01
+    assert confidences([Support()], poses_at(0), ROOM)[0] < 0.01
 
 
 def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
@@ -179,7 +198,7 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
         count = rng.integers(1, 9)
         supports = [Support(int(rng.integers(0, 9)), rng.uniform(0, 9), rng.uniform(0, 30),
                             rng.uniform(0, 20)) for _ in range(count)]
-        found = confidences(supports, poses_at(*5.0 * np.arange(count)))
+        found = confidences(supports, poses_at(*5.0 * np.arange(count)), ROOM)
         # none is more certain than .9999, so none is less likely than .0001
         assert (found >= 0).all() and found.sum() <= 1.0 + 1e-4 * count
         highest = max(highest, found.sum())
@@ -208,12 +227,14 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.999, meetings=4), {'algorithm': 'ransac'}, ''),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'bf'}, ''),
-    (Evidence(5, 0.995, looks=7, agreeing=1), {}, '1 of the last 7 frames lead to this pose'),
-    (Evidence(5, 0.995, looks=4, agreeing=2), {}, '2 of the last 4 frames lead to this pose'),
-    (Evidence(5, 0.995, looks=3, agreeing=2), {}, ''),
+    (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
+     'mean confidence 0.14 < 0.5 of the last 7 frames in this pose'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, ''),
+    (Evidence(5, 0.3), {'min_confidence': 0.2}, ''),
 ])
 def test_refusal_names_its_reason(evidence, options, reason):
-    answer = refusal(evidence, RelocalizerOptions(**options))
+    answer = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
     assert answer.startswith(reason)
     assert bool(answer) == bool(reason)
     assert len(f'refused: {answer}') <= 120
@@ -244,7 +265,7 @@ def test_an_ambiguous_scene_shares_its_confidence(office_map, queries, observe):
         given = [one.confidence for one in result.hypotheses]
         assert all(0 <= one <= 1 for one in given)
         assert result.confidence == (given[0] if given else 0)
-        assert result.accepted == (result.confidence >= 0.99)
+        assert result.accepted == (result.confidence >= relocalizer.options.min_confidence)
         assert result.accepted == (not result.reason)
 
 

@@ -60,6 +60,42 @@ def test_landmarks_are_mislabelled(changed, room, questions):
                                   questions[-1].observation.similarities[:, source])
 
 
+def test_a_share_of_the_objects_is_moved(changed, room):
+    moved = changed(troubles.move_objects, 0.5)[0]
+    distances = np.linalg.norm(moved.centers - room.centers, axis=1)
+    assert (distances > 0).sum() == round(len(room) / 2)
+    assert distances[distances > 0].min() >= 0.3
+    assert distances.max() <= 3.0
+
+
+def test_landmarks_are_doubled_with_their_similarities(changed, room, questions):
+    double, asked = changed(troubles.double_landmarks, 0.1)
+    count = len(room)
+    assert len(double) == len(set(double.landmark_ids)) == 2 * count
+    np.testing.assert_allclose(
+        np.linalg.norm(double.centers[count:] - double.centers[:count], axis=1), 0.1)
+    similarities = asked[-1].observation.similarities
+    np.testing.assert_array_equal(similarities[:, :count], similarities[:, count:])
+    np.testing.assert_array_equal(similarities[:, :count], questions[-1].observation.similarities)
+
+
+def test_an_equal_room_is_added_beside(changed, room):
+    twin = changed(troubles.add_equal_room, 2.0)[0]
+    count = len(room)
+    steps = twin.centers[count:] - twin.centers[:count]
+    assert (steps == steps[0]).all()
+    assert twin.centers[count:, 0].min() > twin.centers[:count, 0].max()
+    assert twin.class_ids[:count] == twin.class_ids[count:]
+
+
+def test_boxes_become_random_ones(changed, questions):
+    asked = changed(troubles.random_detections, 10)[1]
+    assert all(len(one.observation.detections) == 10 for one in asked)
+    assert asked[0].observation.similarities.shape[0] == 10
+    assert not np.array_equal(asked[0].observation.detections.bboxes_xyxy,
+                              asked[1].observation.detections.bboxes_xyxy)
+
+
 def test_detections_are_dropped_and_invented(changed, questions):
     before = sum(len(one.observation.detections) for one in questions)
     fewer = sum(len(one.observation.detections)

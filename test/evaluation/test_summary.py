@@ -122,7 +122,7 @@ def test_the_table_marks_noise_and_cut_searches():
     assert as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
     assert all(len(line) < 130 for line in as_text(rows).splitlines())
     assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
-    assert 'not held out' in notes([good, near])[1]
+    assert 'fitted on simulated' in notes([good, near])[1]
     assert 'hybrid_bf' in notes([good, near])[2]
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import is_rigid
-from cliploc_ros.evaluation.worlds import compare, judge
+from cliploc_ros.evaluation.confidence_fit import outcomes
+from cliploc_ros.evaluation.worlds import compare, fit, judge
 from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.surveyor import MapErrors, survey
@@ -68,3 +69,18 @@ def test_judge_counts_right_and_wrong_poses(record_property):
     assert sum(one.error_m < 1.0 for one in fused) > sum(one.error_m < 1.0 for one in alone)
     assert not [one for one in verdicts if one.accepted and one.error_m > 1.0]
     assert '| room | five images | 12 |' in judge.table(verdicts)
+
+
+def test_a_fit_judges_each_kind_by_the_others(record_property):
+    searched = [one for kind in ('room', 'shop') for one in fit.search_world((kind, 5))]
+    here = [one for one in searched if not one.case.is_elsewhere]
+    assert {one.mode for one in here} == set(judge.MODES)
+    for one in searched:
+        assert (one.case.setting.vertical > 0.0) == ('vertical' in one.mode)
+        assert not (one.case.is_elsewhere and one.case.right.any())
+    calibrations = fit.cross_fitted(searched)
+    assert calibrations['room'] != calibrations['shop']
+    rooms = [one.case for one in here if one.kind == 'room']
+    likely, right = fit.judged([one for one in here if one.kind == 'room'], calibrations)
+    assert np.array_equal(likely, outcomes(rooms, calibrations['room'])[0])
+    assert likely[right].mean() > likely[~right].mean()

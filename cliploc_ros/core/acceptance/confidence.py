@@ -4,10 +4,12 @@
 
 A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice Behavior", 1974):
 each distinct hypothesis has a utility, linear in its support. So has the case that none of them
-is right. Probabilities are proportional to the exponentials of the utilities, so the poses of an
-ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
+is right: the more landmarks the map has, the more wrong poses fit by chance; a known vertical
+leaves fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of
+an ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -35,7 +37,9 @@ _AGREEING_TRACE = 1.0 + 2.0 * np.cos(np.radians(45.0))
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
-# The recordings are too short to justify a higher confidence.
+# Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
+_BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
+# The data are too few to justify a higher confidence.
 _MOST_CONFIDENCE = 0.9999
 # Number of labels that gives mean and deviation of a crop's similarities to 2 %.
 _LABELS_SAMPLED = 4096
@@ -56,9 +60,11 @@ class Support:
     likeness : float
         How much more similar their crops are to the labels of their landmarks than to the map's
         labels on average, in standard deviations, summed.
-    same_class : float
-        Number of the objects that have the class of their landmark. A class that the detector
-        takes the landmark for at times counts by its share, see ClassIndex.shares.
+    rarity : float
+        Summed over the objects that have a class of their landmark: the logarithm of the map's
+        number of landmarks for each landmark of this class. A chance match of a rare class is
+        rarer than one of a common class. A class that the detector takes the landmark for at
+        times counts by its share, see ClassIndex.shares.
     unlabelled : float
         Number of the objects that were matched by class alone.
     unexplained : float
@@ -69,20 +75,47 @@ class Support:
     score: float = 0.0
     misfit: float = 0.0
     likeness: float = 0.0
-    same_class: float = 0.0
+    rarity: float = 0.0
     unlabelled: float = 0.0
     unexplained: float = 0.0
 
 
-class Calibration(NamedTuple):
-    """The coefficients; ``python -m cliploc_ros.evaluation.calibration`` fits them.
+class Setting(NamedTuple):
+    """What the chance of a wrong pose depends on, besides the supports.
 
     Parameters
     ----------
-    score, misfit, likeness, same_class, unlabelled, unexplained : float
+    landmarks : int
+        Number of landmarks in the map.
+    vertical_deg : float
+        Standard deviation of the known vertical [deg]; infinite where none is known.
+    """
+
+    landmarks: int
+    vertical_deg: float = math.inf
+
+    @property
+    def map_size(self) -> float:
+        """Return the logarithm of the number of landmarks."""
+        return math.log(max(1, self.landmarks))
+
+    @property
+    def vertical(self) -> float:
+        """Return what the vertical rules out: 0 where none is known, 3.8 for one to 1 degree."""
+        return math.log(_VAGUE_VERTICAL_DEG / min(max(self.vertical_deg, _BEST_VERTICAL_DEG),
+                                                  _VAGUE_VERTICAL_DEG))
+
+
+class Calibration(NamedTuple):
+    """The coefficients; ``python -m cliploc_ros.evaluation.worlds.fit`` fits them.
+
+    Parameters
+    ----------
+    score, misfit, likeness, rarity, unlabelled, unexplained : float
         Utility of a unit of each kind of support.
-    none_right : float
-        Utility of the case that no hypothesis is right.
+    none_right, map_size, vertical : float
+        Utility of the case that no hypothesis is right: a constant, and a unit of each part of
+        the setting.
     knee, slope : float
         Log odds beyond the knee grow by 1 + slope: where all other poses have hardly any
         support, wrong poses are rarer than the tail of a logit.
@@ -91,21 +124,23 @@ class Calibration(NamedTuple):
     score: float
     misfit: float
     likeness: float
-    same_class: float
+    rarity: float
     unlabelled: float
     unexplained: float
     none_right: float
+    map_size: float
+    vertical: float
     knee: float
     slope: float
 
 
-#: The frames that DEFAULT is fitted on. Figures measured on them are not held out.
-FITTED_ON = "TUM fr3/long_office_household (258 frames) and the demo's world (48 frames)"
-#: Fitted on these frames as they are, with boxes dropped and invented, and in maps whose objects
-#: have exchanged places; by labels and classes, and by classes alone.
-DEFAULT = Calibration(score=2.21, misfit=-0.299, likeness=0.679, same_class=0.416,
-                      unlabelled=0.941, unexplained=-0.843, none_right=6.55, knee=0.0,
-                      slope=1.16)
+#: The data that DEFAULT is fitted on. Figures measured on them are not held out.
+FITTED_ON = 'simulated rooms, offices, shops and bare rooms (24 of each)'
+#: Fitted with and without what else is known, and in maps whose objects have exchanged places; by
+#: labels and classes, and by classes alone.
+DEFAULT = Calibration(score=2.06, misfit=-0.315, likeness=0.396, rarity=0.524, unlabelled=0.594,
+                      unexplained=-0.825, none_right=1.33, map_size=1.55, vertical=-0.637,
+                      knee=0.0, slope=0.433)
 
 
 class ComparedFrame(NamedTuple):
@@ -149,13 +184,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     matches : sequence of F sequence of Match
         Inliers in each frame.
     """
-    rows: dict[int, list[NDArray[np.float64]]] = {}
+    rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
     for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):
-        distinct = _each_object_once(found, frame.bboxes_xyxy)
+        distinct = _each_object_once(found, frame.bboxes_xyxy, landmark_map.objects)
         if distinct:
             for match, row in zip(distinct, _contributions(landmark_map, frame, map_from_camera,
                                                            distinct), strict=True):
-                rows.setdefault(match.landmark, []).append(row)
+                rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
     if not rows:
         return Support()
     total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
@@ -192,10 +227,18 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
                  landmark_map.position_sigmas[landmarks]), likenesses,
-        landmark_map.classes.shares(landmarks, classes[detections]), ~compared])
+        _rarities(landmark_map, landmarks, classes[detections]), ~compared])
 
 
-def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
+def _rarities(landmark_map: LandmarkMap, landmarks: NDArray[np.int64],
+              classes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return how rare the class of each detection (m,) is; 0 if it is none of its landmark."""
+    index = landmark_map.classes
+    shares = np.maximum(index.sizes_of(classes), 1) / len(landmark_map)
+    return -np.log(shares) * index.shares(landmarks, classes)
+
+
+def confidences(supports: Sequence[Support], poses: NDArray[np.float64], setting: Setting,
                 calibration: Calibration = DEFAULT,
                 handicaps: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     """Return the probability that each hypothesis is within 1 m of the truth.
@@ -205,6 +248,7 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
     supports : sequence of m Support
     poses : ndarray (m, 4, 4)
         map_from_camera of the same hypotheses.
+    setting : Setting
     calibration : Calibration, optional
     handicaps : ndarray (m,), optional
         Log odds that speak against each hypothesis besides its support.
@@ -215,8 +259,8 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64],
         0 to 1. The rest to 1 is the probability that another pose is right, or none.
     """
     odds = utilities(supports, calibration) - handicaps
-    shares = np.exp(np.append(odds, calibration.none_right)
-                    - max(odds.max(), calibration.none_right))
+    none = none_right(setting, calibration)
+    shares = np.exp(np.append(odds, none) - max(odds.max(), none))
     shares = shares[:-1] / shares.sum()
     agreeing = agreeing_poses(poses)
     likely = np.clip(agreeing @ shares, 1.0 - _MOST_CONFIDENCE, _MOST_CONFIDENCE)
@@ -234,9 +278,15 @@ def utilities(supports: Sequence[Support], calibration: Calibration = DEFAULT
     """Return the utility (m,) of each support: the logarithm of its odds, up to a constant."""
     return np.array([
         calibration.score * one.score + calibration.misfit * one.misfit
-        + calibration.likeness * one.likeness + calibration.same_class * one.same_class
+        + calibration.likeness * one.likeness + calibration.rarity * one.rarity
         + calibration.unlabelled * one.unlabelled + calibration.unexplained * one.unexplained
         for one in supports])
+
+
+def none_right(setting: Setting, calibration: Calibration = DEFAULT) -> float:
+    """Return the utility of the case that no hypothesis is right."""
+    return (calibration.none_right + calibration.map_size * setting.map_size
+            + calibration.vertical * setting.vertical)
 
 
 def agreeing_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -247,12 +297,13 @@ def agreeing_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(near & (traces > _AGREEING_TRACE))
 
 
-def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64]) -> list[Match]:
-    """Return the best match of each landmark and of each box."""
+def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
+                      objects: NDArray[np.int64]) -> list[Match]:
+    """Return the best match of each landmark's object and of each box."""
     distinct: list[Match] = []
     for match in sorted(matches, key=lambda match: -match.iou):
         boxes = bboxes_xyxy[[other.detection for other in distinct]]
-        if match.landmark in [other.landmark for other in distinct]:
+        if objects[match.landmark] in objects[[other.landmark for other in distinct]]:
             continue
         if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
             continue

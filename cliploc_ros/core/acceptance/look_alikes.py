@@ -2,6 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Places that look alike, such as two rooms with the same furniture.
 
+A camera sees the same at two places whose landmarks a turn about the vertical and a shift lay on
+each other. Such twins of the best pose are found in the map, so they count as rivals even if the
+search met one of the places only.
+
 Two poses at places that look alike explain the same detections. Which of them matches one object
 more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
 places apart, and where there are none, the number of objects does to some degree. A conditional
@@ -13,61 +17,68 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 # All constants are chosen on simulated worlds, see cliploc_ros.evaluation.worlds: kinds room,
 # office, shop, corridor, hall and two rooms, seeds 0 to 59.
-# Landmarks nearer than this belong to a place; the nearest of them are compared.
-_PLACE_M, _MOST_LANDMARKS = 4.0, 200
-# Landmarks of one class correspond if they are nearer than this after one place is moved onto
-# the other.
-_SAME_M = 0.3
-_LEAST_SHARE, _LEAST_LANDMARKS = 0.4, 4
-_LEAST_MATCHED = 0.5
+# A place: what a pose matched, and what is nearer to it than this; at most so many landmarks.
+_PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
+# Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
+_LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
+# Moves that lay a place within this of where another one does are the same.
+_SAME_M, _SAME_COSINE = 1.0, np.cos(np.radians(30.0))
+# The camera of a twin is elsewhere: as far away, or turned as far, as poses that do not agree.
+_ELSEWHERE_COSINE = np.cos(np.radians(45.0))
 # Both places are upright: one is moved onto the other by a turn about the vertical.
 _MOST_TILT = np.cos(np.radians(20.0))
-# Landmarks near a spot that are searched for one of the right class.
-_NEIGHBOURS = 6
+# How near a landmark must lie to one of its class, each time after the move is fitted [m].
+_NEAR_M = (0.6, 0.45, 0.3)
+# The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
+# and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
+_LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
+# The most twins of a pose, and poses of the search whose places are compared.
+_TWINS, _OTHERS = 3, 5
 # Log odds of a unit of likeness, and of an object that was matched by class alone.
 _LIKENESS, _UNLABELLED = 0.44, 0.5
 
 
-def look_alike(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
-               matched: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether the place of a pose looks like the places of other poses.
+def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
+               matched: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a camera would be at the places that look most like that of a pose.
 
     Parameters
     ----------
     landmark_map : LandmarkMap
-        L landmarks.
+        L landmarks, z up.
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
         Landmarks that the pose explains detections with.
-    others : ndarray (m, 4, 4)
-        Poses at other places, from which a camera would see the same.
+    others : ndarray (k, 4, 4)
+        Poses that a search met elsewhere, best first: the places of five are compared, too.
 
     Returns
     -------
-    ndarray (m,) of bool
-        A place looks like another one if at least four landmarks, two fifths of those around it,
-        and half of those matched have one of their class at the same spot there.
+    ndarray (m, 4, 4)
+        At most 3 poses, the place that is most alike first. A place looks like another one if at
+        least four landmarks, .38 of those around it, and .4 of those matched have one of their
+        class at the same spot there.
     """
-    rows = _landmarks_around(landmark_map, map_from_camera[:3, 3])
-    moves = others @ invert_transform(map_from_camera)
-    found = np.zeros(len(others), dtype=np.bool_)
-    if len(rows) < _LEAST_LANDMARKS or not len(matched):
-        return found
-    for number in np.nonzero(moves[:, 2, 2] > _MOST_TILT)[0]:
-        around = _have_twins(landmark_map, rows, moves[number])
-        found[number] = (around.sum() >= max(_LEAST_LANDMARKS, _LEAST_SHARE * len(rows))
-                         and _have_twins(landmark_map, matched, moves[number]).mean()
-                         >= _LEAST_MATCHED)
-    return found
+    rows = _place(landmark_map, map_from_camera[:3, 3], matched)
+    if len(matched) == 0 or len(rows) < _LEAST_LANDMARKS:
+        return np.empty((0, 4, 4))
+    moves = np.concatenate([_moves_of_map(landmark_map, rows),
+                            _moves_of_poses(map_from_camera, others[:_OTHERS])])
+    moves, found = _verified(landmark_map, rows, moves, map_from_camera[:3, 3])
+    shares = found.mean(axis=1)
+    alike = (shares >= _LEAST_SHARE) & (found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
+    moves = moves[alike][np.argsort(-shares[alike], kind='stable')]
+    return moves[_distinct(moves, map_from_camera[:3, 3], _TWINS)] @ map_from_camera
 
 
-def chance_distinct(its: Support, twins: Sequence[Support]) -> float:
+def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]:
     """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
     Parameters
@@ -75,29 +86,107 @@ def chance_distinct(its: Support, twins: Sequence[Support]) -> float:
     its : Support
         Of the pose.
     twins : sequence of Support
-        Of the poses at places that look like its own.
+        Of the poses at places that look like its own, one at least.
+
+    Returns
+    -------
+    chance : float
+    likeliest : int
+        The twin that is likeliest.
     """
-    leads = [_LIKENESS * (its.likeness - one.likeness)
-             + _UNLABELLED * (its.unlabelled - one.unlabelled) for one in twins]
-    return float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
+    leads = np.array([_LIKENESS * (its.likeness - one.likeness)
+                      + _UNLABELLED * (its.unlabelled - one.unlabelled) for one in twins])
+    return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
+            int(np.argmin(leads)))
 
 
-def _landmarks_around(landmark_map: LandmarkMap, position: NDArray[np.float64]
-                      ) -> NDArray[np.int64]:
-    """Return the landmarks around a position, the nearest first."""
-    count = min(_MOST_LANDMARKS, len(landmark_map))
-    distances, rows = landmark_map.tree.query(position, [*range(1, count + 1)],
-                                              distance_upper_bound=_PLACE_M)
-    return np.asarray(rows[np.isfinite(distances)])
+def _place(landmark_map: LandmarkMap, position: NDArray[np.float64], matched: NDArray[np.int64]
+           ) -> NDArray[np.int64]:
+    """Return the landmarks of a place: those matched, then those around, the nearest first."""
+    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
+    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
+    rows = rows[np.isfinite(distances)]
+    return np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
 
 
-def _have_twins(landmark_map: LandmarkMap, rows: NDArray[np.int64], move: NDArray[np.float64]
-                ) -> NDArray[np.bool_]:
-    """Return which landmarks (r,), moved by a transform (4, 4), meet another of their class."""
-    moved = landmark_map.centers[rows] @ move[:3, :3].T + move[:3, 3]
-    count = min(_NEIGHBOURS, len(landmark_map))
-    distances, near = landmark_map.tree.query(moved, [*range(1, count + 1)],
-                                              distance_upper_bound=_SAME_M)
-    classes = np.append(landmark_map.classes.of_landmarks, -1)  # none near has index L
-    same = (classes[near] == classes[rows][:, None]) & (near != rows[:, None])
-    return np.asarray((same & np.isfinite(distances)).any(axis=1))
+def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the moves (m, 4, 4) of a place onto others for which most pairs vote."""
+    repeats = find_repeats(landmark_map.pairs, rows[:_LOOKED_UP])
+    order = np.argsort(-repeats.votes, kind='stable')[:_COMPARED]
+    moves = _upright_moves(repeats.turns[order], landmark_map.centers[repeats.landmarks[order]],
+                           landmark_map.centers[repeats.others[order]])
+    if len(moves) == 0:
+        return moves
+    middle = landmark_map.centers[rows].mean(axis=0)
+    votes = _are_same(moves, middle).astype(np.float64) @ repeats.votes[order]
+    moves = moves[np.argsort(-votes, kind='stable')]
+    return moves[_distinct(moves, middle, _MOVES)]
+
+
+def _moves_of_poses(map_from_camera: NDArray[np.float64], others: NDArray[np.float64]
+                    ) -> NDArray[np.float64]:
+    """Return the upright moves (m, 4, 4) that take a pose to others (k, 4, 4)."""
+    moves = others @ invert_transform(map_from_camera)
+    moves = moves[moves[:, 2, 2] > _MOST_TILT]
+    position = map_from_camera[:3, 3]
+    return _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
+                          moves[:, :3, :3] @ position + moves[:, :3, 3])
+
+
+def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
+                   after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the moves (m, 4, 4) by some turns that take points (m, 3) to others (m, 3)."""
+    moves = np.tile(np.eye(4), (len(turns), 1, 1))
+    moves[:, 0, 0] = moves[:, 1, 1] = np.cos(turns)
+    moves[:, 1, 0], moves[:, 0, 1] = np.sin(turns), -np.sin(turns)
+    moves[:, :3, 3] = after - np.einsum('nij,nj->ni', moves[:, :3, :3],
+                                        np.broadcast_to(before, (len(turns), 3)))
+    return moves
+
+
+def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which moves (m, m) take a point to the same place by the same turn."""
+    ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
+    cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
+    return np.asarray((np.linalg.norm(ends[:, None] - ends, axis=2) < _SAME_M)
+                      & (cosines > _SAME_COSINE))
+
+
+def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
+              ) -> NDArray[np.int64]:
+    """Return the first moves that differ from those before them, so many at most."""
+    same = _are_same(moves, point)
+    kept = np.empty(0, dtype=np.int64)
+    for row in range(len(moves)):
+        if len(kept) < limit and not same[row][kept].any():
+            kept = np.append(kept, row)
+    return kept
+
+
+def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
+              position: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return moves (m, 4, 4) fitted to a place, and which landmarks (m, r) they take to others."""
+    centers = landmark_map.centers[rows]
+    for near_m in _NEAR_M:
+        ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
+        others, found = landmark_map.of_class_near(ends, rows, near_m)
+        kept = found.sum(axis=1) >= _LEAST_LANDMARKS
+        moves, others, found = moves[kept], others[kept], found[kept]
+        if near_m > _NEAR_M[-1]:
+            moves = _fitted(centers, landmark_map.centers[others], found)
+    steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
+    elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
+                 | (moves[:, 0, 0] < _ELSEWHERE_COSINE))
+    return moves[elsewhere], found[elsewhere]
+
+
+def _fitted(before: NDArray[np.float64], after: NDArray[np.float64], found: NDArray[np.bool_]
+            ) -> NDArray[np.float64]:
+    """Return the upright moves (m, 4, 4) that take points (r, 3) nearest to others (m, r, 3)."""
+    weights = found / np.maximum(1, found.sum(axis=1, keepdims=True))
+    first, second = weights @ before, np.einsum('nr,nrj->nj', weights, after)
+    x, y = np.moveaxis(before - first[:, None], 2, 0)[:2]
+    u, v = np.moveaxis(after - second[:, None], 2, 0)[:2]
+    turns = np.arctan2((weights * (x * v - y * u)).sum(axis=1),
+                       (weights * (x * u + y * v)).sum(axis=1))
+    return _upright_moves(turns, first, second)

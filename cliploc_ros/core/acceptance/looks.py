@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Successive looks: the best poses of the last frames, and whether they agree.
+"""Successive looks: the best poses of the last frames, and how sure they were of the newest one.
 
-Every retry is another chance of a false accept. A right pose is found again and again, a wrong
-one seldom twice. Odometry carries the pose of each look to the newest frame, where they are
-compared.
+Every retry is another chance of a false accept. Odometry carries the pose of each look to the
+newest frame. The looks of a standing robot show the same, so their confidences must not multiply.
+Their mean needs no independence. Where looks are exchangeable, their mean ever reaches a limit
+with a probability of at most the expected confidence of one look, divided by the limit, however
+often the robot looks (Ramdas and Manole, "Randomized and exchangeable improvements of Markov's,
+Chebyshev's and Chernoff's inequalities", 2023). So with a limit of .5, a robot that is nowhere in
+the map ever accepts a pose with at most twice the mean confidence of its looks.
 """
 
 from dataclasses import dataclass
@@ -30,11 +34,13 @@ class Look(NamedTuple):
     ----------
     stamp_ns : int
     odom_from_camera, map_from_camera : ndarray (4, 4)
+    confidence : float
     """
 
     stamp_ns: int
     odom_from_camera: NDArray[np.float64]
     map_from_camera: NDArray[np.float64]
+    confidence: float
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,8 @@ class Looks:
         """Return the number of looks."""
         return len(self.past)
 
-    def with_look(self, observation: Observation, map_from_camera: NDArray[np.float64]
-                  ) -> 'Looks':
+    def with_look(self, observation: Observation, map_from_camera: NDArray[np.float64],
+                  confidence: float) -> 'Looks':
         """Return these looks and a new one.
 
         Looks at the same or a later stamp are dropped. An observation without odometry links to
@@ -59,21 +65,31 @@ class Looks:
         observation : Observation
         map_from_camera : ndarray (4, 4)
             Its best pose.
+        confidence : float
+            Of this pose, from the frames of this look alone.
         """
         odom_from_camera = observation.odom_from_camera
         if odom_from_camera is None:
-            return Looks((Look(observation.stamp_ns, np.eye(4), map_from_camera),))
-        earlier = [one for one in self.past if one.stamp_ns < observation.stamp_ns]
-        newest = Look(observation.stamp_ns, odom_from_camera, map_from_camera)
-        return Looks((*earlier, newest)[-_MAX_LOOKS:])
+            return Looks((Look(observation.stamp_ns, np.eye(4), map_from_camera, confidence),))
+        newest = Look(observation.stamp_ns, odom_from_camera, map_from_camera, confidence)
+        return Looks((*self._before(observation), newest)[-_MAX_LOOKS:])
 
-    @property
-    def agreeing(self) -> int:
-        """Return how many looks agree with the newest one, which counts."""
-        newest = self.past[-1]
-        carried = [one.map_from_camera @ invert_transform(one.odom_from_camera)
-                   @ newest.odom_from_camera for one in self.past]
-        return sum(_agree(pose, newest.map_from_camera) for pose in carried)
+    def confidences_in(self, observation: Observation, map_from_camera: NDArray[np.float64]
+                       ) -> tuple[float, ...]:
+        """Return the confidence of each look before an observation in its pose (4, 4).
+
+        A look that leads elsewhere has none: 0.
+        """
+        odom_from_camera = observation.odom_from_camera
+        if odom_from_camera is None:
+            return ()
+        carried = [(one.confidence, one.map_from_camera @ invert_transform(one.odom_from_camera)
+                    @ odom_from_camera) for one in self._before(observation)[1 - _MAX_LOOKS:]]
+        return tuple(confidence if _agree(pose, map_from_camera) else 0.0
+                     for confidence, pose in carried)
+
+    def _before(self, observation: Observation) -> tuple[Look, ...]:
+        return tuple(one for one in self.past if one.stamp_ns < observation.stamp_ns)
 
 
 def _agree(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:

@@ -93,6 +93,16 @@ def remember(leaders, score, iteration, sample, rotation, translation):
 @compiled
 def same_place(rotation_a, translation_a, rotation_b, translation_b):
     """Return whether two camera_from_map poses are within the distinct distance and angle."""
+    return are_near(rotation_a, translation_a, rotation_b, translation_b, DISTINCT_DISTANCE_M,
+                    _DISTINCT_TRACE)
+
+
+@compiled
+def are_near(rotation_a, translation_a, rotation_b, translation_b, distance_m, least_trace):
+    """Return whether two camera_from_map poses differ by at most a distance and an angle.
+
+    The trace of the rotation between them is 1 + 2 cos(angle).
+    """
     trace, square = 0.0, 0.0
     for i in range(3):
         center_a, center_b = 0.0, 0.0
@@ -101,4 +111,4 @@ def same_place(rotation_a, translation_a, rotation_b, translation_b):
             center_a -= rotation_a[j, i] * translation_a[j]
             center_b -= rotation_b[j, i] * translation_b[j]
         square += (center_a - center_b) ** 2
-    return trace >= _DISTINCT_TRACE and square <= DISTINCT_DISTANCE_M * DISTINCT_DISTANCE_M
+    return trace >= least_trace and square <= distance_m * distance_m

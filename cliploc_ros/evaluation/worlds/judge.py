@@ -3,14 +3,13 @@
 """Acceptance in simulated worlds: ``python -m cliploc_ros.evaluation.worlds.judge --help``.
 
 Each group of five images is localized with its last image alone and with all of them, without
-and with the vertical and the height. Nothing here was used to fit the confidence.
+and with the vertical and the height.
 """
 
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,19 +22,12 @@ from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
+from cliploc_ros.evaluation.confidence_fit import RIGHT_M, draw_judged
 from cliploc_ros.evaluation.summary import wilson_interval
-from cliploc_ros.evaluation.trials import Query
-from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
+from cliploc_ros.evaluation.worlds.modes import MODES, Request, requests
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
 from cliploc_ros.parallel import run_tasks
-
-RIGHT_M = 1.0
-#: What is known besides one image.
-MODES = ('one image', 'vertical', 'vertical, height', 'five images', 'five, vertical, height')
-# Deviations of the simulated sensors.
-_VERTICAL_DEG, _STEP_M, _STEP_DEG, _HEIGHT_M = 1.0, 0.01, 0.5, 0.2
 
 
 class Verdict(NamedTuple):
@@ -62,28 +54,18 @@ class MakeJudge(NamedTuple):
 def judge_world(kind: str, seed: int, matching: str, min_confidence: float) -> list[Verdict]:
     """Return the verdicts on all groups of a world in all modes."""
     world = make_world(kind, seed)
-    heights = [one.map_from_camera[2, 3] for one in world.queries]
-    options = RelocalizerOptions(matching=matching, k=min(3, len(world.landmark_map)),
-                                 min_confidence=min_confidence)
-    known = replace(options, height_range_m=(min(heights) - _HEIGHT_M, max(heights) + _HEIGHT_M))
-    level = with_vertical(world.queries, _VERTICAL_DEG, seed)
-    odometry = (_STEP_M, _STEP_DEG, seed)
-    asked = zip(MODES, (
-        (world.queries, options), (level, options), (level, known),
-        (with_neighbours(world.queries, world.groups, *odometry), options),
-        (with_neighbours(level, world.groups, *odometry), known)), strict=True)
-    return [verdict for mode, (queries, its) in asked
-            for verdict in _localize(kind, mode, world.landmark_map, queries, its)]
+    options = RelocalizerOptions(matching=matching, min_confidence=min_confidence)
+    return [verdict for one in requests(world, seed, options)
+            for verdict in _localize(kind, world.landmark_map, one)]
 
 
-def _localize(kind: str, mode: str, landmark_map: LandmarkMap, queries: Sequence[Query],
-              options: RelocalizerOptions) -> Iterator[Verdict]:
-    relocalizer = Relocalizer(landmark_map, options)
-    for query in queries[GROUP_SIZE - 1::GROUP_SIZE]:
+def _localize(kind: str, landmark_map: LandmarkMap, request: Request) -> Iterator[Verdict]:
+    relocalizer = Relocalizer(landmark_map, request.options)
+    for query in request.queries:
         found = relocalizer.relocalize([*query.neighbours, query.observation])
         error = np.inf if found.map_from_camera is None \
             else pose_error(found.map_from_camera, query.map_from_camera)[0]
-        yield Verdict(kind, mode, float(error), found.confidence, found.accepted)
+        yield Verdict(kind, request.mode, float(error), found.confidence, found.accepted)
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
@@ -134,25 +116,11 @@ def run(arguments: list[str]) -> int:
     verdicts = [one for task in tasks for one in found[task]]
     print(table(verdicts))
     if options.out is not None:
-        _draw(options.out, verdicts)
+        draw_judged(options.out, 'simulated worlds', {mode: (
+            np.array([one.confidence for one in verdicts if one.mode == mode]),
+            np.array([one.error_m < RIGHT_M for one in verdicts if one.mode == mode]))
+            for mode in MODES})
     return 0
-
-
-def _draw(folder: Path, verdicts: Sequence[Verdict]) -> None:
-    # late, since the table needs no matplotlib
-    from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
-    from cliploc_ros.evaluation.output import make_folder
-    from cliploc_ros.evaluation.trust import draw_reliability
-
-    make_folder(folder)
-    figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')
-    draw_reliability(axes, {mode: (
-        np.array([one.confidence for one in verdicts if one.mode == mode]),
-        np.array([one.error_m < RIGHT_M for one in verdicts if one.mode == mode]))
-        for mode in MODES})
-    axes.set_title('simulated worlds', fontsize=9)
-    add_legend(figure)
-    print(f'wrote {save_figure(figure, folder / "reliability.png")}')
 
 
 def main() -> int:

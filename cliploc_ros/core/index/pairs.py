@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of neighbouring landmarks by what they look like: where else a map has the same pairs.
+
+A turn about the vertical and a shift keep the classes of two landmarks, their horizontal distance
+and their difference in height. So landmarks whose pairs a map has twice may stand at places that
+look alike. Geometric hashing (Lamdan and Wolfson, "Geometric Hashing: A General and Efficient
+Model-Based Recognition Scheme", 1988), with pairs as bases.
+"""
+
+from math import atan2, floor, pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cliploc_ros.core.compiled import compiled
+
+# Neighbours of a landmark that make pairs with it, and how far away they are [m]. Nearer ones do
+# not give the turn. 100,000 landmarks take 30 MB.
+_NEIGHBOURS = 10
+_LENGTH_M = (0.3, 3.0)
+# Pairs are alike if distance and height differ by less than this, also the side of a bin [m].
+_ALIKE_M = 0.25
+_LENGTH_BINS, _RISE_BINS = 14, 28
+_MIDDLE_BIN = 13
+# Turns are counted in bins twice as wide as their spacing.
+_TURN_BINS = 24
+_TURN_STEP = 2.0 * pi / _TURN_BINS
+_LEAST_VOTES = 2
+# Keys tell so many classes apart.
+_CLASSES = 1 << 20
+# Bounds of time and memory: slots of votes, a power of 2, and pairs compared.
+_SLOTS, _MOST_COMPARED = 1 << 15, 100_000
+
+
+class LandmarkPairs(NamedTuple):
+    """Pairs of a landmark and a neighbour: L landmarks, p pairs.
+
+    Parameters
+    ----------
+    neighbours : ndarray (L, 10) of int
+        Neighbours of each landmark; -1 for none.
+    centers, classes : ndarray (L, 3), (L,)
+        Of the landmarks.
+    keys : ndarray (p,) of int
+        What each pair looks like, ascending.
+    landmarks : ndarray (p,) of int
+        First landmark of each pair.
+    offsets : ndarray (p, 3) float32
+        Horizontal distance and difference in height [m], and direction [rad] of each pair.
+    """
+
+    neighbours: NDArray[np.int32]
+    centers: NDArray[np.float64]
+    classes: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    landmarks: NDArray[np.int32]
+    offsets: NDArray[np.float32]
+
+
+class Repeats(NamedTuple):
+    """Landmarks that may be where others would be after a turn and a shift, r of them.
+
+    Parameters
+    ----------
+    landmarks, others : ndarray (r,) of int
+    turns : ndarray (r,)
+        About the vertical, from landmark to other [rad].
+    votes : ndarray (r,) of int
+        Number of neighbours that agree.
+    """
+
+    landmarks: NDArray[np.int64]
+    others: NDArray[np.int64]
+    turns: NDArray[np.float64]
+    votes: NDArray[np.int64]
+
+
+def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: cKDTree
+               ) -> LandmarkPairs:
+    """Return the pairs of landmarks (L, 3) of some classes (L,), whose tree is given."""
+    count = len(centers)
+    neighbours = np.full((count, _NEIGHBOURS), count, dtype=np.int32)
+    ranks = np.arange(2, min(_NEIGHBOURS + 1, count) + 1)
+    if len(ranks):
+        neighbours[:, :len(ranks)] = tree.query(centers, ranks,
+                                                distance_upper_bound=_LENGTH_M[1])[1]
+    first, column = np.nonzero(neighbours < count)
+    second = neighbours[first, column]
+    steps = centers[second] - centers[first]
+    offsets = np.stack([np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2],
+                        np.arctan2(steps[:, 1], steps[:, 0])], axis=1)
+    short = offsets[:, 0] < _LENGTH_M[0]
+    neighbours[first[short], column[short]] = count
+    bins = np.floor(offsets[:, :2] / _ALIKE_M).astype(np.int64).T
+    keys = np.where(short, -1, _key(classes[first], classes[second], *bins))
+    order = np.argsort(keys, kind='stable')[int(short.sum()):]
+    return LandmarkPairs(np.where(neighbours < count, neighbours, np.int32(-1)), centers, classes,
+                         keys[order], first[order].astype(np.int32),
+                         offsets[order].astype(np.float32))
+
+
+@compiled
+def _key(first, second, length_bin, rise_bin):
+    """Return the number of a pair of classes, a bin of lengths and a bin of heights."""
+    return (((first * _CLASSES + second) * _LENGTH_BINS + length_bin) * _RISE_BINS
+            + rise_bin + _MIDDLE_BIN)
+
+
+def find_repeats(pairs: LandmarkPairs, landmarks: NDArray[np.int64]) -> Repeats:
+    """Return where some landmarks (n,) may be after a turn and a shift.
+
+    A landmark with two neighbours that agree is a repeat: then three landmarks of equal classes
+    have the same arrangement. The work is bounded: of too many, the last landmarks are left out.
+    """
+    return Repeats(*_find_repeats(pairs, landmarks))
+
+
+@compiled
+def _find_repeats(pairs, landmarks):
+    """Count the votes of pairs for a repeat and a turn, in a table with open addresses."""
+    count, columns = pairs.neighbours.shape
+    slots = np.full(_SLOTS, -1, dtype=np.int64)
+    votes, turns = np.zeros(_SLOTS, dtype=np.int64), np.zeros(_SLOTS)
+    compared, used = 0, 0
+    for number in range(landmarks.shape[0]):
+        first = landmarks[number]
+        for column in range(columns):
+            second = pairs.neighbours[first, column]
+            if second < 0:
+                continue
+            length, rise, angle = _offset(pairs.centers, first, second)
+            shortest = floor(length / _ALIKE_M - 0.5)
+            lowest = floor(rise / _ALIKE_M - 0.5)
+            for length_bin in range(shortest, shortest + 2):
+                key = _key(pairs.classes[first], pairs.classes[second], length_bin, lowest)
+                row = np.searchsorted(pairs.keys, key)
+                while row < pairs.keys.shape[0] and pairs.keys[row] <= key + 1:
+                    other = np.int64(pairs.landmarks[row])
+                    compared += 1
+                    if (other != first and abs(pairs.offsets[row, 0] - length) < _ALIKE_M
+                            and abs(pairs.offsets[row, 1] - rise) < _ALIKE_M):
+                        turn = (pairs.offsets[row, 2] - angle) % (2.0 * pi)
+                        used += _vote(slots, votes, turns, number * count + other, turn)
+                    if compared > _MOST_COMPARED or used > _SLOTS // 2:
+                        return _elected(slots, votes, turns, landmarks, count)
+                    row += 1
+    return _elected(slots, votes, turns, landmarks, count)
+
+
+@compiled
+def _vote(slots, votes, turns, candidate, turn):
+    """Write a vote into the two bins that a turn belongs to; return how many slots are new."""
+    new = 0
+    nearest = int(turn / _TURN_STEP)
+    for turn_bin in range(nearest, nearest + 2):
+        vote = candidate * _TURN_BINS + turn_bin % _TURN_BINS
+        slot = (vote * 0x9E3779B1 >> 12) % _SLOTS
+        while slots[slot] >= 0 and slots[slot] != vote:
+            slot = (slot + 1) % _SLOTS
+        if slots[slot] < 0:
+            slots[slot] = vote
+            new += 1
+        votes[slot] += 1
+        turns[slot] += turn - turn_bin * _TURN_STEP
+    return new
+
+
+@compiled
+def _offset(centers, first, second):
+    """Return horizontal distance, difference in height and direction of a pair."""
+    x, y = centers[second, 0] - centers[first, 0], centers[second, 1] - centers[first, 1]
+    return sqrt(x * x + y * y), centers[second, 2] - centers[first, 2], atan2(y, x)
+
+
+@compiled
+def _elected(slots, votes, turns, landmarks, count):
+    """Return the fields of Repeats."""
+    rows = np.nonzero(votes >= _LEAST_VOTES)[0]
+    found = slots[rows] // _TURN_BINS
+    middles = slots[rows] % _TURN_BINS * _TURN_STEP
+    return (landmarks[found // count], found % count, middles + turns[rows] / votes[rows],
+            votes[rows])

@@ -1,0 +1,238 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""False accepts in a list of troubles: ``python -m cliploc_ros.evaluation.stress --help``.
+
+Map, boxes or sensors are wrong, and the robot does not know. The table counts accepted poses that
+are wrong by more than 1 m, as a share of all requests, with the 95 % interval of Wilson; recall is
+the share of the right poses that is accepted.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation import sensors, troubles
+from cliploc_ros.evaluation.methods import AUTO, Method
+from cliploc_ros.evaluation.summary import wilson_interval
+from cliploc_ros.evaluation.trials import Query, make_queries, run_trial
+from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
+from cliploc_ros.evaluation.worlds.places import KINDS
+from cliploc_ros.evaluation.worlds.world import make_world
+from cliploc_ros.parallel import run_tasks
+
+_RIGHT_M = 1.0
+# What is known besides one image: the vertical and the height, odometry of further images.
+ONE, LEVEL, FIVE, ALL = 'one image', 'vertical, height', 'five images', 'five, vertical, height'
+# Deviations of honest sensors, and by how much the height range exceeds the true heights.
+_VERTICAL_DEG, _ODOMETRY, _HEIGHT_M = 1.0, (0.01, 0.5), 0.2
+_SEED = 7
+
+
+class Place(NamedTuple):
+    """A map, all its frames with the group of each, and which frames are queries."""
+
+    landmark_map: LandmarkMap
+    frames: Sequence[Query]
+    groups: Sequence[int]
+    asked: Sequence[bool]
+
+
+Sensor = Callable[[Sequence[Query]], Sequence[Query]]
+
+
+class Trouble(NamedTuple):
+    """What is wrong, in the modes in which it matters.
+
+    Parameters
+    ----------
+    name : str
+    modes : tuple of str
+    change : callable or None
+        Of map and boxes.
+    level : float
+        Of the change.
+    sensor : callable or None
+        Change of verticals and odometry.
+    """
+
+    name: str
+    modes: tuple[str, ...]
+    change: troubles.Change | None = None
+    level: float = 0.0
+    sensor: Sensor | None = None
+
+
+_EVERY = (ONE, LEVEL, ALL)
+TROUBLES = (
+    Trouble('none', (ONE, LEVEL, FIVE, ALL)),
+    *(Trouble(f'{level:g} of the landmarks have exchanged places', _EVERY,
+              troubles.exchange_landmarks, level) for level in (0.2, 0.4, 0.6, 1.0)),
+    Trouble('ten random boxes', _EVERY, troubles.random_detections, 10),
+    Trouble('every landmark twice, 1 cm apart', _EVERY, troubles.double_landmarks, 0.01),
+    Trouble('every landmark twice, 10 cm apart', _EVERY, troubles.double_landmarks, 0.1),
+    Trouble('two identical rooms', _EVERY, troubles.add_equal_room, 2.0),
+    Trouble('.4 of the objects moved by .3 to 3 m', _EVERY, troubles.move_objects, 0.4),
+    Trouble('mount off by 5 degrees', (LEVEL, FIVE, ALL),
+            sensor=lambda queries: sensors.wrong_mount(queries, 5.0)),
+    Trouble('vertical off by 10 degrees', (LEVEL, ALL),
+            sensor=lambda queries: sensors.tilted_vertical(queries, 10.0)),
+    Trouble('odometry 20 % too long', (FIVE, ALL),
+            sensor=lambda queries: sensors.scaled_odometry(queries, 1.2)),
+    Trouble('odometry 20 % too short', (FIVE, ALL),
+            sensor=lambda queries: sensors.scaled_odometry(queries, 0.8)))
+
+
+class Outcome(NamedTuple):
+    """How many requests of a trouble and mode there were, and what became of them."""
+
+    trouble: str
+    mode: str
+    requests: int
+    right: int
+    accepted: int
+    false: int
+
+
+class Recording(NamedTuple):
+    """A query file and its map."""
+
+    queries: Path
+    landmark_map: Path
+    every_frame: bool
+
+    def __call__(self) -> Place:
+        """Return the place."""
+        landmark_map = LandmarkMap.from_file(self.landmark_map)
+        found = load_queries(self.queries, landmark_map.landmark_ids)
+        return Place(landmark_map, make_queries(found, landmark_map, every_frame=True),
+                     [one.group for one in found.frames],
+                     [one.is_main or self.every_frame for one in found.frames])
+
+
+class Simulated(NamedTuple):
+    """A simulated world; the last image of each group is a query."""
+
+    kind: str
+    seed: int
+
+    def __call__(self) -> Place:
+        """Return the place."""
+        world = make_world(self.kind, self.seed)
+        return Place(world.landmark_map, world.queries, world.groups,
+                     [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
+
+
+class MakeTrial(NamedTuple):
+    """Makes the function that tests a place with a trouble."""
+
+    matching: str
+
+    def __call__(self) -> Callable[[tuple[Callable[[], Place], int]], list[Outcome]]:
+        """Return the function."""
+        return lambda task: list(try_place(task[0](), TROUBLES[task[1]], self.matching))
+
+
+def try_place(place: Place, trouble: Trouble, matching: str) -> Iterator[Outcome]:
+    """Localize all queries of a place with a trouble, in each of its modes."""
+    heights = [one.map_from_camera[2, 3] for one in place.frames]
+    plain = RelocalizerOptions(matching=matching)
+    high = replace(plain, height_range_m=(min(heights) - _HEIGHT_M, max(heights) + _HEIGHT_M))
+    for mode in trouble.modes:
+        queries: Sequence[Query] = place.frames
+        if mode in (LEVEL, ALL):
+            queries = sensors.with_vertical(queries, _VERTICAL_DEG, _SEED)
+        if mode in (FIVE, ALL):
+            queries = sensors.with_neighbours(queries, place.groups, *_ODOMETRY, _SEED)
+        queries = [one for one, asked in zip(queries, place.asked, strict=True) if asked]
+        if trouble.sensor is not None:
+            queries = trouble.sensor(queries)
+        changed, options = place.landmark_map, high if mode in (LEVEL, ALL) else plain
+        if trouble.change is not None:
+            changed, queries = trouble.change(changed, queries, trouble.level,
+                                              np.random.default_rng(_SEED))
+        options = replace(options, k=min(options.k, len(changed)))
+        found = run_trial(changed, Method(AUTO, options), 0, queries)
+        right = np.array([one.error_m is not None and one.error_m <= _RIGHT_M for one in found],
+                         dtype=np.bool_)
+        accepted = np.array([one.accepted for one in found], dtype=np.bool_)
+        yield Outcome(trouble.name, mode, len(found), int(right.sum()), int(accepted.sum()),
+                      int((accepted & ~right).sum()))
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Return the sums of each trouble and mode, as Markdown."""
+    rows = ['| wrong | known | requests | within 1 m | accepted | false accepts | share (95 %) | '
+            'recall |', '|---|---|---|---|---|---|---|---|']
+    for trouble, mode in dict.fromkeys((one.trouble, one.mode) for one in outcomes):
+        its = np.sum([one[2:] for one in outcomes if one[:2] == (trouble, mode)], axis=0)
+        requests, right, accepted, false = map(int, its)
+        low, high = wilson_interval(false, requests)
+        recall = f'{(accepted - false) / right:.2f}' if right else ''
+        rows.append(f'| {trouble} | {mode} | {requests} | {right / requests:.2f} | {accepted} | '
+                    f'{false} | {false / requests:.4f} ({low:.4f} to {high:.4f}) | {recall} |')
+    return '\n'.join(rows)
+
+
+def run(arguments: list[str]) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog='stress', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
+    parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
+                        help='one for all query files, or one for each')
+    parser.add_argument('--frames', choices=('main', 'all'), default='all')
+    parser.add_argument('--worlds', type=int, default=0, metavar='N',
+                        help='simulated worlds of each kind, besides')
+    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['room', 'office', 'shop'])
+    parser.add_argument('--first-seed', type=int, default=1000, metavar='N')
+    parser.add_argument('--matching', choices=('hybrid', 'class'), default='hybrid')
+    parser.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
+                        help='troubles whose name contains one of these')
+    parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
+    options = parser.parse_args(arguments)
+    if options.worlds < 0 or options.first_seed < 0:
+        raise OptionsError('--worlds and --first-seed must not be below 0')
+    places = [*_recordings(options), *(Simulated(kind, options.first_seed + number)
+                                       for kind in options.kinds
+                                       for number in range(options.worlds))]
+    tasks = [(place, row) for row, trouble in enumerate(TROUBLES) for place in places
+             if any(text in trouble.name for text in options.only)]
+    if not tasks:
+        raise OptionsError('nothing to test: give --queries and --map, or --worlds; --only must '
+                           'name a trouble')
+    found = {}
+    work = MakeTrial(options.matching)
+    with closing(run_tasks(work, tasks, workers=options.workers)) as results:
+        for task, outcomes in tqdm(results, 'troubles', len(tasks), disable=None):
+            found[task] = outcomes or []
+    print(table([one for task in tasks for one in found[task]]))
+    return 0
+
+
+def _recordings(options: argparse.Namespace) -> list[Recording]:
+    maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
+    if len(maps) != len(options.queries):
+        raise OptionsError('give one map, or as many maps as query files in the same order')
+    return [Recording(path, map_path, options.frames == 'all')
+            for path, map_path in zip(options.queries, maps, strict=True)]
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
