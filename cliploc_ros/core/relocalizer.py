@@ -172,12 +172,10 @@ class Relocalizer:
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
         distinct, twin = self._distinct(frames, rig, cameras, compared)
-        here = place_of(self._map, poses[0])
         evidence = replace(
             self._evidence(frames, compared, likely, covariance.matched),
             earlier=looks.confidences_in(frames[-1].observation, poses[0]), distinct=distinct,
-            place=here.position, place_map=here.name, twin=twin and twin.position,
-            twin_map=twin.name if twin else '')
+            place=place_of(self._map, poses[0]).position, twin=twin and twin.position, twin_map=twin.name if twin else '')
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,

@@ -56,9 +56,8 @@ class Evidence:
         Number of other detected objects of the map's classes.
     earlier : tuple of float
         Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks.
-    place_map, rival_map, twin_map : str
-        Where there are several maps: the name of its own, and of those of the likeliest rival
-        and of the twin.
+    rival_map, twin_map : str
+        Name of the map of the likeliest rival and of the twin, where there are several maps.
     """
 
     inliers: int
@@ -74,7 +73,6 @@ class Evidence:
     meetings: float = math.inf
     unexplained: float = 0.0
     earlier: tuple[float, ...] = ()
-    place_map: str = ''
     rival_map: str = ''
     twin_map: str = ''
 
@@ -147,9 +145,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     others = evidence.likely * evidence.found * evidence.near
     if (evidence.twin is not None and evidence.distinct < options.min_confidence
             and (is_ambiguous or others >= options.min_confidence)):
-        return (f'{compared}; {_point(evidence.place)}{_in(evidence.place_map)} and '
-                f'{_point(evidence.twin)} m{_in(evidence.twin_map)} look alike; turn the camera '
-                'to objects that differ')
+        second = evidence.twin_map and f' (the second in {evidence.twin_map})'
+        return (f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look alike'
+                f'{second}; turn the camera to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
         return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                 'turn the camera to more or nearer objects')
