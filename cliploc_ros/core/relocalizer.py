@@ -175,7 +175,8 @@ class Relocalizer:
         evidence = replace(
             self._evidence(frames, compared, likely, covariance.matched),
             earlier=looks.confidences_in(frames[-1].observation, poses[0]), distinct=distinct,
-            place=place_of(self._map, poses[0]).position, twin=twin and twin.position, twin_map=twin.name if twin else '')
+            place=place_of(self._map, poses[0]).position, twin=twin and twin.position,
+            twin_map=twin.name if twin else '')
         reason = refusal(evidence, self._options)
         return Relocalization(
             accepted=not reason, reason=reason,
