@@ -12,42 +12,31 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation import sensors, troubles
 from cliploc_ros.evaluation.methods import AUTO, Method
+from cliploc_ros.evaluation.places import (
+    ALL,
+    FIVE,
+    LEVEL,
+    ONE,
+    Place,
+    add_arguments,
+    chosen_places,
+)
 from cliploc_ros.evaluation.summary import wilson_interval
-from cliploc_ros.evaluation.trials import Query, make_queries, run_trial
-from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
-from cliploc_ros.evaluation.worlds.places import KINDS
-from cliploc_ros.evaluation.worlds.world import make_world
+from cliploc_ros.evaluation.trials import Query, run_trial
 from cliploc_ros.parallel import run_tasks
 
 _RIGHT_M = 1.0
-# What is known besides one image: the vertical and the height, odometry of further images.
-ONE, LEVEL, FIVE, ALL = 'one image', 'vertical, height', 'five images', 'five, vertical, height'
-# Deviations of honest sensors, and by how much the height range exceeds the true heights.
-_VERTICAL_DEG, _ODOMETRY, _HEIGHT_M = 1.0, (0.01, 0.5), 0.2
 _SEED = 7
-
-
-class Place(NamedTuple):
-    """A map, all its frames with the group of each, and which frames are queries."""
-
-    landmark_map: LandmarkMap
-    frames: Sequence[Query]
-    groups: Sequence[int]
-    asked: Sequence[bool]
-
 
 Sensor = Callable[[Sequence[Query]], Sequence[Query]]
 
@@ -105,35 +94,6 @@ class Outcome(NamedTuple):
     false: int
 
 
-class Recording(NamedTuple):
-    """A query file and its map."""
-
-    queries: Path
-    landmark_map: Path
-    every_frame: bool
-
-    def __call__(self) -> Place:
-        """Return the place."""
-        landmark_map = LandmarkMap.from_file(self.landmark_map)
-        found = load_queries(self.queries, landmark_map.landmark_ids)
-        return Place(landmark_map, make_queries(found, landmark_map, every_frame=True),
-                     [one.group for one in found.frames],
-                     [one.is_main or self.every_frame for one in found.frames])
-
-
-class Simulated(NamedTuple):
-    """A simulated world; the last image of each group is a query."""
-
-    kind: str
-    seed: int
-
-    def __call__(self) -> Place:
-        """Return the place."""
-        world = make_world(self.kind, self.seed)
-        return Place(world.landmark_map, world.queries, world.groups,
-                     [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
-
-
 class MakeTrial(NamedTuple):
     """Makes the function that tests a place with a trouble."""
 
@@ -146,19 +106,12 @@ class MakeTrial(NamedTuple):
 
 def try_place(place: Place, trouble: Trouble, matching: str) -> Iterator[Outcome]:
     """Localize all queries of a place with a trouble, in each of its modes."""
-    heights = [one.map_from_camera[2, 3] for one in place.frames]
     plain = RelocalizerOptions(matching=matching)
-    high = replace(plain, height_range_m=(min(heights) - _HEIGHT_M, max(heights) + _HEIGHT_M))
-    for mode in trouble.modes:
-        queries: Sequence[Query] = place.frames
-        if mode in (LEVEL, ALL):
-            queries = sensors.with_vertical(queries, _VERTICAL_DEG, _SEED)
-        if mode in (FIVE, ALL):
-            queries = sensors.with_neighbours(queries, place.groups, *_ODOMETRY, _SEED)
-        queries = [one for one, asked in zip(queries, place.asked, strict=True) if asked]
+    for mode in [one for one in trouble.modes if one in place.modes]:
+        queries: Sequence[Query] = place.ask(mode)
         if trouble.sensor is not None:
             queries = trouble.sensor(queries)
-        changed, options = place.landmark_map, high if mode in (LEVEL, ALL) else plain
+        changed, options = place.landmark_map, place.options(mode, plain)
         if trouble.change is not None:
             changed, queries = trouble.change(changed, queries, trouble.level,
                                               np.random.default_rng(_SEED))
@@ -189,29 +142,17 @@ def run(arguments: list[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog='stress', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
-    parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
-                        help='one for all query files, or one for each')
-    parser.add_argument('--frames', choices=('main', 'all'), default='all')
-    parser.add_argument('--worlds', type=int, default=0, metavar='N',
-                        help='simulated worlds of each kind, besides')
-    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['room', 'office', 'shop'])
-    parser.add_argument('--first-seed', type=int, default=1000, metavar='N')
+    add_arguments(parser, ('room', 'office', 'shop'))
     parser.add_argument('--matching', choices=('hybrid', 'class'), default='hybrid')
     parser.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
                         help='troubles whose name contains one of these')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
     options = parser.parse_args(arguments)
-    if options.worlds < 0 or options.first_seed < 0:
-        raise OptionsError('--worlds and --first-seed must not be below 0')
-    places = [*_recordings(options), *(Simulated(kind, options.first_seed + number)
-                                       for kind in options.kinds
-                                       for number in range(options.worlds))]
+    places = chosen_places(options)
     tasks = [(place, row) for row, trouble in enumerate(TROUBLES) for place in places
              if any(text in trouble.name for text in options.only)]
     if not tasks:
-        raise OptionsError('nothing to test: give --queries and --map, or --worlds; --only must '
-                           'name a trouble')
+        raise OptionsError('nothing to test: --only must name a trouble')
     found = {}
     work = MakeTrial(options.matching)
     with closing(run_tasks(work, tasks, workers=options.workers)) as results:
@@ -219,14 +160,6 @@ def run(arguments: list[str]) -> int:
             found[task] = outcomes or []
     print(table([one for task in tasks for one in found[task]]))
     return 0
-
-
-def _recordings(options: argparse.Namespace) -> list[Recording]:
-    maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
-    if len(maps) != len(options.queries):
-        raise OptionsError('give one map, or as many maps as query files in the same order')
-    return [Recording(path, map_path, options.frames == 'all')
-            for path, map_path in zip(options.queries, maps, strict=True)]
 
 
 def main() -> int:

@@ -9,14 +9,14 @@ import pytest
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation import sensors, stress
+from cliploc_ros.evaluation import places, sensors, stress
 
 KIND, SEED = 'room', 1000
 
 
 @pytest.fixture(scope='module')
 def place():
-    return stress.Simulated(KIND, SEED)()
+    return places.Simulated(KIND, SEED)()
 
 
 @pytest.fixture(scope='module')
@@ -74,7 +74,7 @@ def test_the_table_counts_each_request_once(capsys):
 
 def test_nothing_wrong_is_mostly_right(place):
     fused = [one for one in stress.try_place(place, stress.TROUBLES[0], 'hybrid')
-             if one.mode == stress.ALL]
+             if one.mode == places.ALL]
     assert fused[0].right >= 3
     assert fused[0].false == 0
 
