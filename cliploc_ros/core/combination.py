@@ -20,7 +20,7 @@ from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.keyframes.localization import Recognized
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization

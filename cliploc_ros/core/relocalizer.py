@@ -26,7 +26,6 @@ from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
-from cliploc_ros.core.compiled import warm_up
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
@@ -40,8 +39,9 @@ from cliploc_ros.core.fit.finalists import (
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
-from cliploc_ros.core.joined_map import Place, place_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.kernels.compiled import warm_up
+from cliploc_ros.core.maps.joined_map import Place, place_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization

@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError

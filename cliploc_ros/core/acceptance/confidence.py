@@ -26,7 +26,7 @@ from cliploc_ros.core.index.similarities import (
     pair_similarities,
     sampled_similarities,
 )
-from cliploc_ros.core.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.maps.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 
 # Boxes that overlap more than this show the same object, detected twice.
 _SAME_BOX_IOU = 0.8

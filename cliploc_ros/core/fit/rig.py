@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Potential, Scene
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.index.culling import Groups
+from cliploc_ros.core.kernels.compiled import compiled
 
 
 class FrameStarts(NamedTuple):

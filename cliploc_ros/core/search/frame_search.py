@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.joined_map import parts_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import parts_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.compatibility import compatible_pairs

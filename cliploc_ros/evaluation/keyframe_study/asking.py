@@ -20,7 +20,7 @@ from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
