@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support, agreeing_poses
+from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform

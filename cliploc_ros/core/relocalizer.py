@@ -10,20 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import (
-    RIGHT_M,
-    ComparedFrame,
-    Setting,
-    Support,
-    agreeing_poses,
-    confidences,
-    support,
-    utilities,
-)
+from cliploc_ros.core.acceptance.confidence import Setting, confidences, utilities
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.spread import spread
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
 from cliploc_ros.core.fit.covariance import share_within

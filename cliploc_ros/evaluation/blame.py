@@ -28,12 +28,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.attitude import tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Support,
-    support,
-    utilities,
-)
+from cliploc_ros.core.acceptance.confidence import utilities
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import make_rig
