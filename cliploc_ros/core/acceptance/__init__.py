@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether to accept a pose: what speaks for it, how likely it is, and the decision.
 
+comparison
+    The best poses of a search: which is the likeliest, and the evidence for it.
 support, attitude
     What speaks for a pose, and what its tilt says against it.
 agreement
