@@ -5,7 +5,8 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core.combination import ObjectsThere, combine
+from cliploc_ros.core.acceptance.recognition import ObjectsThere
+from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer

@@ -12,6 +12,8 @@ confidence
     How likely each pose is, given its support and its rivals.
 look_alikes, spread
     Places that look like its own, and hypotheses near it.
+recognition
+    How likely a pose from keyframes is, and why it is refused.
 looks
     What earlier frames say of it.
 verdict
