@@ -24,8 +24,8 @@ from cliploc_ros.benchmark.floors import CAMERA, SeenFloor, make_floor, see_floo
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.joined_map import join_maps
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import join_maps
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import crops_on_demand, localize_on_demand
 from cliploc_ros.core.options import RelocalizerOptions

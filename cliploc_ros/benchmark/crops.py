@@ -18,7 +18,7 @@ import numpy as np
 import cliploc_ros
 from cliploc_ros.command import run_command
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import crops_on_demand, localize_on_demand
 from cliploc_ros.core.options import CROPS, RelocalizerOptions

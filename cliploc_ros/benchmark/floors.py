@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.worlds.detector import hidden
 from cliploc_ros.evaluation.worlds.things import CLASS_NAMES, TYPICAL
 from cliploc_ros.mapping.posed_detections import PosedDetections

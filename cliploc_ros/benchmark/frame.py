@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.benchmark.startup import write_random_checkpoint
 from cliploc_ros.cache_folder import resolve_cache_dir
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

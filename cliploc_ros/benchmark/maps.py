@@ -23,7 +23,7 @@ from cliploc_ros.core.index.similarities import (
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -30,10 +30,10 @@ from cliploc_ros.core.association.candidates import (
     nearest_candidates,
 )
 from cliploc_ros.core.association.scene import Scene, make_scene
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac

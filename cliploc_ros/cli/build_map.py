@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.maps.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.mapping.posed_detections import PosedDetections
 
@@ -92,7 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
 def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.map_file import write_map
+    from cliploc_ros.core.maps.map_file import write_map
 
     begin = time.monotonic()
     _check_folder(options.out)

@@ -10,7 +10,7 @@ from cliploc_ros.command import positive_int
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 _DEFAULT_POINTS = 600
 

@@ -10,8 +10,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from cliploc_ros.cli.map_labels import Labeller
-    from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.maps.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions
     from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.mapping.updating.updating import UpdatedMap
@@ -38,8 +38,8 @@ def read_old_map(path: Path) -> OldMap:
     MapError
         The map or its embeddings are invalid.
     """
-    from cliploc_ros.core.landmark_embeddings import load_embeddings_of_map
-    from cliploc_ros.core.landmark_map import LandmarkMap
+    from cliploc_ros.core.maps.landmark_embeddings import load_embeddings_of_map
+    from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
     landmark_map = LandmarkMap.from_file(path)
     return OldMap(landmark_map, load_embeddings_of_map(path, landmark_map.landmark_ids))

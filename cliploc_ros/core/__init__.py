@@ -16,12 +16,12 @@ keyframes
     Poses from local features of the place as it was mapped.
 association
     Observation and map to candidates and the scene of one frame.
-landmark_map, joined_map, observation, options
-    Inputs.
+maps, observation, options
+    Inputs: one map or several with their files, the frame, and what the caller chooses.
 index
     Landmarks by class, by similarity of labels, and by place.
 geometry
     Transforms, camera, ellipses, ellipsoids, minimal solvers.
-compiled, parameter_file, time_budget
-    Helpers.
+kernels, time_budget
+    Helpers: functions compiled to machine code, and the time that is left.
 """

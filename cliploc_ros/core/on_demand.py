@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.index.similarities import Similarities
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.joined_map import MapPart, parts_of, place_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.tum import parse_stamp_ns
 from cliploc_ros.demo.truth import TrueFrame, TrueObject, true_ids
 from cliploc_ros.mapping.posed_detections import PosedDetections

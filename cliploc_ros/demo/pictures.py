@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.demo.review import Review
 from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
 

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.demo.review import Judged
 from cliploc_ros.demo.style import ACCEPTED, REFUSED
 from cliploc_ros.evaluation.map_view import EDGED, draw_map

@@ -28,19 +28,15 @@ from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.attitude import tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Support,
-    support,
-    utilities,
-)
+from cliploc_ros.core.acceptance.confidence import utilities
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.rig import cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalizer, cameras_from_last
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical

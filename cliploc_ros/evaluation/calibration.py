@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import Setting
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries

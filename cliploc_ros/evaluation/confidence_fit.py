@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from cliploc_ros.core.acceptance.agreement import agreeing_poses
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT
 from cliploc_ros.core.acceptance.confidence import (
     DEFAULT,
     Calibration,
     Setting,
-    Support,
-    agreeing_poses,
     confidences,
     none_right,
     utilities,
 )
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import OptionsError

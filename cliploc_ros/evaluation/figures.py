@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.map_view import draw_map
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.output import write_file

@@ -23,8 +23,8 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.keyframes.layer_file import save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.map_file import write_map
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.frames import Frame, Frames, RawFrame, Wanted
 from cliploc_ros.datasets.intrinsics import find_camera

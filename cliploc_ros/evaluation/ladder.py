@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.evaluation.methods import Method

@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 #: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)

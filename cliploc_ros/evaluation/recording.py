@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import Recorded
 from cliploc_ros.datasets.queries import Queries, QueryFrame

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import stages_of
 from cliploc_ros.core.options import RelocalizerOptions

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import batched
 from typing import NamedTuple
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CliplocError

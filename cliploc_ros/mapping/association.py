@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import box_iou, project_box
 from cliploc_ros.mapping.views import Views

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes

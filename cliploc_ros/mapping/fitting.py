@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import (
     LANDMARK_SIZE,

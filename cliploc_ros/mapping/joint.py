@@ -21,7 +21,7 @@ from scipy.sparse import bsr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import (
     add_axis_prior,
     edge_residual,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import edge_residual, robust_weight
 from cliploc_ros.mapping.joint import Equations, Problem, State, pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks

@@ -17,7 +17,7 @@ from math import sqrt
 
 import numpy as np
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 
 #: Numbers of a landmark: centre, then the upper triangle of D, row by row.
 LANDMARK_SIZE = 9

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.depth_seeds import depth_hypotheses
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks, no_landmarks

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from cliploc_ros.core.landmark_details import WeightedLabels
+from cliploc_ros.core.maps.landmark_details import WeightedLabels
 
 #: The most labels that are encoded, cached and held at once: 134 MB of 512 numbers each.
 PART = 65_536

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import load_map
 

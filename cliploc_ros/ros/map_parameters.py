@@ -7,8 +7,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from cliploc_ros.core.joined_map import join_maps
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import join_maps
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, OptionsError
 
 _PREFIX = 'map.'

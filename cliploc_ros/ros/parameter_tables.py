@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from cliploc_ros.core.fit.rig import MAX_FRAMES
 from cliploc_ros.core.options import (
     ALGORITHMS,
     COMPARED,
@@ -13,7 +14,6 @@ from cliploc_ros.core.options import (
     MATCHINGS,
     RelocalizerOptions,
 )
-from cliploc_ros.core.relocalizer import MAX_FRAMES
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.core.parameter_file import read_parameter_file
+from cliploc_ros.core.maps.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.vocabulary.grammar import NAME, SECOND, expand_phrases
 

@@ -10,7 +10,7 @@ import pytest
 from cliploc_ros.cli.build_map import main, make_parser
 from cliploc_ros.cli.map_layer import write_layer
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'

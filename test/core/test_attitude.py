@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import Setting, Support, confidences, utilities
+from cliploc_ros.core.acceptance.confidence import Setting, confidences, utilities
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.options import RelocalizerOptions

@@ -11,8 +11,8 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.index.culling import FEW
-from cliploc_ros.core.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

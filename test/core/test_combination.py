@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.acceptance.confidence import Support
-from cliploc_ros.core.combination import ObjectsThere, combine, fuse, objects_there
+from cliploc_ros.core.acceptance.recognition import ObjectsThere, objects_there
+from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.combination import combine, fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.observation import Observation

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 import cliploc_ros
-from cliploc_ros.core.kernel_cache import KernelFolders, source_stamp
+from cliploc_ros.core.kernels.cache import KernelFolders, source_stamp
 
 PROJECT = Path(__file__).resolve().parents[2]
 # A few kernels, which are compiled within seconds. The last one calls the others.
 PROGRAM = """
 import logging
 logging.basicConfig(format='%(levelname)s %(message)s', level=logging.INFO)
-from cliploc_ros.core.compiled import warm_up
-from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS
+from cliploc_ros.core.kernels.compiled import warm_up
+from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
 from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 warm_up(lambda: unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
 print(KERNEL_FOLDERS.missing, unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
@@ -181,7 +181,7 @@ def test_a_read_only_installation_keeps_kernels_in_the_users_cache(kernels, pack
 def test_the_preferred_folder_gets_what_lies_elsewhere(tmp_path, monkeypatch):
     """So a folder to carry to another machine becomes complete."""
     monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
-    monkeypatch.setattr('cliploc_ros.core.kernel_cache._PACKAGE', tmp_path / 'package')
+    monkeypatch.setattr('cliploc_ros.core.kernels.cache._PACKAGE', tmp_path / 'package')
     folders = KernelFolders()
     folders.store('a.kernel', b'code', 'a*')
     folders.prefer(tmp_path / 'carried')

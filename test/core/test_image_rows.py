@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.core.index.image_rows import with_images
 from cliploc_ros.core.index.similarities import (
     CropSimilarities,
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.maps.image_rows import with_images
+from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
 
 COUNT, SIZE = 50, 64
 

@@ -22,8 +22,8 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.landmark_details import LandmarkDetails
-from cliploc_ros.core.landmark_map import DEFAULT_SIGMA_M
+from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.maps.landmark_map import DEFAULT_SIGMA_M
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

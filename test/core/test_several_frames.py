@@ -11,16 +11,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import odometry_deviations
+from cliploc_ros.core.fit.rig import MAX_FRAMES
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import MAX_FRAMES, Relocalizer
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import make_queries

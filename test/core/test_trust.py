@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Setting,
-    Support,
-    confidences,
-    support,
-)
+from cliploc_ros.core.acceptance.confidence import Setting, confidences
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.covariance import pose_covariance

@@ -25,8 +25,8 @@ from foreign_maps import (
 )
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.map_file import write_map
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.datasets.map_formats.class_names import COCO, read_class_names
 from cliploc_ros.datasets.map_formats.given_map import GivenMap, Placement, place
 from cliploc_ros.datasets.map_formats.goreloc import read_goreloc

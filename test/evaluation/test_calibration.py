@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.core.acceptance.confidence import DEFAULT, Setting, Support, confidences
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.acceptance.confidence import DEFAULT, Setting, confidences
+from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries

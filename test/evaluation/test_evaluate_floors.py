@@ -11,8 +11,8 @@ import pytest
 
 from cliploc_ros.benchmark.building import main as building
 from cliploc_ros.cli.evaluate import main
-from cliploc_ros.core.landmark_map import LandmarkMap
-from cliploc_ros.core.map_file import write_map
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.demo import ASSETS
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',

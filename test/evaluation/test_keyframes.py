@@ -5,11 +5,12 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core.combination import ObjectsThere, combine
+from cliploc_ros.core.acceptance.recognition import ObjectsThere
+from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames

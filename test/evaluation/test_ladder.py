@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.evaluation.ladder import climb, count_searches, rungs, table_rows
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from cliploc_ros.benchmark.pose_errors import disturb, draw_errors, offsets_m
-from cliploc_ros.core.map_file import write_map
+from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.landmarks import landmarks_of_map

@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.maps.landmark_details import LandmarkDetails
 from cliploc_ros.models import weighted_labels
 from cliploc_ros.models.weighted_labels import mixed_rows
 

@@ -5,7 +5,7 @@ from scene import make_room
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.ros.outputs.markers import (
     MAX_SHOWN,
     class_color,

@@ -17,10 +17,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.pairs import find_repeats
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 # All constants are chosen on simulated worlds, see cliploc_ros.evaluation.worlds: kinds room,
 # office, shop, corridor, hall and two rooms, seeds 0 to 59.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import agreeing_poses
+from cliploc_ros.core.acceptance.agreement import agreeing_poses
 
 # Hypotheses near each other share landmarks and errors, so the difference of their supports says
 # less than between places. Chosen on simulated worlds (seeds 0 to 39): 1 covers too little in

@@ -21,8 +21,8 @@ from cliploc_ros.core.association.candidates import (
 from cliploc_ros.core.association.scene import Scene, make_scene
 from cliploc_ros.core.index.culling import FEW, SortedLandmarks
 from cliploc_ros.core.index.similarities import split_similarities
-from cliploc_ros.core.joined_map import parts_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import parts_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError

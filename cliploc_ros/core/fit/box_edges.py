@@ -19,8 +19,8 @@ from math import sqrt
 
 import numpy as np
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
+from cliploc_ros.core.kernels.compiled import compiled
 
 # Standard deviation of an edge at a landmark of known position: a share of the mean of its box's
 # two sides, plus a constant on the plane z = 1, about a pixel. The share is near the median error

@@ -27,7 +27,7 @@ from cliploc_ros.core.fit.rig import Rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
-from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
 from cliploc_ros.core.search.leaders import MAX_DISTINCT, are_near, same_place
 
 # Refined poses nearer than this are one minimum of the cost. Places can have several.
@@ -83,6 +83,25 @@ class Finalist(NamedTuple):
     def map_from_camera(self) -> NDArray[np.float64]:
         """Return the pose (4, 4)."""
         return invert_transform(make_transform(self.rotation, self.translation))
+
+
+def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, deadline: float
+                     ) -> tuple[list[Finalist], NDArray[np.bool_]]:
+    """Return the best poses, best first, and which of them use the known vertical.
+
+    The others are their rivals: the best poses elsewhere that ignore the vertical, which may
+    be wrong. See find_finalists for the parameters.
+    """
+    upright = find_finalists(frames, rig, refine, REFINED, deadline)
+    if not upright:
+        return [], np.empty(0, dtype=np.bool_)
+    tilted = find_finalists([one._replace(leaders=one.tilted) for one in frames], rig, refine,
+                            MAX_DISTINCT, deadline)
+    elsewhere = [one for one in tilted if not any(
+        same_place(one.rotation, one.translation, other.rotation, other.translation)
+        for other in upright)]
+    finalists = upright + elsewhere
+    return finalists, np.arange(len(finalists)) < len(upright)
 
 
 def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, count: int,

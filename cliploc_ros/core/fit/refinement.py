@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.fit.box_edges import (
     edge_deviation,
     linearize,
@@ -23,6 +22,7 @@ from cliploc_ros.core.fit.box_edges import (
 )
 from cliploc_ros.core.fit.rig import camera_pose
 from cliploc_ros.core.fit.verification import verify_rig
+from cliploc_ros.core.kernels.compiled import compiled
 
 # A round may lower the score to this share of the best so far: a fit of many edges is nearer to
 # the truth than the greatest overlap. A pose that loses its landmarks is dropped.

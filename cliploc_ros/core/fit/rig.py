@@ -12,8 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Potential, Scene
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.core.index.culling import Groups
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.errors import OptionsError
+
+#: The most frames that are fused. The leaders of each frame are verified on every frame, so the
+#: time grows with the square; and the tenth view of the same objects adds little.
+MAX_FRAMES = 10
 
 
 class FrameStarts(NamedTuple):
@@ -59,6 +66,26 @@ class Rig(NamedTuple):
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
     sigmas: NDArray[np.float64]
+
+
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+    """Return each camera from the last (F, 4, 4), by odometry."""
+    if not 1 <= len(observations) <= MAX_FRAMES:
+        raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
+    cameras = np.tile(np.eye(4), (len(observations), 1, 1))
+    if len(observations) == 1:
+        return cameras
+    linked = []
+    for number, one in enumerate(observations, start=1):
+        where = f'odom_from_camera of frame {number} of {len(observations)}'
+        if one.odom_from_camera is None:
+            raise OptionsError(f'{where} is missing: several frames need it')
+        if not is_rigid(one.odom_from_camera):
+            raise OptionsError(f'{where} is no rigid transform')
+        linked.append(one.odom_from_camera)
+    for row, odom_from_camera in enumerate(linked[:-1]):
+        cameras[row] = invert_transform(odom_from_camera) @ linked[-1]
+    return cameras
 
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],

@@ -6,7 +6,7 @@ from math import acos, copysign, cos, sqrt
 
 import numpy as np
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 
 _DOUBLE_ROOT = 1e-12
 _ROUNDING = 4e-16

@@ -15,8 +15,8 @@ one whole ellipse minus the difference of the caps.
 
 from math import acos, copysign, pi, sqrt
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.cubic import largest_cubic_root
+from cliploc_ros.core.kernels.compiled import compiled
 
 # The least relative difference of the squared semi-axes: the pencil of two circles has no pair of
 # finite lines. The area changes by less than 1e-9 of itself.

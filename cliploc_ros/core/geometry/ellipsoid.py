@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.kernels.compiled import compiled
 
 _UPPER = np.triu_indices(3)
 

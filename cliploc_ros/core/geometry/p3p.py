@@ -15,8 +15,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import ZERO, compiled
 from cliploc_ros.core.geometry.cubic import largest_cubic_root
+from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
 MAX_SOLUTIONS = 4
 _NEWTON_STEPS = 3

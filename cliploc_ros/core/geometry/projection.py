@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS
+from cliploc_ros.core.kernels.compiled import compiled
 
 
 class Poses(NamedTuple):

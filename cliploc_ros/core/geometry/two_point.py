@@ -18,7 +18,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import ZERO, compiled
+from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
 MAX_TWO_POINT_SOLUTIONS = 2
 # Relative limit below which a baseline is vertical or bearings are level.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 
 # Neighbours of a landmark that make pairs with it, and how far away they are [m]. Nearer ones do
 # not give the turn. 100,000 landmarks take 30 MB.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 
 # Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
 # boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:

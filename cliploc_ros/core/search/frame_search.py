@@ -3,7 +3,7 @@
 """The search of one frame by the algorithm that the options name."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import comb
 from typing import NamedTuple
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.joined_map import parts_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import parts_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.compatibility import compatible_pairs
@@ -130,6 +130,11 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
             coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
     return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
                          tuple(part.first for part in parts_of(landmark_map)))
+
+
+def coverage_of(frames: Sequence[SearchedFrame]) -> float:
+    """Return the share of its samples that the search of the least searched frame tried."""
+    return min(one.progress.coverage for one in frames)
 
 
 def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:

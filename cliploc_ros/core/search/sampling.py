@@ -8,7 +8,7 @@ A sample is three candidates with three different detections and three different
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 
 SAMPLE_SIZE = 3
 # An enumeration returns after so many steps of some nanoseconds each, even without a sample.

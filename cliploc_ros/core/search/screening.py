@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.compiled import ZERO, compiled
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS, p3p
 from cliploc_ros.core.geometry.projection import Poses, project
 from cliploc_ros.core.geometry.two_point import two_point
 from cliploc_ros.core.index.culling import Groups, project_visible
+from cliploc_ros.core.kernels.compiled import ZERO, compiled
 from cliploc_ros.core.search.prior import Prior
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.search.leaders import Leaders, remember, worst_score
 from cliploc_ros.core.search.prior import Prior
 from cliploc_ros.core.search.sampling import (

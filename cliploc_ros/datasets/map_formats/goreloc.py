@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.maps.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.class_names import class_name, shares
 from cliploc_ros.datasets.map_formats.files import read_bytes
 from cliploc_ros.datasets.map_formats.given_map import (

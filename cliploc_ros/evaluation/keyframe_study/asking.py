@@ -10,17 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.combination import (
-    ObjectsThere,
-    chance_recognized,
-    combine,
-    objects_there,
-)
+from cliploc_ros.core.acceptance.recognition import ObjectsThere, chance_recognized, objects_there
+from cliploc_ros.core.combination import combine
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 Image = NDArray[np.uint8]
 #: Takes an image and a generator; returns the changed image.

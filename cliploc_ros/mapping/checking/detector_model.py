@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
@@ -16,7 +15,8 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.mapping.checking.landmark_faults import Witness
 from cliploc_ros.mapping.evidence import best_ious

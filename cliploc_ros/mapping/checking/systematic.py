@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.compiled import compiled
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import edge_residual, fit_ellipsoid, robust_weight
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.posed_detections import PosedDetections

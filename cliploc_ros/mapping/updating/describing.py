@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.mapping.updating.fates import Fates
 from cliploc_ros.mapping.updating.judging import Judged
 from cliploc_ros.mapping.updating.objects import Objects

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.landmark_details import LandmarkDetails
+from cliploc_ros.core.maps.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import join_landmarks

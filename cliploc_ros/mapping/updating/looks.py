@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.compiled import compiled
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.projection import project_box
 from cliploc_ros.mapping.updating.options import UpdateOptions

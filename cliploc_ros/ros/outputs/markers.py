@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from cliploc_ros.core.joined_map import parts_of
-from cliploc_ros.core.landmark_map import LandmarkMap
+from cliploc_ros.core.maps.joined_map import parts_of
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 #: The most landmarks that are shown: with more, RViz draws slowly.
 MAX_SHOWN = 5000

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from cliploc_ros.core.kernel_cache import KERNEL_FOLDERS, KernelCache
+from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS, KernelCache
 
 #: A literal 0 as an argument compiles a further specialization of a kernel; this one does not.
 ZERO = np.int64(0)

@@ -34,7 +34,7 @@ from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
 from cliploc_ros.cache_folder import resolve_cache_dir
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parents[2]
 _ROOT = _PACKAGE.name
 _VERSIONS = (sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__)
 _DIGEST_BYTES = 32

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.index.similarities import LabelEmbeddings
-from cliploc_ros.core.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
 
 # Landmarks whose images stand for crops where spreads are measured.
 _CROPS_SAMPLED = 1024

@@ -18,13 +18,13 @@ from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.index.duplicates import objects_of
 from cliploc_ros.core.index.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.landmark_details import (
+from cliploc_ros.core.maps.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
     read_details,
 )
-from cliploc_ros.core.parameter_file import read_parameter_file
+from cliploc_ros.core.maps.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
