@@ -10,6 +10,7 @@ the share of the right poses that is accepted. "best" is the greatest recall tha
 """
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -24,6 +25,7 @@ from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.evaluation.confidence_fit import RIGHT_M, best_recall, draw_judged
 from cliploc_ros.evaluation.methods import AUTO, Method
+from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.places import (
     MODES,
     Place,
@@ -140,15 +142,24 @@ def elsewhere_table(outcomes: Sequence[Outcome],
         f'{least:g}' for least in min_confidences) + ' |',
         '|---' * (len(min_confidences) + 2) + '|']
     there = [one for one in outcomes if one.is_elsewhere]
-    for place in [*dict.fromkeys(one.place for one in there), 'all']:
-        likely = np.array([one.confidence for one in there if place in ('all', one.place)])
-        cells = []
-        for least in min_confidences:
-            false = int((likely >= least).sum())
-            low, high = wilson_interval(false, len(likely))
-            cells.append(f'{false} [{low:.4f}, {high:.4f}]')
-        rows.append(f'| {place} | {len(likely)} | {" | ".join(cells)} |')
+    parts = {one.place: [other for other in there if other.place == one.place] for one in there}
+    parts |= {f'{mode}, {matching}': [
+        one for one in there if (one.mode, one.matching) == (mode, matching)]
+        for matching in _MATCHINGS for mode in MODES}
+    for name, its in [*parts.items(), ('all', there)]:
+        if its:
+            rows.append(f'| {name} | {len(its)} | {_false_accepts(its, min_confidences)} |')
     return '\n'.join(rows)
+
+
+def _false_accepts(outcomes: Sequence[Outcome], min_confidences: Sequence[float]) -> str:
+    likely = np.array([one.confidence for one in outcomes])
+    cells = []
+    for least in min_confidences:
+        false = int((likely >= least).sum())
+        low, high = wilson_interval(false, len(likely))
+        cells.append(f'{false} [{low:.4f}, {high:.4f}]')
+    return ' | '.join(cells)
 
 
 def run(arguments: list[str]) -> int:
@@ -158,7 +169,8 @@ def run(arguments: list[str]) -> int:
     add_arguments(parser, ('room', 'office', 'shop', 'bare room'))
     parser.add_argument('--min-confidence', type=float, nargs='+', default=_THRESHOLDS)
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
-    parser.add_argument('--out', type=Path, metavar='DIR', help='draw a reliability diagram there')
+    parser.add_argument('--out', type=Path, metavar='DIR',
+                        help='write outcomes.json and draw a reliability diagram there')
     options = parser.parse_args(arguments)
     tasks = [Task(place.name, place, mode, matching) for place in chosen_places(options)
              for matching in _MATCHINGS for mode in MODES]
@@ -171,6 +183,8 @@ def run(arguments: list[str]) -> int:
     print()
     print(elsewhere_table(every, options.min_confidence))
     if options.out is not None:
+        make_folder(options.out)
+        (options.out / 'outcomes.json').write_text(json.dumps([one._asdict() for one in every]))
         here = [one for one in every if not one.is_elsewhere]
         draw_judged(options.out, 'poses that at least three objects support', {mode: (
             np.array([one.confidence for one in here if one.mode == mode]),
