@@ -81,7 +81,8 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--camera-height', type=float, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')
     group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
-    group.add_argument('--min-confidence', type=float, default=0.97,
+    group.add_argument('--min-confidence', type=float,
+                       default=RelocalizerOptions().min_confidence,
                        help="the relocalizer's (%(default)s)")
 
 

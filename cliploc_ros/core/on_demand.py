@@ -31,8 +31,8 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 BATCH = 4
 # A pose from a part of the crops may be wrong with this share of the probability that one from all
 # crops may. Chosen on the TUM frames in maps with exchanged places: wrong poses came to .9995
-# before all crops were compared. A share of 1 gave seven false accepts, all crops gave three. With
-# the default min_confidence a pose needs .9997, as then.
+# before all crops were compared. A share of 1 gave seven false accepts, all crops gave three (with
+# coefficients before the installed ones). With the default min_confidence a pose needs .999.
 _EARLY_SHARE = 0.01
 _NONE = np.empty(0, dtype=np.int64)
 _NO_LOOKS = Looks()

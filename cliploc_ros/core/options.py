@@ -85,7 +85,7 @@ class RelocalizerOptions:
     vertical_deviation_deg: float = 1.0
     refine: bool = True
     min_inliers: int = 3
-    min_confidence: float = 0.97
+    min_confidence: float = 0.9
     crops: str = 'on_demand'
 
     def __post_init__(self) -> None:

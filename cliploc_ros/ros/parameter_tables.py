@@ -112,7 +112,7 @@ RELOCALIZER = (
                  'not.'),
     ParameterRow('min_inliers', 3, 'Refuse a pose with fewer inliers.', low=3,
                  high=1000),
-    ParameterRow('min_confidence', 0.97, 'Refuse a pose that is less likely to be within 1 m of '
+    ParameterRow('min_confidence', 0.9, 'Refuse a pose that is less likely to be within 1 m of '
                  'the truth.', low=0.0, high=1.0),
     ParameterRow('fuse_frames', 5, 'Localize with up to this many frames together where odom '
                  'links them; 1: each frame alone.', low=1, high=MAX_FRAMES),

@@ -83,9 +83,9 @@ class Calibration(NamedTuple):
 FITTED_ON = 'simulated rooms, offices, shops and bare rooms (24 of each)'
 #: Fitted with and without what else is known, and in maps whose objects have exchanged places; by
 #: labels and classes, and by classes alone.
-DEFAULT = Calibration(score=2.06, misfit=-0.315, likeness=0.396, rarity=0.524, unlabelled=0.594,
-                      unexplained=-0.825, none_right=1.33, map_size=1.55, vertical=-0.637,
-                      knee=0.0, slope=0.433)
+DEFAULT = Calibration(score=1.72, misfit=-0.274, likeness=0.465, rarity=0.347, unlabelled=0.756,
+                      unexplained=-0.797, none_right=0.92, map_size=1.44, vertical=-0.666,
+                      knee=2.0, slope=0.0)
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64], setting: Setting,
