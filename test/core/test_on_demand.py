@@ -93,10 +93,10 @@ def test_classes_that_suffice_take_no_crop():
 def test_an_early_stop_is_surer_than_the_last_one():
     """A pose that classes alone accept, but not surely, is compared with all crops."""
     sure = localize(OPTIONS)[1].confidence
-    asked = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
+    asked = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
     frame, found = localize(asked)
     assert found.accepted and len(frame.observation.compared) > 0
-    frame, found = localize(replace(asked, min_confidence=1.0 - 300.0 * (1.0 - sure)))
+    frame, found = localize(replace(asked, min_confidence=1.0 - 10.0 * (1.0 - sure)))
     assert found.accepted and len(frame.observation.compared) == 0
     frame, found = localize(replace(OPTIONS, min_confidence=1.0))
     assert not found.accepted and len(frame.observation.compared) == len(SEEN)
@@ -104,7 +104,7 @@ def test_an_early_stop_is_surer_than_the_last_one():
 
 def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     sure = localize(OPTIONS)[1].confidence
-    options = replace(OPTIONS, min_confidence=1.0 - 5.0 * (1.0 - sure))
+    options = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
     stages = crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: 0)
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
     assert found.confidence == sure > options.min_confidence

@@ -172,7 +172,7 @@ def test_the_deviations_of_odometry():
     assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0))
 
 
-def test_two_rooms_alike_are_ambiguous_in_any_number_of_frames(room, walk):
+def test_two_rooms_alike_are_refused_in_any_number_of_frames(room, walk):
     """Until a frame shows what only one of them has."""
     shift = np.array([40.0, 0.0, 0.0])
     unique = [[0.5, 0.4, 4.0]]
@@ -187,7 +187,7 @@ def test_two_rooms_alike_are_ambiguous_in_any_number_of_frames(room, walk):
     for count in (1, 2, 4):
         found = relocalizer.relocalize(alike[:count])
         assert not found.accepted
-        assert 'ambiguous' in found.reason
+        assert 'look alike' in found.reason
     told_apart = relocalizer.relocalize([see(both, walk[0], [*range(12), 24]), *alike[1:]])
     assert pose_error(told_apart.map_from_camera, walk[-1]) < (0.01, 0.2)
     assert told_apart.score > told_apart.hypotheses[1].score + 0.5
