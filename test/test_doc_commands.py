@@ -26,6 +26,7 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
+OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
 MODULES = re.compile(r'(cliploc_ros|demo_world)\.')
 
 
@@ -123,11 +124,12 @@ def check_ros2(words: tuple[str, ...]) -> None:
         assert rest[0] == 'call'
         assert rest[1] in names_of_interface()
     elif verb == 'param':
-        _, node, name, value = rest
+        _, node, name, *values = rest  # get has none
         row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]
-        assert row.validated(yaml.safe_load(value)) is not None
+        for value in values:
+            assert row.validated(yaml.safe_load(value)) is not None
     else:
-        assert verb in OF_ROS or (verb == 'run' and rest[0] == 'tf2_ros'), verb
+        assert verb in OF_ROS or (verb == 'run' and rest[0] in OTHER_PACKAGES), verb
 
 
 def check_script(script: str, *arguments: str) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 examples:
-  build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \
+  build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \\
             --map-frame map --out office.yaml
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
