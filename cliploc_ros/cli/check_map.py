@@ -18,6 +18,7 @@ from cliploc_ros.command import (
     run_command,
     split_ros_args,
 )
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -135,7 +136,6 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _check_options(options: argparse.Namespace) -> 'CheckOptions':
-    from cliploc_ros.core.options import RelocalizerOptions
     from cliploc_ros.mapping.checking.options import CheckOptions
 
     return CheckOptions(
