@@ -23,6 +23,7 @@ from cliploc_ros.core.acceptance.confidence import (
 )
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive, refusal
 from cliploc_ros.core.association.candidates import check_k
@@ -155,15 +156,17 @@ class Relocalizer:
         cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
-            return _nothing_found(frames, budget, f'{detections} detections give fewer than '
-                                  f'{frames[-1].sample_size} distinct correspondence candidates; '
-                                  'turn the camera to more objects')
+            return _nothing_found(frames, budget, Refusal(
+                RefusalKind.TOO_FEW_OBJECTS,
+                f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
+                'correspondence candidates; turn the camera to more objects'))
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]), self._map.position_sigmas)
         finalists, is_upright = self._finalists(frames, rig, budget.refinement_end)
         if not finalists:
-            return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
-                                                  'camera to more objects')
+            return _nothing_found(frames, budget, Refusal(
+                RefusalKind.UNEXPLAINED,
+                'no pose explains the detections; turn the camera to more objects'))
         compared = self._compare(frames, rig, cameras, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
         likely = confidences(compared.supports, poses, self._setting(rig),
@@ -177,9 +180,10 @@ class Relocalizer:
             earlier=looks.confidences_in(frames[-1].observation, poses[0]), distinct=distinct,
             place=place_of(self._map, poses[0]).position, twin=twin and twin.position,
             twin_map=twin.name if twin else '')
-        reason = refusal(evidence, self._options)
+        refused = refusal(evidence, self._options)
         return Relocalization(
-            accepted=not reason, reason=reason,
+            accepted=refused is None, reason=refused.reason if refused else '',
+            refusal_kind=refused.kind if refused else None,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
                                  likely * evidence.certainty, compared.supports,
                                  compared.handicaps.tolist())),
@@ -316,10 +320,11 @@ class _Compared(NamedTuple):
     handicaps: NDArray[np.float64]
 
 
-def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str
+def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, refused: Refusal
                    ) -> Relocalization:
-    return Relocalization(False, reason, tried=_tried(frames), coverage=_coverage(frames),
-                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+    return Relocalization(False, refused.reason, refusal_kind=refused.kind, tried=_tried(frames),
+                          coverage=_coverage(frames), search_ms=budget.elapsed_ms,
+                          stamp_ns=frames[-1].observation.stamp_ns)
 
 
 def _tried(frames: Sequence[SearchedFrame]) -> int:
