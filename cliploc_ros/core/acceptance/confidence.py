@@ -24,7 +24,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.similarities import (
     Similarities,
     pair_similarities,
-    sampled_similarities,
+    sampled_spread,
 )
 from cliploc_ros.core.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 
@@ -41,8 +41,6 @@ _EDGE_DEVIATION = (0.2, 0.003)
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 # The data are too few to justify a higher confidence.
 _MOST_CONFIDENCE = 0.9999
-# Number of labels that gives mean and deviation of a crop's similarities to 2 %.
-_LABELS_SAMPLED = 4096
 
 
 @dataclass(frozen=True)
@@ -338,7 +336,6 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
 
 def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
                 landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    sample = sampled_similarities(similarities, rows, _LABELS_SAMPLED)
-    deviations = np.maximum(sample.std(axis=1), 1e-6)
-    return np.asarray((pair_similarities(similarities, rows, landmarks)
-                       - sample.mean(axis=1)) / deviations)
+    means, deviations = sampled_spread(similarities, rows)
+    return np.asarray((pair_similarities(similarities, rows, landmarks) - means)
+                      / np.maximum(deviations, 1e-6))
