@@ -155,7 +155,7 @@ def test_a_server_that_refuses_every_turn(relocalizer, wake_up_until, serve_spin
     process, code = wake_up_until('(refused by /spin: ', frame=poor_frame)
     assert code == REFUSED
     sides = [turned for _, turned, _ in looks(process) if turned]
-    assert sides == [f', not turned by {side} deg (refused by /spin: activate Nav2\'s '
+    assert sides == [f", not turned by {side} deg (refused by /spin: activate Nav2's "
                      'behavior_server)'
                      for _, side in zip(sides, itertools.cycle((45, -45)), strict=False)]
     assert spinner.yaw == 0.0
