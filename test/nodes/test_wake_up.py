@@ -16,6 +16,8 @@ from rclpy.task import Future
 from scene import make_room, see_room
 from tester import RELIABLE, class_matching, make_frame
 
+from cliploc_ros.cli.wake_up import main
+
 ACCEPTED, REFUSED, NOT_READY, INTERRUPTED = 0, 1, 2, 130
 LOOK = (r'^look (\d+) \[[0-9.]+ s\](, (?:not )?turned by .*?)?: '
         r'((?:accepted|refused|withheld): .*)$')
@@ -242,12 +244,20 @@ def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer,
 
 
 @pytest.mark.parametrize('arguments', [
-    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181'),
-    ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken')])
-def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end, arguments):
-    process = start('cli.wake_up', *arguments)
-    assert end(process) == NOT_READY
-    assert 'error: ' in process.output()
-    assert 'Traceback' not in process.output()
+    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181')])
+def test_a_wrong_option_is_not_taken_for_a_refusal(capsys, arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == NOT_READY
+    assert 'error: ' in capsys.readouterr().err
+
+
+def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end):
+    processes = [start('cli.wake_up', *arguments) for arguments in (
+        ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken'))]
+    for process in processes:
+        assert end(process) == NOT_READY
+        assert 'error: ' in process.output()
+        assert 'Traceback' not in process.output()
 
 
