@@ -6,6 +6,7 @@
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
 
 from pathlib import Path
+from typing import List  # noqa: UP035  launch knows this form
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -39,7 +40,8 @@ DETECTOR_PARAMETERS = {
 }
 RELOCALIZER_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
-    'map_file': 'the map of objects',
+    'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
+    'map_files': 'instead of map_file, the maps of several floors: [ground.yaml, first.yaml]',
     'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
     'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
@@ -58,6 +60,7 @@ OTHERS = {
     'log_level': ('info', 'debug, info, warn or error'),
 }
 _TRUTH_VALUES = ('autostart', 'use_sim_time')
+_LISTS = ('map_files',)
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -85,10 +88,16 @@ def check_parameter_file(path: str) -> None:
                            'correct the path, or omit the argument to use the defaults')
 
 
+def _type_of(parameter: str) -> type:
+    if parameter in _LISTS:
+        return List[str]  # noqa: UP006
+    return bool if parameter in _TRUTH_VALUES else str
+
+
 def _node(name: str, parameters: set[str], given: set[str], **keywords) -> Node:
     files = [ParameterFile(LaunchConfiguration('parameters'))] if 'parameters' in given else []
     changes = {one: ParameterValue(LaunchConfiguration(one),
-                                   value_type=bool if one in _TRUTH_VALUES else str)
+                                   value_type=_type_of(one))
                for one in sorted(parameters)}
     tf, image = LaunchConfiguration('tf'), LaunchConfiguration('image')
     return Node(

@@ -24,8 +24,8 @@ OF_NAV2 = {'namespace', 'use_namespace', 'slam', 'map', 'use_localization', 'use
            'log_level'}
 SHARED_WITH_NAV2 = {'namespace', 'use_sim_time', 'autostart', 'log_level'}
 # what both nodes have in their own names' namespaces, and what ROS has at its root
-OWN = re.compile('/(detector|relocalizer|diagnostics|clock|parameter_events|rosout|tf(_static)?)'
-                 '(/.*)?$')
+OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_events|rosout|'
+                 'tf(_static)?)(/.*)?$')
 
 
 def relocalization_launch() -> list[ast.stmt]:

@@ -21,6 +21,7 @@ from cliploc_ros.core.acceptance.recognition import (
     chance_recognized,
     refusal_of,
 )
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.localization import Recognized
@@ -58,10 +59,12 @@ def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere 
     if agree:
         return _both(found, seen, chance, refusal, options)
     if found.accepted:
-        return replace(found, accepted=False, reason=_contradiction(found, seen)) \
+        return replace(found, accepted=False, reason=_contradiction(found, seen),
+                       refusal_kind=RefusalKind.CONTRADICTION) \
             if _contradicts(seen, found, options) else found
     if not refusal and found.confidence >= _CONTRADICTS:
         refusal = _contradiction(found, seen)
+        found = replace(found, refusal_kind=RefusalKind.CONTRADICTION)
     reason = f'{found.reason}; keyframes: {refusal}' if refusal else ''
     if refusal and found.confidence >= chance:
         return replace(found, reason=reason)
@@ -95,8 +98,10 @@ def _with_pose(found: Relocalization, pose: NDArray[np.float64],
                    if one is not best and not _agree(one.map_from_camera, pose))
     leading = Hypothesis(pose, best.score if best else 0.0, confidence,
                          best.support if best else Support())
-    return replace(found, accepted=not reason, reason=reason, hypotheses=(leading, *others),
-                   matches=found.matches if best else (), covariance=covariance, source=source)
+    return replace(found, accepted=not reason, reason=reason,
+                   refusal_kind=found.refusal_kind if reason else None,
+                   hypotheses=(leading, *others), matches=found.matches if best else (),
+                   covariance=covariance, source=source)
 
 
 def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],

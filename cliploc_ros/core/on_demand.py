@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.index.similarities import Similarities
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -151,6 +152,6 @@ def _accepted_early(found: Relocalization, options: RelocalizerOptions) -> Reloc
     needed = 1.0 - _EARLY_SHARE * (1.0 - options.min_confidence)
     if not found.accepted or found.confidence >= needed:
         return found
-    return replace(found, accepted=False,
+    return replace(found, accepted=False, refusal_kind=RefusalKind.NOT_ALL_CROPS,
                    reason=f'confidence {found.confidence:.4f} < {needed:.4f}, as it takes without '
                           'all crops; raise timeout_s')

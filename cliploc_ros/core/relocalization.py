@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
@@ -70,6 +71,8 @@ class Relocalization:
     source : str
         What the best pose comes from: 'objects', 'keyframes' or 'both', see
         cliploc_ros.core.combination.
+    refusal_kind : RefusalKind or None
+        Kind of the refusal, which programs compare; None when accepted.
     """
 
     accepted: bool
@@ -84,6 +87,7 @@ class Relocalization:
     search_ms: float = 0.0
     stamp_ns: int = 0
     source: str = 'objects'
+    refusal_kind: RefusalKind | None = None
 
     @property
     def solved(self) -> bool:

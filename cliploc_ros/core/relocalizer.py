@@ -10,6 +10,7 @@ import numpy as np
 from cliploc_ros.core.acceptance.comparison import JoinedFrames, compare, evidence_of
 from cliploc_ros.core.acceptance.confidence import utilities
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.association.candidates import check_k
@@ -121,16 +122,18 @@ class Relocalizer:
         cameras = cameras_from_last([one.observation for one in frames])
         if not any(one.has_samples for one in frames):
             detections = sum(len(one.observation.detections) for one in frames)
-            return _nothing_found(frames, budget, f'{detections} detections give fewer than '
-                                  f'{frames[-1].sample_size} distinct correspondence candidates; '
-                                  'turn the camera to more objects')
+            return _nothing_found(frames, budget, Refusal(
+                RefusalKind.TOO_FEW_OBJECTS,
+                f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
+                'correspondence candidates; turn the camera to more objects'))
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]), self._map.position_sigmas)
         finalists, is_upright = find_with_rivals(frames, rig, self._options.refine,
                                                  budget.refinement_end)
         if not finalists:
-            return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
-                                                  'camera to more objects')
+            return _nothing_found(frames, budget, Refusal(
+                RefusalKind.UNEXPLAINED,
+                'no pose explains the detections; turn the camera to more objects'))
         joined = JoinedFrames(self._map, self._options, frames, rig, cameras)
         compared = compare(joined, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
@@ -138,9 +141,10 @@ class Relocalizer:
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
         evidence = evidence_of(joined, compared, covariance.matched, looks)
-        reason = refusal(evidence, self._options)
+        refused = refusal(evidence, self._options)
         return Relocalization(
-            accepted=not reason, reason=reason,
+            accepted=refused is None, reason=refused.reason if refused else '',
+            refusal_kind=refused.kind if refused else None,
             hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
                                  compared.likely * evidence.certainty, compared.supports,
                                  compared.handicaps.tolist())),
@@ -149,10 +153,11 @@ class Relocalizer:
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
 
 
-def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, reason: str
+def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, refused: Refusal
                    ) -> Relocalization:
-    return Relocalization(False, reason, tried=_tried(frames), coverage=coverage_of(frames),
-                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+    return Relocalization(False, refused.reason, refusal_kind=refused.kind, tried=_tried(frames),
+                          coverage=coverage_of(frames), search_ms=budget.elapsed_ms,
+                          stamp_ns=frames[-1].observation.stamp_ns)
 
 
 def _tried(frames: Sequence[SearchedFrame]) -> int:

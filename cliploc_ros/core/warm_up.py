@@ -20,6 +20,7 @@ from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.index.pairs import find_repeats, make_pairs
+from cliploc_ros.core.index.similarities import keep_greatest
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.search.leaders import Leaders, are_near, same_place
@@ -59,6 +60,8 @@ def call_every_kernel() -> None:
     are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
     project_ellipsoids(np.eye(4), centers, shapes)
     classes = np.zeros(3, dtype=np.int64)
+    keep_greatest(np.ones((1, 1), np.float32), 0, np.zeros((1, 1), np.int64),
+                  np.zeros((1, 1), np.float32))
     find_repeats(make_pairs(centers, classes, cKDTree(centers)), classes)
 
 

@@ -57,6 +57,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
              '(one of bf and auto, which draw no samples); ± is the standard deviation over '
              'trials, at 1 m.',
              f'Confidences are fitted on {FITTED_ON}.']
+    lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'
               for one in summaries if 0.0 < one.crops_share < 1.0]
@@ -64,6 +65,10 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
     return lines
+
+
+def _kinds(one: Summary) -> str:
+    return ', '.join(f'{count} {kind}' for kind, count in one.refusals.items())
 
 
 def as_text(rows: Sequence[Sequence[str]]) -> str:
@@ -90,7 +95,7 @@ def as_csv(summaries: Sequence[Summary]) -> str:
                      'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
                      'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
                      'less_than_best_1m', 'less_than_best_low', 'less_than_best_high',
-                     'crops_share'])
+                     'crops_share', 'refused_by_kind'])
     for one in summaries:
         difference = compare(one, best)
         writer.writerow([
@@ -100,7 +105,7 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
             float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
             one.false_accepts(), difference.mean, difference.low, difference.high,
-            one.crops_share])
+            one.crops_share, _kinds(one)])
     return text.getvalue()
 
 

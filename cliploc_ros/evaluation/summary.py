@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Statistics of a method's results, and whether two methods differ by more than noise."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -38,6 +39,8 @@ class Summary:
         Infinite where no pose was found; empty where it was not recorded.
     crops_share : float
         Share of a query's crops that were compared with labels, on average.
+    refusals : dict of str to int
+        How many were refused, by kind, the most frequent first.
     """
 
     method: str
@@ -52,6 +55,7 @@ class Summary:
     boxes: NDArray[np.int64]
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     crops_share: float = 1.0
+    refusals: dict[str, int] = field(default_factory=dict)
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, accepted or not."""
@@ -127,13 +131,15 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     def column(name: str) -> NDArray[Any]:
         return np.array([getattr(result, name) for result in results]).reshape(-1, len(queries))
 
+    kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
     errors = [np.inf if result.error_m is None else result.error_m for result in results]
     return Summary(
         method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
         column('hypotheses'), column('boxes')[0],
         np.array([np.inf if result.nees is None else result.nees for result in results]
-                 ).reshape(-1, len(queries)), float(column('crops_share').mean()))
+                 ).reshape(-1, len(queries)), float(column('crops_share').mean()),
+        dict(kinds.most_common()))
 
 
 @dataclass(frozen=True)

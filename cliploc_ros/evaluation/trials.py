@@ -93,6 +93,8 @@ class Result:
     map : str
         Of several maps, the one of the pose, which is in the coordinates of the first map: on
         another map, it is far away. Empty for a single map.
+    refusal_kind : str
+        See cliploc_ros.core.acceptance.refusal_kind; empty when accepted.
     """
 
     method: str
@@ -116,6 +118,7 @@ class Result:
     search_ms: float
     crops_share: float = 1.0
     map: str = ''
+    refusal_kind: str = ''
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -216,4 +219,5 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
         inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
         reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
-        map='' if pose is None else place_of(landmark_map, pose).name)
+        map='' if pose is None else place_of(landmark_map, pose).name,
+        refusal_kind=found.refusal_kind or '')

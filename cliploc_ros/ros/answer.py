@@ -9,6 +9,7 @@ from enum import StrEnum
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.ros.inputs.robot_state import RobotState
 
 
@@ -46,6 +47,8 @@ class Answer:
         How long each stage took [ms].
     map_hash : str
         Of the map that was searched, see cliploc_ros.ros.map_hash; empty without one.
+    kind : RefusalKind or None
+        Of a refusal; None for other verdicts.
     """
 
     verdict: Verdict
@@ -56,6 +59,7 @@ class Answer:
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     map_hash: str = ''
+    kind: RefusalKind | None = None
 
     @property
     def is_linked(self) -> bool:
@@ -64,6 +68,8 @@ class Answer:
 
     @property
     def message(self) -> str:
-        """Return the verdict, its reason and the map in one line."""
+        """Return the verdict, its reason, the kind of a refusal and the map in one line."""
         text = self.detail if self.verdict is Verdict.FAILED else f'{self.verdict}: {self.detail}'
+        if self.kind is not None:
+            text = f'{text}; kind {self.kind}'
         return f'{text}; map {self.map_hash}' if self.map_hash else text

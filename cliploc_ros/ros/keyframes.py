@@ -20,6 +20,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import MapError
+from cliploc_ros.ros.map_urls import path_of
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +87,7 @@ def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyf
     named, map_file = values['keyframes_file'], values['map_file']
     if not named or (named == NEXT_TO_MAP and not map_file):
         return None
-    path = layer_path(map_file) if named == NEXT_TO_MAP else Path(named)
+    path = layer_path(path_of(map_file)) if named == NEXT_TO_MAP else Path(named)
     if named == NEXT_TO_MAP and not path.exists():
         return None
     try:

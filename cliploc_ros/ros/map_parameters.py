@@ -10,23 +10,26 @@ from rclpy.node import Node
 from cliploc_ros.core.maps.joined_map import join_maps
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, OptionsError
+from cliploc_ros.ros.map_urls import path_of
 
 _PREFIX = 'map.'
 
 
 def map_files(values: Mapping[str, Any]) -> list[str]:
-    """Return the files that the parameters map_file and map_files name.
+    """Return the paths of the files that the parameters map_file and map_files name.
 
     Raises
     ------
     OptionsError
         Both parameters name files.
+    MapError
+        A URL names a package that is not installed.
     """
     several = [name for name in values['map_files'] if name]
     if several and values['map_file']:
         raise OptionsError("map_file and map_files both name files: set map_file to '' to search "
                            'all of map_files')
-    return several or [name for name in [values['map_file']] if name]
+    return [path_of(name) for name in several or [values['map_file']] if name]
 
 
 def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:

@@ -14,8 +14,6 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.pipeline import Pipeline
 
-_URL_PREFIX = 'file://'
-
 
 class MapServices:
     """Reads maps in the node's worker, never in the middle of a search.
@@ -46,7 +44,7 @@ class MapServices:
         Parameters
         ----------
         map_url : str
-            A file, or a URL of one that begins with file://.
+            See cliploc_ros.ros.map_urls.
 
         Raises
         ------
@@ -54,7 +52,7 @@ class MapServices:
             Names what to fix; parameters and maps stay as they were.
         """
         before = {name: self._node.settings[name] for name in ('map_file', 'map_files')}
-        self._set(map_file=map_url.removeprefix(_URL_PREFIX), map_files=[''])
+        self._set(map_file=map_url, map_files=[''])
         try:
             return self._node.worker.run(self._pipeline.reload_map)
         except CliplocError:

@@ -69,7 +69,8 @@ DETECTOR = (
 )
 
 RELOCALIZER = (
-    ParameterRow('map_file', '', "Map file, read when the node is configured and by reload_map; "
+    ParameterRow('map_file', '', "Map file, read when the node is configured and by reload_map: "
+                 "a path, or package://PACKAGE/PATH in a package's share folder; "
                  "empty: map_files, or the parameters below 'map', hold the map."),
     ParameterRow('map_files', [''], 'Map files of floors and buildings instead of map_file: a '
                  'request searches all of them. Each has a frame_id of its own, which names the '

@@ -127,7 +127,8 @@ class Pipeline:
         found = localized.found
         summary = f'[{_summary(localized)}; {times}]'
         if not found.accepted:
-            return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at, state)
+            return Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, received_at, state,
+                          kind=found.refusal_kind)
         assert found.covariance is not None and found.map_from_camera is not None
         assert localized.for_filter is not None
         map_from_base = found.map_from_camera @ state.camera_from_base

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
@@ -108,7 +109,7 @@ class Requests:
         try:
             look, looks = self._look_past_jumps(arrived_at, deadline), 1
         except TimeUpError as error:
-            return Answer(Verdict.REFUSED, str(error))
+            return Answer(Verdict.REFUSED, str(error), kind=RefusalKind.TIME_UP)
         stages_ms, unlinked = Counter(look.answer.stages_ms), int(not look.answer.is_linked)
         is_up = look.answer.is_cut
         while look.may_go_on and unlinked < _MAX_UNLINKED:

@@ -73,9 +73,9 @@ def test_a_pose_of_uncertain_position_is_refused_and_says_so():
     certain = Evidence(5, 0.9999, near=0.9999, deviation_m=0.1)
     vague = replace(certain, near=0.95, deviation_m=0.514)
     options = RelocalizerOptions(min_confidence=0.99)
-    assert refusal(certain, options) == ''
+    assert refusal(certain, options) is None
     assert vague.confidence == pytest.approx(0.9499, abs=1e-4)
-    reason = refusal(vague, options)
+    reason = refusal(vague, options).reason
     assert reason.startswith('confidence 0.94 < 0.99; position uncertain by 0.51 m; turn the')
 
 

@@ -97,6 +97,7 @@ def test_accepted_objects_elsewhere_do_not_overrule_strong_features():
     found = combine(by_objects(5.0, 0.999, True), by_keyframes(0.0), ObjectsThere(0, 8), OPTIONS)
     assert not found.accepted
     assert 'contradict' in found.reason
+    assert found.refusal_kind == 'contradiction'
 
 
 def test_objects_that_the_pose_does_not_explain_speak_against_it():

@@ -13,10 +13,12 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.search.compatibility import (
     FARTHEST,
     NEAREST,
+    _depths,
     _distance_range,
     compatible_pairs,
 )
 from cliploc_ros.core.search.leaders import Leaders
+from cliploc_ros.core.search.sampling import enumerate_compatible_triples
 from cliploc_ros.core.search.strategies import search_exhaustively, search_progressively
 
 
@@ -56,6 +58,38 @@ def test_what_is_true_is_compatible_and_much_else_is_not(room):
     for first, second in np.argwhere(compatible):
         assert (scene.pairs[first] != scene.pairs[second]).all()
     assert compatible.mean() < 0.8
+
+
+def test_all_that_is_within_reach_is_found(room, rng):
+    """Landmarks along a corridor: the sweep leaves out only what no distance allows."""
+    seen = see_room(room)
+    centers = rng.uniform(-1.0, 1.0, (60, 3)) * [40.0, 3.0, 3.0]
+    pairs = np.column_stack([rng.integers(len(seen), size=200), rng.integers(60, size=200)])
+    scene = make_scene(CAMERA.normalize_bboxes(seen.bboxes_xyxy), centers,
+                       np.repeat(room.shapes, 5, axis=0), pairs, pairs, 0.2)
+    depths, bearings = _depths(scene), scene.bearings[pairs[:, 0]]
+    expected = np.zeros((200, 200), dtype=bool)
+    for i, j in np.argwhere((pairs[:, None] != pairs[None]).all(axis=2)):
+        low, high = _distance_range(depths[i], depths[j], bearings[i] @ bearings[j])
+        expected[i, j] = low <= np.linalg.norm(centers[pairs[i, 1]] - centers[pairs[j, 1]]) <= high
+    assert 100 < expected.sum() < 0.5 * expected.size
+    np.testing.assert_array_equal(compatible_pairs(scene), expected)
+
+
+@pytest.mark.parametrize('size', [1, 7, 1024])
+def test_every_compatible_triple_comes_once_and_in_order(rng, size):
+    compatible = np.triu(rng.random((25, 25)) < 0.4, 1)
+    compatible |= compatible.T
+    cursor, found = np.array([2, 0, 1]), []
+    while cursor[0] < len(compatible):
+        block = np.full((size, 3), -1)
+        count = enumerate_compatible_triples(compatible, cursor, block)
+        found += map(tuple, block[:count].tolist())
+    expected = [(a, b, newest) for newest in range(25) for a in range(newest)
+                for b in range(a + 1, newest)
+                if compatible[newest, a] and compatible[newest, b] and compatible[a, b]]
+    assert found == expected
+    assert len(found) > 50
 
 
 def test_it_ends_where_the_exhaustive_search_ends(room):

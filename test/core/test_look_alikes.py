@@ -158,7 +158,8 @@ def test_only_labels_tell_places_apart():
 
 def test_a_refusal_names_both_places():
     evidence = Evidence(6, 0.9999, distinct=0.6, place=(1.0, -2.0, 0.5), twin=(9.0, 3.0, 1.234))
-    reason = refusal(evidence, RelocalizerOptions(min_confidence=0.99))
+    kind, reason = refusal(evidence, RelocalizerOptions(min_confidence=0.99))
+    assert kind == 'look_alike'
     assert reason == ('confidence 0.59 < 0.99; (1.0, -2.0, 0.5) and (9.0, 3.0, 1.2) m look alike; '
                       'turn the camera to objects that differ')
     assert len(f'refused: {reason}') < 130

@@ -109,6 +109,7 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
     assert found.confidence == sure > options.min_confidence
     assert not found.accepted and 'without all crops; raise timeout_s' in found.reason
+    assert found.refusal_kind == 'not_all_crops'
 
 
 @pytest.mark.parametrize('options', [

@@ -229,7 +229,8 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.3), {'min_confidence': 0.2}, ''),
 ])
 def test_refusal_names_its_reason(evidence, options, reason):
-    answer = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
+    refused = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
+    answer = refused.reason if refused else ''
     assert answer.startswith(reason)
     assert bool(answer) == bool(reason)
     assert len(f'refused: {answer}') <= 120

@@ -18,6 +18,7 @@ from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.evaluation.journal import Journal
 from cliploc_ros.evaluation.methods import parse_methods
+from cliploc_ros.evaluation.paper_table import notes
 from cliploc_ros.evaluation.run import count_searches, run_methods
 from cliploc_ros.evaluation.summary import summarize
 from cliploc_ros.evaluation.trials import make_queries
@@ -184,3 +185,8 @@ def test_crops_on_demand_are_a_part_of_all(room, questions):
                for share, one in zip(shares, found['on_demand'], strict=True))
     (summary,) = summarize(found['on_demand'])
     assert summary.crops_share == pytest.approx(np.mean(shares))
+    refused = [one for one in found['on_demand'] if not one.accepted]
+    assert refused and all(one.refusal_kind for one in refused)
+    assert sum(summary.refusals.values()) == len(refused)
+    kinds = ', '.join(f'{count} {kind}' for kind, count in summary.refusals.items())
+    assert f'auto refused: {kinds}.' in notes([summary])

@@ -128,7 +128,7 @@ def test_a_fleet_collects_counters_and_the_hash(own_relocalizer, tester, room_ma
     counted = values()
     tester.destroy_subscription(subscription)
     assert (counted['requests accepted'], counted['requests refused']) == ('1', '2')
-    assert counted['refused: too few objects'] == '1'
+    assert counted['refused: too_few_objects'] == '1'
     assert sum(int(value) for key, value in counted.items() if key.startswith('refused: ')) == 2
     assert 0.0 < float(counted['requests longest [s]']) <= float(counted['requests total [s]'])
     assert counted['map hash'] == hash_of(room_map)

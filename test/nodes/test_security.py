@@ -16,12 +16,17 @@ GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',
          ('services', 'request'): 'get_client_names_and_types_by_node'}
+# What SROS 2 makes of the permission to call an action.
+CALL = {('topics', 'subscribe'): ('feedback', 'status'),
+        ('services', 'request'): ('send_goal', 'cancel_goal', 'get_result')}
 
 
 def allowed(node, kind, act):
     profile = ElementTree.parse(POLICY).find(f".//profile[@node='{node}']")
+    actions = [action.text for action in profile.findall("actions[@call='ALLOW']/action")]
     return {entry.text for group in profile.findall(kind) if group.get(act) == 'ALLOW'
-            for entry in group}
+            for entry in group} | {f'{action}/_action/{name}' for action in actions
+                                   for name in CALL.get((kind, act), ())}
 
 
 def used(tester, node, kind, act):
@@ -61,20 +66,28 @@ def test_the_detector_does_what_its_policy_allows(start, tester, parameters, abs
         check(tester, 'detector', *absent)
 
 
+@pytest.mark.needs('nav2_msgs')
+def test_wake_up_does_what_its_policy_allows(start, tester):
+    start('cli.wake_up', '--timeout', 60)
+    check(tester, 'wake_up')
+
+
 def test_the_policy_has_the_form_of_its_schema():
     """Of version 0.2.0, whose names of elements and attributes the tools look for."""
     root = ElementTree.parse(POLICY).getroot()
     assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
     assert [child.tag for child in root] == ['enclaves']
     assert [(enclave.tag, enclave.attrib) for enclave in root[0]] == [
-        ('enclave', {'path': f'/cliploc_ros/{node}'}) for node in ('detector', 'relocalizer')]
+        ('enclave', {'path': f'/cliploc_ros/{node}'})
+        for node in ('detector', 'relocalizer', 'wake_up')]
     for enclave in root[0]:
         node = enclave.get('path').rpartition('/')[2]
         assert [profiles.tag for profiles in enclave] == ['profiles']
         assert [(profile.tag, profile.attrib) for profile in enclave[0]] == [
             ('profile', {'ns': '/', 'node': node})]
         for group in enclave[0][0]:
-            assert [(group.tag, act) for act in group.attrib] in [[rule] for rule in GRAPH]
+            assert [(group.tag, act) for act in group.attrib] in [
+                [rule] for rule in (*GRAPH, ('actions', 'call'))]
             assert list(group.attrib.values()) == ['ALLOW']
             assert {entry.tag for entry in group} == {group.tag.removesuffix('s')}
 
@@ -82,7 +95,9 @@ def test_the_policy_has_the_form_of_its_schema():
 @pytest.mark.needs('sros2')
 def test_the_tools_take_the_policy(tmp_path):
     keystore = tmp_path / 'keys'
-    for command in (['create_keystore', keystore],
-                    ['create_enclave', keystore, '/cliploc_ros/relocalizer'],
-                    ['create_permission', keystore, '/cliploc_ros/relocalizer', POLICY]):
+    commands = [['create_keystore', keystore]]
+    for node in ('relocalizer', 'wake_up'):
+        commands += [['create_enclave', keystore, f'/cliploc_ros/{node}'],
+                     ['create_permission', keystore, f'/cliploc_ros/{node}', POLICY]]
+    for command in commands:
         subprocess.run(['ros2', 'security', *map(str, command)], check=True, timeout=60)

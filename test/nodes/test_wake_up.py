@@ -16,6 +16,8 @@ from rclpy.task import Future
 from scene import make_room, see_room
 from tester import RELIABLE, class_matching, make_frame
 
+from cliploc_ros.cli.wake_up import main
+
 ACCEPTED, REFUSED, NOT_READY, INTERRUPTED = 0, 1, 2, 130
 LOOK = (r'^look (\d+) \[[0-9.]+ s\](, (?:not )?turned by .*?)?: '
         r'((?:accepted|refused|withheld): .*)$')
@@ -124,7 +126,8 @@ def test_refusals_end_when_time_is_up(relocalizer, wake_up_until, tester):
     assert len(answers) > 1
     assert all(answer.startswith('refused: 2 detections') for _, _, answer in answers)
     assert process.output().count('not turning: switched off') == 1
-    assert f'refused: {len(answers)} looks in ' in process.output()
+    assert re.search(rf'refused: {len(answers)} looks in \d+ s: {len(answers)} too_few_objects$',
+                     process.output(), re.MULTILINE)
     assert not tester.initial_poses
 
 
@@ -151,10 +154,11 @@ def test_the_robot_turns_until_it_sees_enough(relocalizer, start, end, serve_spi
 @pytest.mark.needs('nav2_msgs')
 def test_a_server_that_refuses_every_turn(relocalizer, wake_up_until, serve_spin):
     spinner = serve_spin('refuse')
-    process, code = wake_up_until('(refused by /spin)', frame=poor_frame)
+    process, code = wake_up_until('(refused by /spin: ', frame=poor_frame)
     assert code == REFUSED
     sides = [turned for _, turned, _ in looks(process) if turned]
-    assert sides == [f', not turned by {side} deg (refused by /spin)'
+    assert sides == [f", not turned by {side} deg (refused by /spin: activate Nav2's "
+                     'behavior_server)'
                      for _, side in zip(sides, itertools.cycle((45, -45)), strict=False)]
     assert spinner.yaw == 0.0
 
@@ -240,12 +244,20 @@ def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer,
 
 
 @pytest.mark.parametrize('arguments', [
-    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181'),
-    ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken')])
-def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end, arguments):
-    process = start('cli.wake_up', *arguments)
-    assert end(process) == NOT_READY
-    assert 'error: ' in process.output()
-    assert 'Traceback' not in process.output()
+    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181')])
+def test_a_wrong_option_is_not_taken_for_a_refusal(capsys, arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == NOT_READY
+    assert 'error: ' in capsys.readouterr().err
+
+
+def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end):
+    processes = [start('cli.wake_up', *arguments) for arguments in (
+        ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken'))]
+    for process in processes:
+        assert end(process) == NOT_READY
+        assert 'error: ' in process.output()
+        assert 'Traceback' not in process.output()
 
 

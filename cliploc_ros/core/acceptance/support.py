@@ -16,7 +16,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.similarities import (
     Similarities,
     pair_similarities,
-    sampled_similarities,
+    sampled_spread,
 )
 from cliploc_ros.core.maps.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 
@@ -25,8 +25,6 @@ _SAME_BOX_IOU = 0.8
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
-# Number of labels that gives mean and deviation of a crop's similarities to 2 %.
-_LABELS_SAMPLED = 4096
 
 
 @dataclass(frozen=True)
@@ -200,7 +198,6 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
 
 def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
                 landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    sample = sampled_similarities(similarities, rows, _LABELS_SAMPLED)
-    deviations = np.maximum(sample.std(axis=1), 1e-6)
-    return np.asarray((pair_similarities(similarities, rows, landmarks)
-                       - sample.mean(axis=1)) / deviations)
+    means, deviations = sampled_spread(similarities, rows)
+    return np.asarray((pair_similarities(similarities, rows, landmarks) - means)
+                      / np.maximum(deviations, 1e-6))

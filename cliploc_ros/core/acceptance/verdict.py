@@ -5,6 +5,7 @@
 import math
 from dataclasses import dataclass
 
+from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
 from cliploc_ros.core.options import RelocalizerOptions
 
 # A search that tried fewer samples has not looked for rivals: its confidence means nothing.
@@ -109,35 +110,37 @@ def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
     return coverage == 1.0 and options.algorithm in ('auto', 'bf')
 
 
-def refusal(evidence: Evidence, options: RelocalizerOptions) -> str:
-    """Return why the best hypothesis is refused; empty if it is accepted."""
+def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
+    """Return why the best hypothesis is refused; None if it is accepted."""
     return (_too_short(evidence, options) or _too_few(evidence, options)
             or _too_unlikely(evidence, options) or _contradicted(evidence, options))
 
 
-def _too_short(evidence: Evidence, options: RelocalizerOptions) -> str:
+def _too_short(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
+    kind = RefusalKind.SEARCH_CUT_SHORT
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
         if evidence.tried < _MIN_ITERATIONS:
-            return (f'search stopped after {evidence.tried} < {_MIN_ITERATIONS} hypotheses; '
-                    'raise the time budget and iterations')
+            return Refusal(kind, f'search stopped after {evidence.tried} < {_MIN_ITERATIONS} '
+                                 'hypotheses; raise the time budget and iterations')
     elif evidence.coverage < 1.0:
-        return (f'search stopped after {100 * evidence.coverage:.3g} % of the samples; '
-                'raise the time budget or set algorithm to auto')
+        return Refusal(kind, f'search stopped after {100 * evidence.coverage:.3g} % of the '
+                             'samples; raise the time budget or set algorithm to auto')
     elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
-        return (f'iterations {options.iterations} < {_MIN_ITERATIONS}, too few to find rivals; '
-                f'set iterations to {_MIN_ITERATIONS} or more')
-    return ''
+        return Refusal(kind, f'iterations {options.iterations} < {_MIN_ITERATIONS}, too few to '
+                             f'find rivals; set iterations to {_MIN_ITERATIONS} or more')
+    return None
 
 
-def _too_few(evidence: Evidence, options: RelocalizerOptions) -> str:
+def _too_few(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if evidence.inliers >= options.min_inliers:
-        return ''
-    return f'{evidence.inliers} objects matched < {options.min_inliers}; {_LOOK_ABOUT}'
+        return None
+    return Refusal(RefusalKind.TOO_FEW_OBJECTS, f'{evidence.inliers} objects matched < '
+                                                f'{options.min_inliers}; {_LOOK_ABOUT}')
 
 
-def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
+def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if evidence.confidence >= options.min_confidence:
-        return ''
+        return None
     compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
     # the rival holds most of the missing probability, or is about as likely as the pose
     is_ambiguous = evidence.rival > max(_LEAST_RIVAL, min(0.9 * evidence.likely,
@@ -146,32 +149,38 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> str:
     if (evidence.twin is not None and evidence.distinct < options.min_confidence
             and (is_ambiguous or others >= options.min_confidence)):
         second = evidence.twin_map and f' (the second in {evidence.twin_map})'
-        return (f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look alike'
-                f'{second}; turn the camera to objects that differ')
+        return Refusal(RefusalKind.LOOK_ALIKE,
+                       f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look '
+                       f'alike{second}; turn the camera to objects that differ')
     if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
-        return (f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
-                'turn the camera to more or nearer objects')
+        return Refusal(RefusalKind.UNCERTAIN_POSITION,
+                       f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
+                       'turn the camera to more or nearer objects')
     if evidence.likely >= options.min_confidence:
-        return (f'{compared}; pose met only {evidence.meetings:g} times in {evidence.tried} '
-                'samples; raise iterations or set algorithm to auto')
+        return Refusal(RefusalKind.SEARCH_CUT_SHORT,
+                       f'{compared}; pose met only {evidence.meetings:g} times in '
+                       f'{evidence.tried} samples; raise iterations or set algorithm to auto')
     if is_ambiguous:
-        return (f'{compared}; ambiguous, another pose has {evidence.rival:.2g}'
-                f'{_in(evidence.rival_map)}; turn the camera to objects that differ')
-    return (f'{compared}; {evidence.inliers} objects matched, '
-            f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
+        return Refusal(RefusalKind.AMBIGUOUS,
+                       f'{compared}; ambiguous, another pose has {evidence.rival:.2g}'
+                       f'{_in(evidence.rival_map)}; turn the camera to objects that differ')
+    return Refusal(RefusalKind.UNEXPLAINED,
+                   f'{compared}; {evidence.inliers} objects matched, '
+                   f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
 
 
 def _in(map_name: str) -> str:
     return f' in {map_name}' if map_name else ''
 
 
-def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> str:
-    """Return a reason if the looks before this one were too unsure of this pose."""
+def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
+    """Return a refusal if the looks before this one were too unsure of this pose."""
     needed = min(_MEAN_CONFIDENCE, options.min_confidence)
     if evidence.mean_confidence >= needed:
-        return ''
-    return (f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of the last '
-            f'{len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
+        return None
+    return Refusal(RefusalKind.FRAMES_DISAGREE,
+                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of '
+                   f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
 
 
 def _point(position: tuple[float, float, float]) -> str:

@@ -16,8 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import OptionsError
 
+# Number of labels that gives mean and deviation of a crop's similarities to 2 %.
+_LABELS_SAMPLED = 4096
 # Labels compared at once: a block stays in the processor's cache from product to selection.
 _BLOCK = 2048
 
@@ -110,6 +113,12 @@ class CropSimilarities:
         """Return the number of crops and of landmarks."""
         return len(self.crops), len(self.labels.of_landmarks)
 
+    @cached_property
+    def spread(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the mean and the deviation (n,) of each crop, see sampled_spread."""
+        step = _sample_step(self)
+        return _spread(self.crops @ self.labels.unique[self.labels.of_landmarks[::step]].T)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the similarities (n, L)."""
         whole = self.crops @ self.labels.unique.T
@@ -178,29 +187,49 @@ def _label_blocks(similarities: CropSimilarities) -> Iterator[tuple[int, NDArray
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
                      ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return columns and values (count, k) of the k greatest of each row, best first."""
-    columns = np.empty((count, 0), dtype=np.int64)
-    values = np.empty((count, 0), dtype=np.float32)
+    columns = np.full((count, k), -1, dtype=np.int64)
+    values = np.full((count, k), -np.inf, dtype=np.float32)
     for start, block in blocks:
-        if not np.isfinite(block).all():
+        if not keep_greatest(np.ascontiguousarray(block, dtype=np.float32), start, columns,
+                             values):
             raise OptionsError('similarities hold values that are not finite')
-        chosen = _greatest(block, k)
-        columns = np.concatenate([columns, chosen + start], axis=1)
-        values = np.concatenate([values, np.take_along_axis(block, chosen, axis=1)], axis=1)
-        columns, values = _best(columns, values, k)
     return columns, values
 
 
-def _greatest(block: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-    """Return the columns of each row's k greatest values, unordered; of equals, the first."""
-    count, width = block.shape
-    if k >= width:
-        return np.tile(np.arange(width), (count, 1))
-    chosen = np.argpartition(block, width - k, axis=1)[:, width - k:]
-    least = np.take_along_axis(block, chosen, axis=1).min(axis=1, keepdims=True)
-    # a partition takes any of equal values
-    for row in np.nonzero((block >= least).sum(axis=1) > k)[0]:
-        chosen[row] = np.argsort(-block[row], kind='stable')[:k]
-    return chosen
+@compiled
+def keep_greatest(block, start, columns, values):
+    """Take the values of a block that are among each row's greatest; of equals, the first.
+
+    Parameters
+    ----------
+    block : ndarray (n, w)
+    start : int
+        Column of its first value.
+    columns, values : ndarray (n, k)
+        The greatest so far, best first; updated.
+
+    Returns
+    -------
+    bool
+        Whether all values are finite.
+    """
+    last = values.shape[1] - 1
+    for row in range(block.shape[0]):
+        least = values[row, last]
+        for column in range(block.shape[1]):
+            value = block[row, column]
+            if not np.isfinite(value):
+                return False
+            if value <= least:
+                continue
+            place = last
+            while place > 0 and value > values[row, place - 1]:
+                values[row, place] = values[row, place - 1]
+                columns[row, place] = columns[row, place - 1]
+                place -= 1
+            values[row, place], columns[row, place] = value, start + column
+            least = values[row, last]
+    return True
 
 
 def _best(columns: NDArray[np.int64], values: NDArray[np.float32], k: int
@@ -234,14 +263,22 @@ def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
     return np.asarray(np.einsum('ij,ij->i', similarities.crops[crops], labels))
 
 
-def sampled_similarities(similarities: Similarities, crops: NDArray[np.int64], most: int
-                         ) -> NDArray[np.float32]:
-    """Return the similarities (m, s) of crops (m,) and landmarks spread evenly over the map.
+def sampled_spread(similarities: Similarities, crops: NDArray[np.int64]
+                   ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return mean and standard deviation of the similarities of crops (m,) to any landmark.
 
-    These are all landmarks of a map that has at most `most`; otherwise half of `most` at least.
+    They are those to landmarks spread evenly over the map: all of a map of _LABELS_SAMPLED,
+    otherwise half of _LABELS_SAMPLED at least.
     """
-    step = -(-similarities.shape[1] // most)
-    if not isinstance(similarities, CropSimilarities):
-        return similarities[crops, ::step]
-    labels = similarities.labels.unique[similarities.labels.of_landmarks[::step]]
-    return similarities.crops[crops] @ labels.T
+    if isinstance(similarities, CropSimilarities):
+        means, deviations = similarities.spread
+        return means[crops], deviations[crops]
+    return _spread(similarities[crops, ::_sample_step(similarities)])
+
+
+def _sample_step(similarities: Similarities) -> int:
+    return -(-similarities.shape[1] // _LABELS_SAMPLED)
+
+
+def _spread(sample: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return sample.mean(axis=1), sample.std(axis=1)

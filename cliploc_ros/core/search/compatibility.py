@@ -28,7 +28,7 @@ def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
     """
     depths = _depths(scene)
     compatible = np.zeros((len(scene.pairs), len(scene.pairs)), dtype=np.bool_)
-    _compare_all(scene, depths, compatible)
+    _compare_near(scene, depths, np.argsort(scene.centers[scene.pairs[:, 1], 0]), compatible)
     return compatible
 
 
@@ -46,10 +46,21 @@ def _depths(scene: Scene) -> NDArray[np.float64]:
 
 
 @compiled
-def _compare_all(scene, depths, compatible):
-    pairs = scene.pairs
-    for i in range(pairs.shape[0]):
-        for j in range(i):
+def _compare_near(scene, depths, along_x, compatible):
+    """Compare each candidate with those before it along the x axis, as far as it may reach.
+
+    In a large map, and in several maps side by side, most are beyond.
+    """
+    pairs, deepest = scene.pairs, 0.0
+    for depth in depths:
+        deepest = max(deepest, depth)
+    for number in range(pairs.shape[0]):
+        i = along_x[number]
+        reach = FARTHEST * (depths[i] + deepest)
+        for before in range(number - 1, -1, -1):
+            j = along_x[before]
+            if scene.centers[pairs[i, 1], 0] - scene.centers[pairs[j, 1], 0] > reach:
+                break
             if pairs[i, 0] == pairs[j, 0] or pairs[i, 1] == pairs[j, 1]:
                 continue
             p, q = scene.centers[pairs[i, 1]], scene.centers[pairs[j, 1]]

@@ -153,22 +153,40 @@ def enumerate_compatible_triples(compatible, cursor, samples):
     """
     count = compatible.shape[0]
     newest, first, second = cursor[0], cursor[1], cursor[2]
+    earlier = np.empty(count, dtype=np.int64)
     found, steps = 0, 0
     while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
-        steps += 1
-        if first >= newest - 1:
-            newest, first, second = newest + 1, 0, 1
-            continue
-        if second >= newest or not compatible[newest, first]:
-            first += 1
-            second = first + 1
-            continue
-        if compatible[newest, second] and compatible[first, second]:
-            samples[found, 0], samples[found, 1], samples[found, 2] = first, second, newest
-            found += 1
-        second += 1
+        known = _compatible_before(compatible, newest, earlier)
+        steps += newest + 1
+        for a in range(known):
+            if earlier[a] < first:
+                continue
+            for b in range(a + 1, known):
+                if earlier[a] == first and earlier[b] < second:
+                    continue
+                steps += 1
+                if not compatible[earlier[a], earlier[b]]:
+                    continue
+                if found == samples.shape[0]:
+                    cursor[0], cursor[1], cursor[2] = newest, earlier[a], earlier[b]
+                    return found
+                samples[found, 0], samples[found, 1] = earlier[a], earlier[b]
+                samples[found, 2] = newest
+                found += 1
+        newest, first, second = newest + 1, 0, 1
     cursor[0], cursor[1], cursor[2] = newest, first, second
     return found
+
+
+@compiled
+def _compatible_before(compatible, newest, earlier):
+    """Write the candidates before the newest one that are compatible; return their number."""
+    known = 0
+    for candidate in range(newest):
+        if compatible[newest, candidate]:
+            earlier[known] = candidate
+            known += 1
+    return known
 
 
 @compiled

@@ -96,7 +96,7 @@ class Turning:
         handle = self._goal.result()
         if not handle.accepted:
             self._goal = None
-            return f'refused by {self._name}'
+            return f"refused by {self._name}: activate Nav2's behavior_server"
         result = handle.get_result_async()
         if not self._wait(result.done, end - time.monotonic()):
             self.stop()

@@ -3,9 +3,11 @@
 """Wake a robot up: request its pose, turn between the looks, until accepted or time is up."""
 
 import math
+import re
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -93,17 +95,18 @@ class WakeUp(Node):
             self._turning.stop()
 
     def _look_about(self) -> Outcome:
-        looks, turned = 0, ''
+        looks, turned, kinds = 0, '', Counter[str]()
         while not (problem := self._until_ready()):
             looks += 1
             verdict, message = self._look()
+            kinds.update(_kind_of(message))
             print(f'look {looks} [{self._elapsed_s:.1f} s]{turned}: {message}', flush=True)
             if verdict is Verdict.ACCEPTED:
                 return Outcome.ACCEPTED
             if self._is_time_up:
                 if verdict is Verdict.REFUSED:
                     return _end(Outcome.REFUSED, f'refused: {looks} looks in '
-                                f'{self._elapsed_s:.0f} s, no pose is certain enough')
+                                f'{self._elapsed_s:.0f} s: {_in_words(kinds)}')
                 problem = message
                 break
             turned = self._turn() if verdict is Verdict.REFUSED else self._rest()
@@ -191,6 +194,15 @@ def _verdict_of(message: str) -> Verdict:
     """Return the verdict that an answer begins with."""
     return next((verdict for verdict in Verdict if message.startswith(f'{verdict}: ')),
                 Verdict.FAILED)
+
+
+def _kind_of(message: str) -> list[str]:
+    """Return the kind of a refusal, see cliploc_ros.ros.answer; nothing for other answers."""
+    return re.findall(r'; kind (\w+)(?:; map \w+)?$', message)
+
+
+def _in_words(kinds: Counter[str]) -> str:
+    return ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
 
 
 def _end(outcome: Outcome, text: str) -> Outcome:
