@@ -17,9 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support, agreeing_poses
 from cliploc_ros.core.fit.covariance import share_within
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -50,6 +52,8 @@ _MOST_UNEXPLAINED, _LEAST_EXPLAINED = 4, 0.25
 _CONTRADICTING_INLIERS = 100
 # A detection is explained by a landmark of its class whose outline overlaps it so much.
 _EXPLAINS_IOU = 0.2
+# Poses of objects that propose keyframes.
+_MOST_GUESSES = 3
 
 
 class ObjectsThere(NamedTuple):
@@ -60,6 +64,48 @@ class ObjectsThere(NamedTuple):
 
 
 _NO_OBJECTS = ObjectsThere(0, 0)
+
+
+class Image(NamedTuple):
+    """What an image with local features shows.
+
+    Parameters
+    ----------
+    features : Features
+    camera : Camera
+        Of these features.
+    observation : Observation
+        The detected objects.
+    """
+
+    features: Features
+    camera: Camera
+    observation: Observation
+
+
+def join_keyframes(found: Relocalization, image: Image, landmark_map: LandmarkMap,
+                   localizer: KeyframeLocalizer, options: RelocalizerOptions,
+                   deadline: float = math.inf) -> Relocalization:
+    """Return the answer of objects and keyframes to an image.
+
+    Parameters
+    ----------
+    found : Relocalization
+        By objects.
+    image : Image
+    landmark_map : LandmarkMap
+    localizer : KeyframeLocalizer
+        Of the layer of this map.
+    options : RelocalizerOptions
+    deadline : float
+        When no further keyframe is matched (monotonic clock) [s].
+    """
+    guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
+    seen = localizer.localize_features(image.features, image.camera, guesses, deadline)
+    if seen is None:
+        return found
+    there = objects_there(landmark_map, image.observation, seen.map_from_camera)
+    return replace(combine(found, seen, there, options), recognized=seen)
 
 
 def objects_there(landmark_map: LandmarkMap, observation: Observation,

@@ -11,6 +11,7 @@ from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.joined_map import MapPart, parts_of, place_of
+from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.landmark_map import LandmarkMap
 
 
@@ -70,6 +71,8 @@ class Relocalization:
     source : str
         What the best pose comes from: 'objects', 'keyframes' or 'both', see
         cliploc_ros.core.combination.
+    recognized : Recognized or None
+        What keyframes say, whatever the best pose comes from; None without keyframes.
     """
 
     accepted: bool
@@ -84,6 +87,7 @@ class Relocalization:
     search_ms: float = 0.0
     stamp_ns: int = 0
     source: str = 'objects'
+    recognized: Recognized | None = None
 
     @property
     def solved(self) -> bool:

@@ -38,6 +38,11 @@ class Summary:
         Infinite where no pose was found; empty where it was not recorded.
     crops_share : float
         Share of a query's crops that were compared with labels, on average.
+    sources : ndarray (t, q) of str
+        What each pose comes from, see Result.
+    keyframe_inliers : ndarray (t, q) of int
+    keyframes_ms : ndarray (t, q)
+        The three are empty where no query was compared with keyframes.
     """
 
     method: str
@@ -52,6 +57,19 @@ class Summary:
     boxes: NDArray[np.int64]
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     crops_share: float = 1.0
+    sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
+    keyframe_inliers: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty((0, 0), dtype=np.int64))
+    keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def has_keyframes(self) -> bool:
+        """Return whether queries were compared with keyframes."""
+        return self.sources.size > 0
+
+    def share_from(self, source: str) -> float:
+        """Return the share of all queries whose pose comes from a source."""
+        return float((self.sources == source).mean()) if self.has_keyframes else 0.0
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, accepted or not."""
@@ -127,13 +145,18 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     def column(name: str) -> NDArray[Any]:
         return np.array([getattr(result, name) for result in results]).reshape(-1, len(queries))
 
+    keyframes = {name: column(name) for name in ('keyframe_inliers', 'keyframes_ms')}
+    if (keyframes['keyframes_ms'] > 0.0).any():
+        keyframes['sources'] = column('source')
+    else:
+        keyframes = {}
     errors = [np.inf if result.error_m is None else result.error_m for result in results]
     return Summary(
         method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
         column('hypotheses'), column('boxes')[0],
         np.array([np.inf if result.nees is None else result.nees for result in results]
-                 ).reshape(-1, len(queries)), float(column('crops_share').mean()))
+                 ).reshape(-1, len(queries)), float(column('crops_share').mean()), **keyframes)
 
 
 @dataclass(frozen=True)

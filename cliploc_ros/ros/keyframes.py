@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.combination import combine, objects_there
+from cliploc_ros.core.combination import Image, join_keyframes
 from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -26,8 +26,6 @@ logger = logging.getLogger(__name__)
 NEXT_TO_MAP = 'auto'
 # Without so much time left, the objects' answer stands: extracting features cannot be stopped.
 _LEAST_S = 0.5
-# Poses of objects that propose keyframes.
-_MOST_GUESSES = 3
 
 
 class Keyframes:
@@ -69,12 +67,8 @@ class Keyframes:
         if note and note not in self._notes:
             self._notes.add(note)
             logger.warning('%s', note)
-        guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
-        seen = self._localizer.localize(image_rgb, observation.camera, guesses, deadline)
-        if seen is None:
-            return found
-        return combine(found, seen, objects_there(self._map, observation, seen.map_from_camera),
-                       options)
+        image = Image(query_features(image_rgb), observation.camera, observation)
+        return join_keyframes(found, image, self._map, self._localizer, options, deadline)
 
 
 def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyframes | None:
