@@ -26,6 +26,9 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--keyframe-points', type=positive_int, default=_DEFAULT_POINTS,
                        metavar='N', help='the most points of a keyframe, 146 bytes each '
                        '(%(default)s)')
+    group.add_argument('--keyframe-images', action='store_true',
+                       help='also store small images of the keyframes, for the debug image: '
+                       'anyone who has the file sees the place')
 
 
 def check_layer_options(options: argparse.Namespace) -> None:
@@ -37,6 +40,8 @@ def check_layer_options(options: argparse.Namespace) -> None:
         Names the options that do not go together.
     """
     if not options.keyframe_layer:
+        if options.keyframe_images:
+            raise OptionsError('--keyframe-images is for --keyframe-layer')
         return
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
@@ -63,11 +68,13 @@ def write_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> lis
 
     distance_m, angle_deg = options.keyframes
     layer = build_layer(read_frames(options), landmark_map,
-                        LayerOptions(distance_m, angle_deg, options.keyframe_points))
+                        LayerOptions(distance_m, angle_deg, options.keyframe_points,
+                                     options.keyframe_images))
     path = layer_path(options.out)
     save_layer(path, layer)
     megabytes = path.stat().st_size / 1e6
-    return [f'keyframes: {len(layer)} with {len(layer.points)} points, {megabytes:.1f} MB '
+    images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
+    return [f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
             f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}']
 
 

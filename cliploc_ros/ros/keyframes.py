@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.combination import Image, join_keyframes
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -45,6 +46,11 @@ class Keyframes:
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self._localizer.layer)
+
+    @property
+    def layer(self) -> KeyframeLayer:
+        """Return the layer."""
+        return self._localizer.layer
 
     def join(self, found: Relocalization, image_rgb: NDArray[np.uint8], observation: Observation,
              options: RelocalizerOptions, deadline: float) -> Relocalization:

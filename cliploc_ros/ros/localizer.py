@@ -191,7 +191,9 @@ class Localizer:
         for_filter = session.covariance_for_filter(found) \
             if found.accepted and values['mode'] == 'continuous' else found.covariance
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
-        return Localized(found, landmark_map, SeenImage(image, seen), compared, is_cut, for_filter)
+        layer = None if self._keyframes is None else self._keyframes.layer
+        return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
+                         for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float

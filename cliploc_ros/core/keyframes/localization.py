@@ -24,8 +24,9 @@ _SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
 # Places differ by more than 1 m or 45 degrees, as poses that do not agree.
 _MOST_RANKED = 500
 _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
-# A keyframe sees the same as a pose if it looks the same way from near enough.
-_NEAR_M, _NEAR_DEG = 2.0, 40.0
+#: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
+#: two that it is away are less than 1 together.
+NEAR_M, NEAR_DEG = 2.0, 40.0
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
 # Cells of the image (columns, rows), and how many points and features make one comparable.
@@ -237,7 +238,7 @@ def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> N
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    costs = distances / _NEAR_M + angles / _NEAR_DEG
+    costs = distances / NEAR_M + angles / NEAR_DEG
     order = np.argsort(costs, kind='stable')
     return np.asarray(order[costs[order] < 1.0])
 
