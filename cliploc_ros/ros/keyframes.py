@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.combination import Image, join_keyframes
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -36,9 +36,13 @@ class Keyframes:
     ----------
     localizer : KeyframeLocalizer
     landmark_map : LandmarkMap
+    file, file_hash : str
+        Where the layer is from, for the diagnostics.
     """
 
-    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap) -> None:
+    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap, file: str = '',
+                 file_hash: str = '') -> None:
+        self.file, self.file_hash = file, file_hash
         self._localizer = localizer
         self._map = landmark_map
         self._notes: set[str] = set()
@@ -90,7 +94,7 @@ def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyf
         return None
     try:
         layer = load_layer_of_map(path, landmark_map)
-        return Keyframes(KeyframeLocalizer(layer), landmark_map)
+        return Keyframes(KeyframeLocalizer(layer), landmark_map, str(path), layer_hash(path))
     except MapError as error:
         logger.error('localizing without keyframes: %s', error)
         return None

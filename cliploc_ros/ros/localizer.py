@@ -110,6 +110,11 @@ class Localizer:
         return self._map
 
     @property
+    def keyframes(self) -> Keyframes | None:
+        """Return the layer of keyframes; None without one."""
+        return self._keyframes
+
+    @property
     def description(self) -> str:
         """Return what is loaded, in a line."""
         frames = [f"'{part.landmark_map.frame_id}'" for part in parts_of(self._map)]

@@ -118,7 +118,8 @@ class Pipeline:
 
     def _use(self, localizer: Localizer) -> str:
         self.localizer = localizer
-        self._visualization.set_map(localizer.landmark_map)
+        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
+                                    else localizer.keyframes.layer)
         return localizer.description
 
     def _answer(self, header: Header, localized: Localized, state: RobotState,

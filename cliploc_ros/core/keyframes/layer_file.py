@@ -7,6 +7,7 @@ layer costs memory only where it is used, and may be larger than the memory. A s
 a program that writes over a mapped file in place would kill this process.
 """
 
+import hashlib
 import json
 import os
 import zipfile
@@ -45,6 +46,7 @@ _IMAGES: dict[str, tuple[tuple[object, ...], str]] = {
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
 _MAPPED = ('pixels', 'points', 'descriptors', 'images')
 _HEADER_BYTES = 100_000
+_HASH_DIGITS = 12
 #: Files up to this size are read into memory [bytes].
 MOST_READ = 256_000_000
 _MOST_DEVIATION = 1.0
@@ -95,6 +97,16 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
     except _LayerError as error:
         raise MapError(f'{path}: {error}; {_MAKE_AGAIN}') from error
     return layer
+
+
+def layer_hash(path: Path) -> str:
+    """Return what tells one layer from another: of the names, sizes and checksums of its arrays.
+
+    It reads the table of contents only: a layer may be larger than the memory.
+    """
+    with zipfile.ZipFile(path) as archive:
+        content = [(one.filename, one.file_size, one.CRC) for one in archive.infolist()]
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:_HASH_DIGITS]
 
 
 class _LayerError(Exception):

@@ -7,14 +7,16 @@ may look another way. Walls are not considered, nor whether the features are fou
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
-from cliploc_ros.mapping.checking.report import GridCheck
+
+if TYPE_CHECKING:
+    from cliploc_ros.mapping.checking.report import GridCheck
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class KeyframeCheck:
             'positions_without': self.positions[self.without].round(3).tolist()}
 
 
-def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
+def check_keyframes(layer: KeyframeLayer, grid: 'GridCheck',
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
     """Return what keyframes reach.
 
