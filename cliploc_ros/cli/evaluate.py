@@ -184,6 +184,8 @@ def evaluate(options: argparse.Namespace) -> int:
         queries = tuple(query for query in queries if recorded[query.number].is_main)
     if layer is not None:
         queries = with_features(queries, _frames(options))
+        notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
+        print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
     evaluation = Evaluation(landmark_map, queries, options.out, options.trials,
                             options.workers or _cores(), options.scheduler, layer)
     evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
