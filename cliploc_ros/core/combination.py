@@ -14,13 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.confidence import RIGHT_M, Support, agreeing_poses
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_difference
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -45,9 +44,6 @@ _LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 20
 _MOST_RIVAL = 20
 _LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.32, 300
 _CONTRADICTS = 0.5
-# Poses that agree to 1 m, but are further apart than this quantile of their covariances: one of
-# the covariances is wrong.
-_APART = float(chi2.ppf(0.99, 6))
 # Weights of the first pose that covariance intersection tries.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 # Detected objects of the map's classes contradict a pose that explains so few of them.
@@ -218,17 +214,9 @@ def _both(found: Relocalization, seen: Recognized, chance: float, refusal: str,
     halves, fusing them cost .08 at .1 m). A weak one is fused. Each is wrong with its own
     probability, and both lead to the same wrong place only by chance: the product is an upper
     bound where their errors are independent.
-
-    Where the covariances do not explain how far the poses are apart, a weak pose of keyframes
-    says nothing, and a strong one is as much less certain.
     """
     assert found.map_from_camera is not None and found.covariance is not None
-    step = pose_difference(found.map_from_camera, seen.map_from_camera)
-    doubt = float(step @ np.linalg.solve(found.covariance + seen.covariance, step)) / _APART
-    if refusal and doubt > 1.0:
-        return found
-    pose, covariance = (seen.map_from_camera, max(1.0, doubt) * seen.covariance) \
-        if not refusal else fuse(
+    pose, covariance = (seen.map_from_camera, seen.covariance) if not refusal else fuse(
         found.map_from_camera, found.covariance, seen.map_from_camera, seen.covariance)
     confidence = min(_MOST_CONFIDENCE, 1.0 - (1.0 - found.confidence) * (1.0 - chance))
     reason = '' if found.accepted or confidence >= options.min_confidence else \

@@ -130,16 +130,3 @@ def test_a_perfect_view_explains_its_objects_only_where_it_is():
     assert objects_there(room, observation, away).explained < len(room) // 2
     unknown = replace(observation.detections, class_ids=('z',) * len(room))
     assert objects_there(room, replace(observation, detections=unknown), away) == (0, 0)
-
-
-def test_a_weak_pose_that_its_covariance_does_not_explain_says_nothing():
-    found = by_objects(0.6, 0.995, True)  # six deviations of the objects away
-    assert combine(found, by_keyframes(0.0, inliers=9, confirmed=0.4), SOME, OPTIONS) is found
-
-
-def test_a_strong_pose_that_objects_contradict_is_less_certain():
-    near, far = (combine(by_objects(x, 0.995, True), by_keyframes(0.0), SOME, OPTIONS)
-                 for x in (0.2, 0.6))
-    assert near.covariance is FINE or np.allclose(near.covariance, FINE)
-    assert far.accepted and far.source == 'both'
-    assert far.covariance[0, 0] > 1.5 * FINE[0, 0]
