@@ -10,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.progress import StageBar
 from cliploc_ros.command import (
     interrupt_on_sigterm,
@@ -62,6 +63,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame of the observations only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
     return parser
@@ -121,9 +123,11 @@ def check(options: argparse.Namespace) -> int:
         if options.every > 1:
             detections = detections.select_frames(range(0, len(detections), options.every))
     queries = _read_queries(options.queries, landmark_map) if options.queries else []
+    layer = read_layer(options.map, landmark_map, options.keyframes)
     make_folder(options.out)
     with StageBar() as bar:
-        report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show)
+        report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
+                           layer)
         write_report(options.out, options.map.name, landmark_map, report)
     print('\n'.join(summary_lines(report)))
     print('what to do:')

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -22,11 +23,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.maps.landmark_map import LandmarkMap
     from cliploc_ros.core.observation import Observation
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
     from cliploc_ros.evaluation.cases import Observe
+    from cliploc_ros.evaluation.methods import Method
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -82,6 +85,8 @@ def make_parser() -> argparse.ArgumentParser:
                         help='of a Dask cluster, instead of local processes')
     parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
+    add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
+                   'needs the images of --bag or --tum')
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)
@@ -147,6 +152,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.maps.joined_map import join_maps
     from cliploc_ros.core.maps.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.evaluation import Evaluation
+    from cliploc_ros.evaluation.keyframe_queries import with_features
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
@@ -164,6 +170,7 @@ def evaluate(options: argparse.Namespace) -> int:
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
+    layer = _read_layer(options, landmark_map, methods)
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)
     queries = make_queries(recorded, landmark_map, every_frame=True)
@@ -175,11 +182,42 @@ def evaluate(options: argparse.Namespace) -> int:
                                   noise_deg, options.seed)
     if options.frames == 'main':
         queries = tuple(query for query in queries if recorded[query.number].is_main)
+    if layer is not None:
+        queries = with_features(queries, _frames(options))
+        notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
+        print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
     evaluation = Evaluation(landmark_map, queries, options.out, options.trials,
-                            options.workers or _cores(), options.scheduler)
+                            options.workers or _cores(), options.scheduler, layer)
     evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
                        figures=options.figures, frames=recorded.frames)
     return 0
+
+
+def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
+                methods: 'Sequence[Method]') -> 'KeyframeLayer | None':
+    """Return the layer of the map where a method, the map and the queries can use it.
+
+    Raises
+    ------
+    CliplocError
+        Keyframes are asked for, and cannot be used.
+    """
+    from cliploc_ros.core.keyframes.layer_file import layer_path
+
+    wanted, problem = options.keyframes, ''
+    if not any(one.keyframes for one in methods):
+        problem = f"none of the methods uses them: add '{AUTO}'"
+    elif len(options.map) > 1:
+        problem = 'several maps are searched by objects only'
+    elif options.queries is not None:
+        problem = '--queries has no images: give --bag or --tum'
+    if not problem:
+        return read_layer(options.map[0], landmark_map, wanted)
+    if wanted:
+        raise OptionsError(f'--keyframes: {problem}')
+    if wanted is None and layer_path(options.map[0]).exists():
+        print(f'without keyframes: {problem}', flush=True)
+    return None
 
 
 def _is_case(options: argparse.Namespace) -> bool:
@@ -194,12 +232,16 @@ def _is_case(options: argparse.Namespace) -> bool:
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
     from cliploc_ros.datasets.cases import read_case
-    from cliploc_ros.evaluation.cases import options_of, replay_case
+    from cliploc_ros.evaluation.cases import options_of, replay_case, used_keyframes
 
     case = read_case(options.bag)
     observe = _with_clip(options, landmark_map) if options_of(case).needs_similarities \
         else _without_clip
-    replayed = replay_case(case, landmark_map, observe)
+    wanted = options.keyframes
+    if wanted is None and not used_keyframes(case):
+        wanted = False
+    layer = read_layer(options.map[0], landmark_map, wanted) if len(options.map) == 1 else None
+    replayed = replay_case(case, landmark_map, observe, layer)
     print(f'{options.bag}: {len(case.frames)} frames, map {case.report.get("map_hash")}\n'
           f'recorded: {case.report.get("message")}\n'
           f'again:    {"accepted" if replayed.again else f"refused: {replayed.reason_again}"}\n'

@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Options of ``build_map`` for the layer of keyframes next to the map, and what comes of them."""
+"""The layer of keyframes next to a map: the options that write it, and those that read it."""
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.command import positive_int
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import MapError, OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 _DEFAULT_POINTS = 600
@@ -24,6 +26,9 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--keyframe-points', type=positive_int, default=_DEFAULT_POINTS,
                        metavar='N', help='the most points of a keyframe, 146 bytes each '
                        '(%(default)s)')
+    group.add_argument('--keyframe-images', action='store_true',
+                       help='also store small images of the keyframes, for the debug image: '
+                       'anyone who has the file sees the place')
 
 
 def check_layer_options(options: argparse.Namespace) -> None:
@@ -35,6 +40,8 @@ def check_layer_options(options: argparse.Namespace) -> None:
         Names the options that do not go together.
     """
     if not options.keyframe_layer:
+        if options.keyframe_images:
+            raise OptionsError('--keyframe-images is for --keyframe-layer')
         return
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
@@ -61,9 +68,47 @@ def write_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> lis
 
     distance_m, angle_deg = options.keyframes
     layer = build_layer(read_frames(options), landmark_map,
-                        LayerOptions(distance_m, angle_deg, options.keyframe_points))
+                        LayerOptions(distance_m, angle_deg, options.keyframe_points,
+                                     options.keyframe_images))
     path = layer_path(options.out)
     save_layer(path, layer)
     megabytes = path.stat().st_size / 1e6
-    return [f'keyframes: {len(layer)} with {len(layer.points)} points, {megabytes:.1f} MB '
+    images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
+    return [f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
             f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}']
+
+
+def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the switch --keyframes to a parser; what it does is for the help."""
+    parser.add_argument('--keyframes', action=argparse.BooleanOptionalAction,
+                        help=f'{what} (default: if NAME.keyframes.npz lies next to the map)')
+
+
+def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
+               ) -> 'KeyframeLayer | None':
+    """Return the layer next to a map; None where there is none, or none is wanted.
+
+    Parameters
+    ----------
+    map_file : Path
+    landmark_map : LandmarkMap
+    wanted : bool, optional
+        None: a bad layer is left out with a note, as the relocalizer does.
+
+    Raises
+    ------
+    MapError
+        The layer is wanted, and is missing or bad.
+    """
+    from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
+
+    path = layer_path(map_file)
+    if wanted is False or (wanted is None and not path.exists()):
+        return None
+    try:
+        return load_layer_of_map(path, landmark_map)
+    except MapError as error:
+        if wanted:
+            raise
+        print(f'without keyframes: {error}', flush=True)
+        return None

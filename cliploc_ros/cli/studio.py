@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.map_layer import read_layer
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
 from cliploc_ros.errors import OptionsError
 
@@ -141,7 +142,9 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)
     finder = _phrase_finder(options, recording, images)
-    return Studio(Document(options.map or _free_path()), recording, images, finder)
+    document = Document(options.map or _free_path())
+    layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
+    return Studio(document, recording, images, finder, layer)
 
 
 def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',

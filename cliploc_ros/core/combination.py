@@ -7,7 +7,9 @@ things that were moved. So a pose that both lead to is accepted sooner, and a co
 refuses a pose that either alone would accept.
 """
 
+import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +21,17 @@ from cliploc_ros.core.acceptance.recognition import (
     NO_OBJECTS,
     ObjectsThere,
     chance_recognized,
+    objects_there,
     refusal_of,
 )
 from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
 
@@ -34,6 +41,50 @@ _CONTRADICTS = 0.5
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 # So many points elsewhere contradict accepted objects, whatever else they lack; a guess.
 _CONTRADICTING_INLIERS = 100
+# Poses of objects that propose keyframes.
+_MOST_GUESSES = 3
+
+
+class Image(NamedTuple):
+    """What an image with local features shows.
+
+    Parameters
+    ----------
+    features : Features
+    camera : Camera
+        Of these features.
+    observation : Observation
+        The detected objects.
+    """
+
+    features: Features
+    camera: Camera
+    observation: Observation
+
+
+def join_keyframes(found: Relocalization, image: Image, landmark_map: LandmarkMap,
+                   localizer: KeyframeLocalizer, options: RelocalizerOptions,
+                   deadline: float = math.inf) -> Relocalization:
+    """Return the answer of objects and keyframes to an image.
+
+    Parameters
+    ----------
+    found : Relocalization
+        By objects.
+    image : Image
+    landmark_map : LandmarkMap
+    localizer : KeyframeLocalizer
+        Of the layer of this map.
+    options : RelocalizerOptions
+    deadline : float
+        When no further keyframe is matched (monotonic clock) [s].
+    """
+    guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
+    seen = localizer.localize_features(image.features, image.camera, guesses, deadline)
+    if seen is None:
+        return found
+    there = objects_there(landmark_map, image.observation, seen.map_from_camera)
+    return replace(combine(found, seen, there, options), recognized=seen)
 
 
 def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere | None,

@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.combination import Image, join_keyframes
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import stages_of
@@ -65,7 +68,19 @@ def options_of(case: Case) -> RelocalizerOptions:
         raise DatasetError(f'the options of this case are broken: {error}') from error
 
 
-def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe) -> Replayed:
+def used_keyframes(case: Case) -> bool:
+    """Return whether the relocalizer was to use keyframes, if it had some.
+
+    Raises
+    ------
+    DatasetError
+        The case does not hold its parameters.
+    """
+    return bool(_parameters(case).get('keyframes_file', True))
+
+
+def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
+                layer: KeyframeLayer | None = None) -> Replayed:
     """Answer a case again with a map: as it was recorded, or with another one.
 
     Parameters
@@ -73,6 +88,8 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe) -> Repl
     case : Case
     landmark_map : LandmarkMap
     observe : callable
+    layer : KeyframeLayer, optional
+        Keyframes of the map.
 
     Raises
     ------
@@ -81,10 +98,16 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe) -> Repl
     """
     options, parameters = options_of(case), _parameters(case)
     session = Session(Relocalizer(landmark_map, options))
+    keyframes = None if layer is None else KeyframeLocalizer(layer)
     found = None
     for frame in case.frames:
-        observation = observe(*_seen(frame, parameters))
-        found = _localize(session, observation, landmark_map, options, parameters)
+        image, seen = _seen(frame, parameters)
+        found = _localize(session, observe(image, seen), landmark_map, options, parameters)
+        if keyframes is not None:
+            assert session.observation is not None
+            found = join_keyframes(
+                found, Image(query_features(image), seen.camera, session.observation),
+                landmark_map, keyframes, options)
     assert found is not None  # a case has a frame
     accepted = case.report.get('found') == 'accepted'
     reason = '' if accepted else str(case.report.get('reason', '')).rpartition(' [')[0]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.joined_map import parts_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import QueryFrame
@@ -48,7 +49,7 @@ class Evaluation:
     queries : sequence of Query
     out : Path
         An existing folder.
-    trials, workers, scheduler : int, int, str
+    trials, workers, scheduler, layer
         See run_methods.
     """
 
@@ -58,6 +59,7 @@ class Evaluation:
     trials: int
     workers: int
     scheduler: str = ''
+    layer: KeyframeLayer | None = None
 
     def compare(self, methods: Sequence[Method], *, sweep: Sequence[int] = (),
                 resume: bool = False, figures: bool = True, frames: Sequence[QueryFrame] = ()
@@ -111,7 +113,7 @@ class Evaluation:
 
             return run_methods(self.landmark_map, methods, self.queries, trials=self.trials,
                                workers=self.workers, scheduler=self.scheduler, done=done,
-                               advance=advance)
+                               layer=self.layer, advance=advance)
 
     @contextmanager
     def _progress(self, methods: Sequence[Method], done: int) -> Iterator[Any]:
@@ -136,7 +138,20 @@ class Evaluation:
                                      self.landmark_map.shapes.tolist())).encode())
         return {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': self.trials,
                 'methods': {one.name: {name: str(value) for name, value
-                                       in asdict(one.options).items()} for one in methods}}
+                                       in asdict(one.options).items()} for one in methods},
+                'keyframes': self._describe_keyframes(methods)}
+
+    def _describe_keyframes(self, methods: Sequence[Method]) -> dict[str, Any] | None:
+        if self.layer is None:
+            return None
+        digest = hashlib.sha256()
+        for query in self.queries:
+            if query.image is not None:
+                digest.update(query.image.features.descriptors.tobytes())
+        for part in (self.layer.map_from_camera, self.layer.points, self.layer.descriptors):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        return {'digest': digest.hexdigest(),
+                'methods': [one.name for one in methods if one.keyframes]}
 
     def _write(self, results: Sequence[Result], summaries: Sequence[Summary]) -> None:
         rows = table_rows(summaries)
@@ -163,7 +178,8 @@ class Evaluation:
 
 
 def _swept(methods: Sequence[Method], counts: Sequence[int]) -> list[Method]:
-    return [Method(f'{one.name}{_AT}{count}', replace(one.options, iterations=count))
+    return [replace(one, name=f'{one.name}{_AT}{count}',
+                    options=replace(one.options, iterations=count))
             for one in methods if not one.draws_nothing
             for count in counts if count != one.options.iterations]
 

@@ -24,10 +24,11 @@ _FIELDS = {field.name: field for field in fields(RelocalizerOptions)}
 
 @dataclass(frozen=True)
 class Method:
-    """A name and its options."""
+    """A name, its options, and whether it uses keyframes where there are some."""
 
     name: str
     options: RelocalizerOptions
+    keyframes: bool = False
 
     @property
     def draws_nothing(self) -> bool:
@@ -43,7 +44,8 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
     ----------
     words : iterable of str
         Names of the paper's methods, 'all' of these, 'auto', or YAML files: a mapping of names
-        to options, where 'base' names a method whose options are the defaults.
+        to options, where 'base' names a method whose options are the defaults, and 'keyframes'
+        says whether keyframes are used; the paper's methods never use them.
     paper : RelocalizerOptions
         Options of the paper's methods besides matching and algorithm. auto takes its seed,
         height range, deviations of vertical and tilt, and crops from them.
@@ -86,7 +88,7 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
     else:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
                            'nor a YAML file')
-    return Method(name, replace(options, k=min(options.k, landmarks)))
+    return Method(name, replace(options, k=min(options.k, landmarks)), name == AUTO)
 
 
 def _read(path: Path, paper: RelocalizerOptions, landmarks: int) -> list[Method]:
@@ -108,14 +110,17 @@ def _made(path: Path, name: str, values: Any, paper: RelocalizerOptions, landmar
         raise OptionsError(f'{where}: is not a mapping of options')
     if '@' in name or '/' in name:
         raise OptionsError(f"{where}: a name must hold neither '@' nor '/'")
-    base = _named(str(values.get('base', AUTO)), paper, landmarks).options
-    changes = {option: value for option, value in values.items() if option != 'base'}
+    base = _named(str(values.get('base', AUTO)), paper, landmarks)
+    keyframes = _converted(f'{where}: keyframes', values.get('keyframes', base.keyframes), True)
+    changes = {option: value for option, value in values.items()
+               if option not in ('base', 'keyframes')}
     for option, value in changes.items():
         if option not in _FIELDS:
-            raise OptionsError(f"{where}: '{option}' is none of base, {', '.join(_FIELDS)}")
+            raise OptionsError(f"{where}: '{option}' is none of base, {', '.join(_FIELDS)}, "
+                               'keyframes')
         changes[option] = _converted(f'{where}: {option}', value, _FIELDS[option].default)
     try:
-        return Method(name, replace(base, **changes))
+        return Method(name, replace(base.options, **changes), keyframes)
     except OptionsError as error:
         raise OptionsError(f'{where}: {error}') from error
 

@@ -7,6 +7,8 @@ import io
 import json
 from collections.abc import Sequence
 
+import numpy as np
+
 from cliploc_ros.core.acceptance.confidence import FITTED_ON
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary, compare, find_best
@@ -15,12 +17,16 @@ from cliploc_ros.evaluation.trials import Result
 _HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
            'search [ms]', 'accepted', 'precision (95 %)', 'false accepts')
 _WITHIN_NOISE = '~'
+# Columns of methods that use keyframes; the other methods leave them empty.
+_KEYFRAMES = ('pose by objects / keyframes / both', 'keyframe inliers', 'keyframes [ms]')
+_SOURCES = ('objects', 'keyframes', 'both')
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     """Return the cells of the table, its header first.
 
-    A '~' marks methods that the queries are too few to separate from the best one.
+    A '~' marks methods that the queries are too few to separate from the best one. Where a method
+    used keyframes, there are columns for the source of its poses.
 
     Parameters
     ----------
@@ -28,7 +34,18 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
         Of the same queries.
     """
     best = find_best(summaries)
-    return [_HEADER, *(_row(one, best) for one in summaries)]
+    rows = [_HEADER, *(_row(one, best) for one in summaries)]
+    if not any(one.has_keyframes for one in summaries):
+        return rows
+    return [row + more for row, more in zip(
+        rows, [_KEYFRAMES, *map(_keyframe_cells, summaries)], strict=True)]
+
+
+def _keyframe_cells(one: Summary) -> tuple[str, ...]:
+    if not one.has_keyframes:
+        return ('',) * len(_KEYFRAMES)
+    return (' / '.join(str(int((one.sources == source).sum())) for source in _SOURCES),
+            f'{np.median(one.keyframe_inliers):.0f}', f'{one.keyframes_ms.mean():.1f}')
 
 
 def _row(one: Summary, best: Summary) -> tuple[str, ...]:
@@ -61,6 +78,9 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'
               for one in summaries if 0.0 < one.crops_share < 1.0]
+    if any(one.has_keyframes for one in summaries):
+        lines.append('Keyframes: number of poses from each source, median of the points that '
+                     'agree, and mean time besides the search; --no-keyframes leaves them out.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
@@ -95,7 +115,8 @@ def as_csv(summaries: Sequence[Summary]) -> str:
                      'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
                      'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
                      'less_than_best_1m', 'less_than_best_low', 'less_than_best_high',
-                     'crops_share', 'refused_by_kind'])
+                     'crops_share', 'refused_by_kind', *(f'from_{source}' for source in _SOURCES),
+                     'keyframe_inliers', 'keyframes_ms'])
     for one in summaries:
         difference = compare(one, best)
         writer.writerow([
@@ -105,8 +126,14 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
             float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
             one.false_accepts(), difference.mean, difference.low, difference.high,
-            one.crops_share, _kinds(one)])
+            one.crops_share, _kinds(one),
+            *(_keyframe_figures(one) if one.has_keyframes else [''] * 5)])
     return text.getvalue()
+
+
+def _keyframe_figures(one: Summary) -> list[float]:
+    return [*map(one.share_from, _SOURCES), float(np.median(one.keyframe_inliers)),
+            float(one.keyframes_ms.mean())]
 
 
 def as_json(results: Sequence[Result]) -> str:

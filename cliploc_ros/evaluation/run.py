@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from itertools import batched
 from typing import NamedTuple
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -40,7 +42,7 @@ class _Part(NamedTuple):
 
 def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
                 *, trials: int, workers: int = 1, scheduler: str = '',
-                done: Sequence[Result] = (),
+                done: Sequence[Result] = (), layer: KeyframeLayer | None = None,
                 advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
     """Run methods on queries.
 
@@ -55,6 +57,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
         See cliploc_ros.parallel.run_tasks. Results do not depend on them.
     done : sequence of Result
         Results of an earlier run, which are not run again.
+    layer : KeyframeLayer, optional
+        Keyframes of the map, for methods that use them and queries with features.
     advance : callable, optional
         Called with the results of each finished part.
 
@@ -75,7 +79,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     results, lost = list(done), []
     # a few queries are done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
-    with closing(run_tasks(_MakeSearch(landmark_map, queries), parts, workers=workers,
+    with closing(run_tasks(_MakeSearch(landmark_map, queries, layer), parts, workers=workers,
                            scheduler=scheduler)) as finished:
         for part, found in finished:
             if found is None:
@@ -113,13 +117,15 @@ class _MakeSearch:
 
     landmark_map: LandmarkMap
     queries: Sequence[Query]
+    layer: KeyframeLayer | None = None
 
     def __call__(self) -> Callable[[_Part], list[Result]]:
         """Return the function, after the kernels are compiled: searches are timed."""
+        keyframes = None if self.layer is None else KeyframeLocalizer(self.layer)
         Relocalizer(self.landmark_map,
                     RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
-        return self._run
 
-    def _run(self, part: _Part) -> list[Result]:
-        return run_trial(self.landmark_map, part.method, part.trial,
-                         [self.queries[place] for place in part.places])
+        def run(part: _Part) -> list[Result]:
+            return run_trial(self.landmark_map, part.method, part.trial,
+                             [self.queries[place] for place in part.places], keyframes)
+        return run

@@ -41,6 +41,11 @@ class Summary:
         Share of a query's crops that were compared with labels, on average.
     refusals : dict of str to int
         How many were refused, by kind, the most frequent first.
+    sources : ndarray (t, q) of str
+        What each pose comes from, see Result.
+    keyframe_inliers : ndarray (t, q) of int
+    keyframes_ms : ndarray (t, q)
+        The three are empty where no query was compared with keyframes.
     """
 
     method: str
@@ -56,6 +61,19 @@ class Summary:
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     crops_share: float = 1.0
     refusals: dict[str, int] = field(default_factory=dict)
+    sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
+    keyframe_inliers: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty((0, 0), dtype=np.int64))
+    keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def has_keyframes(self) -> bool:
+        """Return whether queries were compared with keyframes."""
+        return self.sources.size > 0
+
+    def share_from(self, source: str) -> float:
+        """Return the share of all queries whose pose comes from a source."""
+        return float((self.sources == source).mean()) if self.has_keyframes else 0.0
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, accepted or not."""
@@ -132,6 +150,11 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         return np.array([getattr(result, name) for result in results]).reshape(-1, len(queries))
 
     kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
+    keyframes = {name: column(name) for name in ('keyframe_inliers', 'keyframes_ms')}
+    if (keyframes['keyframes_ms'] > 0.0).any():
+        keyframes['sources'] = column('source')
+    else:
+        keyframes = {}
     errors = [np.inf if result.error_m is None else result.error_m for result in results]
     return Summary(
         method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
@@ -139,7 +162,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         column('hypotheses'), column('boxes')[0],
         np.array([np.inf if result.nees is None else result.nees for result in results]
                  ).reshape(-1, len(queries)), float(column('crops_share').mean()),
-        dict(kinds.most_common()))
+        dict(kinds.most_common()), **keyframes)
 
 
 @dataclass(frozen=True)

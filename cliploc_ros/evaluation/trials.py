@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods run on queries: the pose that each search found, and its error."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.combination import Image, join_keyframes
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.joined_map import place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -42,12 +45,18 @@ class Query:
         Ground truth.
     neighbours : tuple of Observation
         Other frames, which odometry links to it.
+    image : Image, optional
+        Its local features, for keyframes.
+    features_ms : float
+        Time that they took [ms].
     """
 
     number: int
     observation: Observation
     map_from_camera: NDArray[np.float64]
     neighbours: tuple[Observation, ...] = ()
+    image: Image | None = None
+    features_ms: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,7 @@ class Result:
     reason : str
         Reason of the refusal; empty when accepted.
     search_ms : float
-        The only field that differs from run to run.
+        Of the objects. The times are the only fields that differ from run to run.
     crops_share : float
         Share of the crops of its frames that were compared with labels.
     map : str
@@ -95,6 +104,12 @@ class Result:
         another map, it is far away. Empty for a single map.
     refusal_kind : str
         See cliploc_ros.core.acceptance.refusal_kind; empty when accepted.
+    source : str
+        What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found.
+    keyframe_inliers : int
+        Points of keyframes that agree on their pose, whatever the pose comes from.
+    keyframes_ms : float
+        Time of features, matching and the pose from them [ms].
     """
 
     method: str
@@ -119,6 +134,9 @@ class Result:
     crops_share: float = 1.0
     map: str = ''
     refusal_kind: str = ''
+    source: str = ''
+    keyframe_inliers: int = 0
+    keyframes_ms: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -161,8 +179,8 @@ def _observation(frame: QueryFrame, camera: Camera, columns: list[int]) -> Obser
                        similarities, frame.stamp_ns)
 
 
-def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query]
-              ) -> list[Result]:
+def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query],
+              keyframes: KeyframeLocalizer | None = None) -> list[Result]:
     """Run one trial of a method on some queries.
 
     Parameters
@@ -172,13 +190,25 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     trial : int
         From 0.
     queries : sequence of Query
+    keyframes : KeyframeLocalizer, optional
+        Of the map's layer, for methods that use keyframes and queries with features.
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
     on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
     localize = _localize_on_demand if on_demand else _localize
-    return [_judge(landmark_map, method.name, trial, query,
-                   *localize(landmark_map, relocalizer, query)) for query in queries]
+    results = []
+    for query in queries:
+        found, crops_share = localize(landmark_map, relocalizer, query)
+        spent_ms = 0.0
+        if keyframes is not None and query.image is not None and method.keyframes:
+            begin = time.perf_counter()
+            found = join_keyframes(found, query.image, landmark_map, keyframes,
+                                   relocalizer.options)
+            spent_ms = query.features_ms + 1e3 * (time.perf_counter() - begin)
+        results.append(replace(_judge(landmark_map, method.name, trial, query, found, crops_share),
+                               keyframes_ms=spent_ms))
+    return results
 
 
 def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
@@ -220,4 +250,6 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
         reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
         map='' if pose is None else place_of(landmark_map, pose).name,
-        refusal_kind=found.refusal_kind or '')
+        refusal_kind=found.refusal_kind or '',
+        source='' if pose is None else found.source,
+        keyframe_inliers=0 if found.recognized is None else int(found.recognized.inliers))

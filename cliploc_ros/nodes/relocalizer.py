@@ -111,6 +111,10 @@ class RelocalizerNode(ManagedNode):
                           'time limit [s]': self.settings['timeout_s'],
                           'missing': '; '.join(self._missing())}
         if self._pipeline.localizer is not None:
+            keyframes = self._pipeline.localizer.keyframes
+            if keyframes is not None:
+                health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
+                                  'keyframes hash': keyframes.file_hash}
             health.values |= {'map': self._pipeline.localizer.description,
                               'map hash': self._pipeline.localizer.map_hash,
                               'device': self._pipeline.localizer.device}

@@ -3,9 +3,10 @@
 """Keyframes of a recording: which images, which of their features, and where these are."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +31,8 @@ from cliploc_ros.errors import MappingError, OptionsError
 _MOST_FOUND = 2000
 # An image with fewer points is no keyframe.
 _LEAST_POINTS = 20
+# Stored images are for people: 7 to 9 kB each.
+_IMAGE_PX, _JPEG_QUALITY = 256, 60
 
 
 @dataclass(frozen=True)
@@ -42,11 +45,14 @@ class LayerOptions:
         An image becomes a keyframe unless one of them is nearer than both. 0: every image.
     most_points : int
         Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
+    images : bool
+        Whether to store small images of the keyframes, too, for people to look at.
     """
 
     distance_m: float = 0.1
     angle_deg: float = 5.0
     most_points: int = 600
+    images: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that make no layer."""
@@ -62,10 +68,11 @@ _DEFAULT = LayerOptions()
 
 
 class _Seen(NamedTuple):
-    """A keyframe: its features (undistorted pixels, strongest first) and their depths."""
+    """A keyframe: its features (undistorted pixels, strongest first), their depths, its JPEG."""
 
     posed: PosedFeatures
     depths: NDArray[np.float64]
+    jpeg: bytes
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -88,7 +95,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     camera, seen = None, []
     for frame in _chosen(frames, options):
         camera = camera or _pinhole(frame.camera)
-        seen.append(_look(frame, options.most_points))
+        seen.append(_look(frame, options))
     images = [one.posed for one in seen]
     points = [_points(images, row, one.depths)
               for row, one in enumerate(seen)]
@@ -98,10 +105,11 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
                            f'{_LEAST_POINTS} features with a place in the map; record depth, or '
                            'images that overlap and are 5 cm or more apart')
-    return _assemble(landmark_map, camera, [images[row] for row in rows],
-                     [points[row] for row in rows], [kept[row] for row in rows],
-                     FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
-                     else TRIANGULATED)
+    layer = _assemble(landmark_map, camera, [images[row] for row in rows],
+                      [points[row] for row in rows], [kept[row] for row in rows],
+                      FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
+                      else TRIANGULATED)
+    return _with_images(layer, [seen[row].jpeg for row in rows]) if options.images else layer
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
@@ -126,7 +134,7 @@ def _pinhole(camera: Camera) -> Camera:
     return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _look(frame: Frame, most: int) -> _Seen:
+def _look(frame: Frame, options: LayerOptions) -> _Seen:
     """Return the features of an image; with depth, only those that have some."""
     assert frame.map_from_camera is not None
     features = extract(frame.image_rgb, _MOST_FOUND)
@@ -136,9 +144,33 @@ def _look(frame: Frame, most: int) -> _Seen:
     if frame.depth is not None:
         depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
         known &= np.isfinite(depths)
-        known &= np.cumsum(known) <= most
+        known &= np.cumsum(known) <= options.most_points
     return _Seen(PosedFeatures(frame.map_from_camera, bearings[known],
-                               features.descriptors[known]), depths[known])
+                               features.descriptors[known]), depths[known],
+                 _small_jpeg(frame) if options.images else b'')
+
+
+def _small_jpeg(frame: Frame) -> bytes:
+    """Return an image, undistorted and small, as JPEG."""
+    camera = frame.camera
+    scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    scales = np.array([width / camera.width, height / camera.height])
+    image = cv2.resize(frame.image_rgb, (width, height), interpolation=cv2.INTER_AREA)
+    if any(camera.distortion):
+        columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+        pixels = (np.column_stack([columns.ravel(), rows.ravel()]) + 0.5) / scales - 0.5
+        seen = camera.project_normalized(_pinhole(camera).normalize_points(pixels))
+        maps = ((seen + 0.5) * scales - 0.5).reshape(height, width, 2).astype(np.float32)
+        image = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+    _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
+                              [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return bytes(content)
+
+
+def _with_images(layer: KeyframeLayer, jpegs: Sequence[bytes]) -> KeyframeLayer:
+    return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
+                   image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
 
 def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float64]

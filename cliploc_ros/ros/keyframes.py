@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.recognition import objects_there
-from cliploc_ros.core.combination import combine
-from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.combination import Image, join_keyframes
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -28,8 +28,6 @@ logger = logging.getLogger(__name__)
 NEXT_TO_MAP = 'auto'
 # Without so much time left, the objects' answer stands: extracting features cannot be stopped.
 _LEAST_S = 0.5
-# Poses of objects that propose keyframes.
-_MOST_GUESSES = 3
 
 
 class Keyframes:
@@ -39,9 +37,13 @@ class Keyframes:
     ----------
     localizer : KeyframeLocalizer
     landmark_map : LandmarkMap
+    file, file_hash : str
+        Where the layer is from, for the diagnostics.
     """
 
-    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap) -> None:
+    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap, file: str = '',
+                 file_hash: str = '') -> None:
+        self.file, self.file_hash = file, file_hash
         self._localizer = localizer
         self._map = landmark_map
         self._notes: set[str] = set()
@@ -49,6 +51,11 @@ class Keyframes:
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self._localizer.layer)
+
+    @property
+    def layer(self) -> KeyframeLayer:
+        """Return the layer."""
+        return self._localizer.layer
 
     def join(self, found: Relocalization, image_rgb: NDArray[np.uint8], observation: Observation,
              options: RelocalizerOptions, deadline: float) -> Relocalization:
@@ -71,12 +78,8 @@ class Keyframes:
         if note and note not in self._notes:
             self._notes.add(note)
             logger.warning('%s', note)
-        guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
-        seen = self._localizer.localize(image_rgb, observation.camera, guesses, deadline)
-        if seen is None:
-            return found
-        return combine(found, seen, objects_there(self._map, observation, seen.map_from_camera),
-                       options)
+        image = Image(query_features(image_rgb), observation.camera, observation)
+        return join_keyframes(found, image, self._map, self._localizer, options, deadline)
 
 
 def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyframes | None:
@@ -92,7 +95,7 @@ def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyf
         return None
     try:
         layer = load_layer_of_map(path, landmark_map)
-        return Keyframes(KeyframeLocalizer(layer), landmark_map)
+        return Keyframes(KeyframeLocalizer(layer), landmark_map, str(path), layer_hash(path))
     except MapError as error:
         logger.error('localizing without keyframes: %s', error)
         return None

@@ -110,6 +110,11 @@ class Localizer:
         return self._map
 
     @property
+    def keyframes(self) -> Keyframes | None:
+        """Return the layer of keyframes; None without one."""
+        return self._keyframes
+
+    @property
     def description(self) -> str:
         """Return what is loaded, in a line."""
         frames = [f"'{part.landmark_map.frame_id}'" for part in parts_of(self._map)]
@@ -191,7 +196,9 @@ class Localizer:
         for_filter = session.covariance_for_filter(found) \
             if found.accepted and values['mode'] == 'continuous' else found.covariance
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
-        return Localized(found, landmark_map, SeenImage(image, seen), compared, is_cut, for_filter)
+        layer = None if self._keyframes is None else self._keyframes.layer
+        return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
+                         for_filter)
 
     def _stages(self, image: NDArray[np.uint8], observation: Observation,
                 options: RelocalizerOptions, times: StageTimes, deadline: float

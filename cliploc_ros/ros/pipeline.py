@@ -118,7 +118,8 @@ class Pipeline:
 
     def _use(self, localizer: Localizer) -> str:
         self.localizer = localizer
-        self._visualization.set_map(localizer.landmark_map)
+        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
+                                    else localizer.keyframes.layer)
         return localizer.description
 
     def _answer(self, header: Header, localized: Localized, state: RobotState,
@@ -162,6 +163,8 @@ def _summary(localized: Localized) -> str:
     crops = '' if seen.similarities is None else \
         f', CLIP of {localized.compared} of {len(seen.detections)} crops'
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
+    if found.recognized is not None:
+        keyframes += f', {found.recognized.inliers} points of keyframes agree'
     return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
             f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}')

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.replace_file import replace_file
 from cliploc_ros.studio import edits
+from cliploc_ros.studio.keyframes_panel import KeyframesPanel
 from cliploc_ros.studio.live_panel import LivePanel
 from cliploc_ros.studio.panels import LandmarkPanel, MapPanel, TablePanel, ViewPanel
 from cliploc_ros.studio.picture import SELECTED_RGB
@@ -105,6 +106,8 @@ class Page:
             self._view_panel = ViewPanel(self, tools)
         with tools.add_tab('Places'):
             self._places = PlacesPanel(self)
+            if self.studio.layer is not None:
+                KeyframesPanel(server, self.studio.layer)
         self._tools: list[PlacesPanel | LivePanel] = [self._places]
         if live is not None:
             with tools.add_tab('Robot'):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.frustum import frusta
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.studio import Studio, color_of
@@ -29,8 +30,6 @@ IMAGE_DEPTH_M = 0.3
 #: Landmarks with their ids.
 Pairs = list[tuple[str, Landmark]]
 _SPHERE = trimesh.creation.icosphere(subdivisions=2)
-# Corners of a frustum's base: right and down, in units of half its size.
-_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 class Ellipsoids:
@@ -194,6 +193,11 @@ def wxyz_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.roll(Rotation.from_matrix(map_from_camera[:3, :3]).as_quat(), 1))
 
 
+def some_cameras(count: int) -> NDArray[np.int64]:
+    """Return the rows of the cameras to draw: all, or every n-th of many."""
+    return np.arange(0, count, max(1, -(-count // _MAX_CAMERAS)))
+
+
 def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
                    on_click: Callable[[Any, int], None]) -> None:
     """Draw the trajectory and the cameras, all of them or every n-th; a click chooses a view."""
@@ -202,16 +206,9 @@ def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
         path = np.stack([poses[:-1, :3, 3], poses[1:, :3, 3]], axis=1)
         scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
                                 thickness_units='screen')
-    shown = np.arange(0, len(poses), max(1, -(-len(poses) // _MAX_CAMERAS)))
-    camera = detections.camera
-    half = np.array([camera.width / camera.fx, camera.height / camera.fy]) * 0.5 * _FRUSTUM_M
-    corners = np.column_stack([_CORNERS * half, np.full(4, _FRUSTUM_M)])
-    points = np.einsum('fij,kj->fki', poses[shown, :3, :3], corners) + poses[shown, None, :3, 3]
-    tips = np.broadcast_to(poses[shown, None, :3, 3], points.shape)
-    lines = np.concatenate([np.stack([tips, points], axis=2),
-                            np.stack([points, np.roll(points, 1, axis=1)], axis=2)], axis=1)
-    scene.add_line_segments('/cameras', lines.reshape(-1, 2, 3), (120, 120, 200),
-                            thickness=1.0, thickness_units='screen')
+    shown = some_cameras(len(poses))
+    scene.add_line_segments('/cameras', frusta(detections.camera, poses[shown], _FRUSTUM_M),
+                            (120, 120, 200), thickness=1.0, thickness_units='screen')
     handle = scene.add_batched_meshes_simple(
         '/camera_centers', _SPHERE.vertices * 0.012, _SPHERE.faces,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(shown), 1)), poses[shown, :3, 3],

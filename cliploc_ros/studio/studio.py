@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.checking.relocalization import sample_frames
 from cliploc_ros.studio import edits
@@ -54,11 +55,15 @@ class Studio:
         The images of these views.
     finder : PhraseFinder, optional
         Finds phrases for landmarks.
+    layer : KeyframeLayer, optional
+        The keyframes next to the map, to be shown.
     """
 
     def __init__(self, document: Document, recording: Recording | None = None,
-                 images: Images | None = None, finder: PhraseFinder | None = None):
+                 images: Images | None = None, finder: PhraseFinder | None = None,
+                 layer: KeyframeLayer | None = None):
         self.document = document
+        self.layer = layer
         self.finder = finder
         self.recording = recording
         self.view = 0

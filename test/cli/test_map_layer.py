@@ -26,6 +26,12 @@ def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, capsys, o
     assert not out.exists()
 
 
+def test_images_without_a_layer_are_refused(tmp_path, capsys):
+    out = tmp_path / 'map.yaml'
+    assert main([*WALK, '--keyframe-images', '--out', str(out)]) == 1
+    assert '--keyframe-images is for --keyframe-layer' in capsys.readouterr().err
+
+
 def test_a_walk_gives_a_layer_next_to_its_map(tmp_path):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     options = make_parser().parse_args([

@@ -10,7 +10,10 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.recognition import ObjectsThere
+from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -267,3 +270,27 @@ def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
     assert deviations[1] > 10.0
     alone = session.localize(replace(frame(3), odom_from_camera=None))
     np.testing.assert_array_equal(session.covariance_for_filter(alone), alone.covariance)
+
+
+def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
+    session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
+
+    def join(found, metres):
+        seen = Recognized(make_transform(MAP_FROM_CAMERA[:3, :3], MAP_FROM_CAMERA[:3, 3]
+                                         + np.array([metres, 0.0, 0.0])),
+                          fine, 200, 0, None, 0.8, 0.85, (0,))
+        return combine(found, seen, ObjectsThere(len(ROOM), 0), RELOCALIZER.options)
+
+    objects = session.localize(frame(0), 0, 5, 5.0)
+    first = join(objects, 0.01)
+    assert first.source == 'both' and first.accepted
+    given = session.covariance_for_filter(first)
+    np.testing.assert_array_equal(given, fine)
+    assert (np.diag(given) < np.diag(objects.covariance)).all()
+    again = session.covariance_for_filter(join(session.localize(frame(1), 0, 5, 5.0), 0.01))
+    assert (np.diag(again) > 100.0 * np.diag(fine)).all(), 'nothing new'
+    rough = session.covariance_for_filter(session.localize(frame(2), 0, 5, 5.0))
+    assert (np.diag(rough) > 100.0 * np.diag(objects.covariance)).all(), 'objects tell less'
+    alone = join(session.localize(frame(3, detections=NOTHING), 1, 5, 5.0), 0.0)
+    assert alone.source == 'keyframes' and alone.accepted
+    np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)

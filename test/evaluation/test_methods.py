@@ -41,7 +41,16 @@ def test_named_sets_of_options(tmp_path):
     assert (strict.options.min_confidence, strict.options.iterations) == (0.9, 10_000)
 
 
+def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text('strict: {min_confidence: 0.9}\nobjects: {keyframes: false}\n'
+                    'wide: {base: hybrid_b-prosac}\n')
+    methods = parse_methods(['auto', 'clip_bf', str(path)], PAPER, 40)
+    assert [one.name for one in methods if one.keyframes] == ['auto', 'strict']
+
+
 @pytest.mark.parametrize(('text', 'named'), [
+    ('wide: {keyframes: 3}', 'mine.yaml: wide: keyframes: 3 is no bool'),
     ('wide: {kk: 9}', "mine.yaml: wide: 'kk' is none of base, matching"),
     ('wide: {k: many}', "mine.yaml: wide: k: 'many' is no int"),
     ('wide: {k: true}', 'mine.yaml: wide: k: True is no int'),

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from scene import make_room, write_map
 from std_srvs.srv import Trigger
 from tester import class_matching, make_frame, transform_of
 
+from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, save_layer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
@@ -37,8 +39,9 @@ def room_map(tmp_path):
 
 
 def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
-        start, tester, room_map):
-    process = start('nodes.relocalizer', parameters=class_matching(room_map))
+        start, tester, room_map, tmp_path, capsys):
+    process = start('nodes.relocalizer',
+                    parameters=class_matching(room_map, record_folder=tmp_path / 'cases'))
     process.wait_for_output('ready after')
     assert '29 keyframes' in process.output()
     tester.connect()
@@ -53,13 +56,37 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     answer = tester.relocalize((image, info, detections))
     assert answer.success, answer.message
     assert 'pose by keyframes' in answer.message
+    assert 'points of keyframes agree' in answer.message
+    assert tester.call(Trigger, '/relocalizer/record', Trigger.Request()).success
+    case, = (tmp_path / 'cases').iterdir()
+    again = ['--bag', str(case), '--map', str(room_map)]
+    assert evaluate(again) == 0
+    assert 'again:    accepted' in capsys.readouterr().out
+    assert evaluate([*again, '--no-keyframes']) == 1
+    assert 'another verdict' in capsys.readouterr().out
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
     # boxes that the objects' search accepts, in an image of another place
     contradicted = tester.relocalize((image, info, make_frame()[2]))
     assert not contradicted.success
     assert 'objects and keyframes contradict each other' in contradicted.message
+    health = diagnostics_of(tester)
+    assert health['keyframes'] == '29'
+    assert health['keyframes file'] == str(layer_path(room_map))
+    assert health['keyframes hash'] == layer_hash(layer_path(room_map))
     layer_path(room_map).write_bytes(b'no layer')
     assert tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request()).success
     process.wait_for_output('localizing without keyframes')
     assert not tester.relocalize((image, info, detections)).success
+    assert 'keyframes' not in diagnostics_of(tester)
+
+
+def diagnostics_of(tester):
+    """Return the relocalizer's next diagnostics."""
+    heard = []
+    subscription = tester.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda msg: heard.extend(
+            one for one in msg.status if 'relocalizer' in one.name), 10)
+    tester.wait(lambda: heard, 'diagnostics')
+    tester.destroy_subscription(subscription)
+    return {value.key: value.value for value in heard[-1].values}

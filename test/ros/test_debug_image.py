@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scene import CAMERA, make_room, see_room
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
@@ -81,3 +84,42 @@ def test_boxes_beyond_all_measure_do_no_harm(room, found):
     draw_debug_image(SeenImage(seen.image_rgb, huge), found, room, 'x')
     small = SeenImage(np.zeros((1, 1, 3), np.uint8), seen.observation)
     assert draw_debug_image(small, found, room, 'accepted: ' + 99 * 'x').shape == (1, 1, 3)
+
+
+def layer_of(room, **images):
+    """One keyframe with the camera's size, and ten points along its middle row."""
+    pixels = np.column_stack([np.linspace(50, 590, 10), np.full(10, 240.0)])
+    return KeyframeLayer(
+        'map', room.landmark_ids, room.centers.astype(np.float32), CAMERA, np.eye(4)[None],
+        np.array([0, 10]), (16 * pixels).astype(np.uint16), np.ones((10, 3), np.float32),
+        np.ones((10, 128), np.uint8), np.zeros(10, np.uint16), np.ones((1, 128), np.uint8),
+        **images)
+
+
+def recognized(found):
+    """Answer by five of the points, which the image shows 100 px further up."""
+    pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
+    seen = Recognized(np.eye(4), np.eye(6), 5, 0, None, 0.8, 0.8, (0,), pixels, np.arange(5))
+    return replace(found, recognized=seen)
+
+
+def test_the_best_keyframe_is_beside_the_image(room, found):
+    seen = grey_image(room)
+    alone = draw_debug_image(seen, found, room, '')
+    assert draw_debug_image(seen, recognized(found), room, '').shape == alone.shape
+    blank = draw_debug_image(replace(seen, layer=layer_of(room)), recognized(found), room, '')
+    height, width = alone.shape[:2]
+    assert blank.shape == (height, 2 * width, 3)
+    assert (alone == draw_debug_image(seen, found, room, '')).all()
+    place = np.array([width, 0])
+    others = pixels_of(blank, (120, 120, 120))
+    for column in (350, 590):  # points of the keyframe that the image does not show
+        assert np.abs(others - place - (column, 240)).max(axis=1).min() <= 1
+    dot_here, dot_there = blank[140, 290], blank[240, width + 290]
+    assert (dot_here == dot_there).all() and np.ptp(dot_here.astype(int)) > 200, 'equal colours'
+    jpeg = cv2.imencode('.jpg', np.full((192, 256, 3), (200, 30, 30), np.uint8)[..., ::-1])[1]
+    shown = draw_debug_image(replace(seen, layer=layer_of(
+        room, images=jpeg.ravel(), image_offsets=np.array([0, jpeg.size]))),
+        recognized(found), room, '')
+    assert np.abs(shown[20, width + 20].astype(int) - (200, 30, 30)).max() < 12
+    assert len(pixels_of(shown[:, width:], (120, 120, 120))) == 0

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
-from scene import make_room
+from scene import CAMERA, make_room
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.ros.outputs.markers import (
     MAX_SHOWN,
@@ -34,6 +35,24 @@ def test_every_landmark_is_an_ellipsoid_with_its_label():
         assert text.pose.position.z > room.centers[row][2] + room.semi_axes[row].max()
         assert ellipsoid.color == class_color(room.class_ids[row])
     assert len({(color.r, color.g, color.b) for color in map(class_color, 'abc')}) == 3
+
+
+def test_keyframes_are_cameras_in_a_namespace_of_their_own():
+    room = make_room()
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 1.0, 2.0, 3.0
+    layer = KeyframeLayer(
+        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA, poses,
+        np.zeros(4, np.int64), np.empty((0, 2), np.uint16), np.empty((0, 3), np.float32),
+        np.empty((0, 128), np.uint8), np.empty(0, np.uint16), np.ones((1, 128), np.uint8))
+    *others, cameras = landmark_markers(room, layer).markers
+    assert len(others) == 1 + 2 * len(room)
+    assert (cameras.ns, cameras.type, cameras.header.frame_id) == (
+        'keyframes', Marker.LINE_LIST, 'map')
+    assert len(cameras.points) == 2 * 8 * len(poses)
+    tip, corner = cameras.points[:2]
+    assert (tip.x, tip.y, tip.z) == (1.0, 0.0, 0.0)
+    assert corner.z > 0.05 and corner.x < 1.0, 'it looks along z of the camera'
 
 
 def test_a_large_map_is_shown_in_part():

@@ -10,6 +10,7 @@ the numbers of their words. Words that many keyframes have count less.
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,6 +59,10 @@ class KeyframeLayer:
     deviation_per_metre : float
         How far a pose is off that was found from a keyframe a metre away, as a standard
         deviation on each axis [m]: the error that its points share.
+    images : ndarray (b,) uint8, optional
+        Small undistorted JPEG images, one after another: for people, no answer needs them.
+    image_offsets : ndarray (K + 1,) of int, optional
+        Keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1].
     """
 
     frame_id: str
@@ -72,6 +77,8 @@ class KeyframeLayer:
     words: NDArray[np.uint16]
     vocabulary: NDArray[np.uint8]
     deviation_per_metre: float = FROM_DEPTH
+    images: NDArray[np.uint8] | None = None
+    image_offsets: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -94,6 +101,14 @@ class KeyframeLayer:
     def rows(self, keyframe: int) -> slice:
         """Return where the points of a keyframe are."""
         return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
+
+    def image_rgb(self, keyframe: int) -> NDArray[np.uint8] | None:
+        """Return the small image (h, w, 3) of a keyframe; None without a sound one."""
+        if self.images is None or self.image_offsets is None:
+            return None
+        content = np.asarray(self.images[slice(*self.image_offsets[keyframe:keyframe + 2])])
+        image = cv2.imdecode(content, cv2.IMREAD_COLOR) if len(content) else None
+        return None if image is None else np.asarray(image[..., ::-1], dtype=np.uint8)
 
     def points_in_map(self, keyframe: int) -> NDArray[np.float64]:
         """Return the points (m, 3) of a keyframe in the map [m]."""

@@ -7,6 +7,7 @@ layer costs memory only where it is used, and may be larger than the memory. A s
 a program that writes over a mapped file in place would kill this process.
 """
 
+import hashlib
 import json
 import os
 import zipfile
@@ -37,9 +38,15 @@ _LAYOUT: dict[str, tuple[tuple[object, ...], str]] = {
     'words': (('n',), 'uint16'),
     'vocabulary': (('W', DIMENSIONS), 'uint8'),
 }
+# Only there where images were asked for; b bytes.
+_IMAGES: dict[str, tuple[tuple[object, ...], str]] = {
+    'images': (('b',), 'uint8'),
+    'image_offsets': (('K+1',), 'int64'),
+}
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
-_MAPPED = ('pixels', 'points', 'descriptors')
+_MAPPED = ('pixels', 'points', 'descriptors', 'images')
 _HEADER_BYTES = 100_000
+_HASH_DIGITS = 12
 #: Files up to this size are read into memory [bytes].
 MOST_READ = 256_000_000
 _MOST_DEVIATION = 1.0
@@ -64,9 +71,10 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
               'camera': {name: getattr(layer.camera, name) for name in _CAMERA}}
+    layout = _LAYOUT if layer.images is None else _LAYOUT | _IMAGES
     arrays: dict[str, NDArray[Any]] = {
         name: np.asarray(getattr(layer, name)).astype(kind, copy=False)
-        for name, (_, kind) in _LAYOUT.items()}
+        for name, (_, kind) in layout.items()}
     try:
         with replace_file(path) as partial, partial.open('wb') as file:
             np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
@@ -91,6 +99,16 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
     return layer
 
 
+def layer_hash(path: Path) -> str:
+    """Return what tells one layer from another: of the names, sizes and checksums of its arrays.
+
+    It reads the table of contents only: a layer may be larger than the memory.
+    """
+    with zipfile.ZipFile(path) as archive:
+        content = [(one.filename, one.file_size, one.CRC) for one in archive.infolist()]
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:_HASH_DIGITS]
+
+
 class _LayerError(Exception):
     """What is wrong with a layer; the caller adds the file's name."""
 
@@ -101,12 +119,13 @@ def _load(path: Path) -> KeyframeLayer:
     try:
         with zipfile.ZipFile(path) as archive, path.open('rb') as file:
             header = _read_header(archive)
-            arrays = {name: _read_array(archive, file, path, name) for name in _LAYOUT}
+            layout = _LAYOUT | _IMAGES if 'images.npy' in archive.namelist() else _LAYOUT
+            arrays = {name: _read_array(archive, file, path, name) for name in layout}
     except _LayerError:
         raise
     except Exception as error:  # whatever NumPy and zipfile meet in a broken file
         raise _LayerError(f'is no complete layer of keyframes ({error})') from error
-    _check_layout(arrays)
+    _check_layout(arrays, layout)
     _check_values(arrays)
     try:
         camera = Camera(*(header['camera'][name] for name in _CAMERA))
@@ -160,13 +179,15 @@ def _read_array(archive: zipfile.ZipFile, file: Any, path: Path, name: str) -> N
     return mapped if path.stat().st_size > MOST_READ else np.array(mapped)
 
 
-def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
+def _check_layout(arrays: dict[str, NDArray[Any]],
+                  layout: dict[str, tuple[tuple[object, ...], str]]) -> None:
     sizes: dict[object, int] = {
         letter: len(np.atleast_1d(arrays[name])) for letter, name in
         (('K', 'map_from_camera'), ('n', 'descriptors'), ('L', 'landmark_ids'),
          ('W', 'vocabulary'))}
     sizes['K+1'] = sizes['K'] + 1
-    for name, (letters, kind) in _LAYOUT.items():
+    sizes['b'] = arrays['images'].size if 'images' in layout else 0
+    for name, (letters, kind) in layout.items():
         array, shape = arrays[name], tuple(sizes.get(one, one) for one in letters)
         if array.shape != shape:
             raise _LayerError(f'array {name} has shape {array.shape}, expected {shape}')
@@ -177,10 +198,12 @@ def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
-    offsets = arrays['offsets']
-    count = len(arrays['descriptors'])
-    if offsets[0] != 0 or offsets[-1] != count or (np.diff(offsets) < 0).any():
-        raise _LayerError('array offsets does not count the points of the keyframes')
+    for name, counted, what in (('offsets', 'descriptors', 'points'),
+                                ('image_offsets', 'images', 'bytes')):
+        offsets = arrays.get(name)
+        if offsets is not None and (offsets[0] != 0 or offsets[-1] != len(arrays[counted])
+                                    or (np.diff(offsets) < 0).any()):
+            raise _LayerError(f'array {name} does not count the {what} of the keyframes')
     for row, pose in enumerate(arrays['map_from_camera']):
         if not is_rigid(pose, tolerance=1e-3):
             raise _LayerError(f'array map_from_camera has no rigid transform in row {row}')

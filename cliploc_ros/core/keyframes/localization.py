@@ -24,8 +24,9 @@ _SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
 # Places differ by more than 1 m or 45 degrees, as poses that do not agree.
 _MOST_RANKED = 500
 _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
-# A keyframe sees the same as a pose if it looks the same way from near enough.
-_NEAR_M, _NEAR_DEG = 2.0, 40.0
+#: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
+#: two that it is away are less than 1 together.
+NEAR_M, NEAR_DEG = 2.0, 40.0
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
 # Cells of the image (columns, rows), and how many points and features make one comparable.
@@ -56,6 +57,10 @@ class Recognized(NamedTuple):
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
     keyframes : tuple of int
         Those that points agree with, the most points first.
+    pixels : ndarray (k, 2)
+        Where the image, as it is, shows each point that agrees [px].
+    rows : ndarray (k,) of int
+        Which point of the layer that is.
     """
 
     map_from_camera: NDArray[np.float64]
@@ -66,17 +71,26 @@ class Recognized(NamedTuple):
     confirmed: float
     expected: float
     keyframes: tuple[int, ...]
+    pixels: NDArray[np.float64] = np.empty((0, 2))
+    rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 
 
 class _Matched(NamedTuple):
-    """Matches of an image: feature, point in the map, keyframe, k of each."""
+    """Matches of an image: feature, point in the map, its keyframe and row, k of each."""
 
     features: NDArray[np.int64]
     points: NDArray[np.float64]
     keyframes: NDArray[np.int64]
+    rows: NDArray[np.int64]
 
-    def select(self, rows: NDArray[np.int64]) -> '_Matched':
-        return _Matched(self.features[rows], self.points[rows], self.keyframes[rows])
+    def select(self, chosen: NDArray[np.int64]) -> '_Matched':
+        return _Matched(self.features[chosen], self.points[chosen], self.keyframes[chosen],
+                        self.rows[chosen])
+
+
+def query_features(image_rgb: NDArray[np.uint8]) -> Features:
+    """Return the features of an image (h, w, 3) that is to be localized."""
+    return extract(image_rgb, _QUERY_FEATURES)
 
 
 class KeyframeLocalizer:
@@ -106,7 +120,12 @@ class KeyframeLocalizer:
         deadline : float
             No further keyframe is matched then (monotonic clock) [s].
         """
-        features = extract(image_rgb, _QUERY_FEATURES)
+        return self.localize_features(query_features(image_rgb), camera, guesses, deadline)
+
+    def localize_features(self, features: Features, camera: Camera,
+                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
+                          ) -> Recognized | None:
+        """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features, bearings = _select(features, known), bearings[known]
@@ -126,7 +145,7 @@ class KeyframeLocalizer:
             best.covariance + self._shared(best.map_from_camera, counts),
             len(np.unique(inliers.features)), rival, rival_pose,
             *self._confirmed(best.map_from_camera, camera, features, inliers, used),
-            tuple(used.tolist()))
+            tuple(used.tolist()), features.pixels[inliers.features], inliers.rows)
 
     def _choose(self, descriptors: NDArray[np.float32], guesses: Sequence[NDArray[np.float64]]
                 ) -> list[int]:
@@ -145,6 +164,7 @@ class KeyframeLocalizer:
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
         features, points, keyframes = [np.empty(0, np.int64)], [np.empty((0, 3))], []
+        rows = [np.empty(0, np.int64)]
         for keyframe in chosen:
             if time.monotonic() > deadline:
                 break
@@ -154,8 +174,9 @@ class KeyframeLocalizer:
             features.append(pairs[known, 0])
             points.append(inside[known])
             keyframes += [keyframe] * int(known.sum())
+            rows.append(self.layer.offsets[keyframe] + pairs[known, 1])
         return _Matched(np.concatenate(features), np.concatenate(points),
-                        np.array(keyframes, dtype=np.int64))
+                        np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _rival(self, matched: _Matched, bearings: NDArray[np.float64], camera: Camera,
                best: NDArray[np.float64]) -> tuple[int, NDArray[np.float64] | None]:
@@ -217,7 +238,7 @@ def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> N
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    costs = distances / _NEAR_M + angles / _NEAR_DEG
+    costs = distances / NEAR_M + angles / NEAR_DEG
     order = np.argsort(costs, kind='stable')
     return np.asarray(order[costs[order] < 1.0])
 

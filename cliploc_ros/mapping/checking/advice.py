@@ -35,7 +35,7 @@ def give_advice(report: CheckReport) -> list[str]:
     """Return what to do, one sentence or two each."""
     advice = [*_on_look_alikes(report), *_on_duplicates(report), *_on_few_views(report),
               *_on_landmarks(report), *_on_corrections(report), *_on_misled(report),
-              *_on_spans(report), *_on_grid(report)]
+              *_on_spans(report), *_on_grid(report), *_on_keyframes(report)]
     return advice or ['nothing to do: the map reaches all thresholds that were checked']
 
 
@@ -164,9 +164,26 @@ def _on_grid(report: CheckReport) -> Iterator[str]:
                'more objects that can be seen from there')
 
 
+def _on_keyframes(report: CheckReport) -> Iterator[str]:
+    if report.keyframes is None:
+        return
+    areas = _areas(report.grid, report.keyframes.without)
+    for rows in areas[:_MOST_OF_A_KIND]:
+        places = report.grid.positions[rows]
+        low, high = places.min(axis=0), places.max(axis=0)
+        yield (f'no keyframe is within reach of {len(rows)} positions near the recording, x '
+               f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: drive there when '
+               'the layer is made again, or rely on the landmarks')
+    yield from _more(len(areas), 'areas that no keyframe reaches')
+
+
 def _dead_areas(grid: GridCheck) -> list[NDArray[np.int64]]:
     """Return the rows of neighbouring positions that accept no heading, the most first."""
-    dead = np.nonzero(grid.is_near & (grid.accepted == 0))[0]
+    return _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])
+
+
+def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return rows of a grid as areas of neighbours, the largest first."""
     if len(dead) == 0:
         return []
     cells = np.round((grid.positions[:, :2] - grid.positions[:, :2].min(axis=0))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.checking.advice import give_advice
@@ -22,6 +23,7 @@ from cliploc_ros.mapping.checking.detector_model import (
     measure_detector,
 )
 from cliploc_ros.mapping.checking.grid import Grid, make_grid
+from cliploc_ros.mapping.checking.keyframe_reach import check_keyframes
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
     check_landmarks,
@@ -65,8 +67,8 @@ _NO_RECORDING = (
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
               queries: Sequence[PosedObservation] = (), options: CheckOptions | None = None,
-              thresholds: Thresholds | None = None, progress: Progress | None = None
-              ) -> CheckReport:
+              thresholds: Thresholds | None = None, progress: Progress | None = None,
+              layer: KeyframeLayer | None = None) -> CheckReport:
     """Check a map.
 
     Parameters
@@ -81,6 +83,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         What the map has to reach.
     progress : callable, optional
         Called with the name of a stage and the share of it that is done, 0 to 1.
+    layer : KeyframeLayer, optional
+        The keyframes next to the map.
 
     Raises
     ------
@@ -115,7 +119,9 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         grid=grid, recording=recording,
         queries=tuple(try_observations(landmark_map, queries, options,
                                        lambda share: tell('relocalizing queries', share))),
-        notes=tuple(notes), map_ids=landmark_map.landmark_ids)
+        notes=tuple(notes), map_ids=landmark_map.landmark_ids,
+        keyframes=None if layer is None else check_keyframes(
+            layer, grid, None if detections is None else detections.map_from_camera))
     tell('done', 1.0)
     return replace(report, advice=tuple(give_advice(report)),
                    failures=tuple(find_failures(report, thresholds or Thresholds())))

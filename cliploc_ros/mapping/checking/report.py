@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.mapping.checking.cross_validation import BoxQuality
+from cliploc_ros.mapping.checking.keyframe_reach import KeyframeCheck
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck, Overlap
 from cliploc_ros.mapping.checking.look_alikes import LookAlike
 from cliploc_ros.mapping.checking.options import Thresholds
@@ -141,6 +142,8 @@ class CheckReport:
         What to do, the most urgent first.
     notes : tuple of str
         What the figures rest on.
+    keyframes : KeyframeCheck, optional
+        What the keyframes next to the map reach; None without any.
     """
 
     landmarks: tuple[LandmarkCheck, ...]
@@ -152,6 +155,7 @@ class CheckReport:
     failures: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    keyframes: KeyframeCheck | None = None
 
     @property
     def passed(self) -> bool:
@@ -181,7 +185,8 @@ class CheckReport:
             'look_alikes': [asdict(one) for one in self.look_alikes],
             'grid': _grid_dict(self.grid),
             'recording': None if self.recording is None else _recording_dict(self.recording),
-            'queries': [_trial_dict(one) for one in self.queries]}
+            'queries': [_trial_dict(one) for one in self.queries],
+            'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
 
     def _id(self, row: int) -> str:
         return self.map_ids[row]

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.similarities import CropSimilarities
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.ros.outputs.keyframe_panel import beside_keyframe
 
 _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
 _ACCEPTED, _REFUSED = (0, 158, 115), (213, 94, 0)
@@ -25,15 +27,18 @@ _CHAR_PX = 9
 
 @dataclass(frozen=True)
 class SeenImage:
-    """An image (h, w, 3) uint8, red first, and what was observed in it."""
+    """An image (h, w, 3) uint8, red first, what was observed in it, and the map's keyframes."""
 
     image_rgb: NDArray[np.uint8]
     observation: Observation
+    layer: KeyframeLayer | None = None
 
 
 def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: LandmarkMap,
                      verdict: str) -> NDArray[np.uint8]:
     """Return the image with every usable box and the outlines of matched landmarks.
+
+    Where keyframes had something to say, the best one is to the right of it.
 
     Parameters
     ----------
@@ -67,7 +72,9 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
     for line, text in enumerate(_lines(verdict, canvas.shape[1] // _CHAR_PX)):
         _write(canvas, text, np.array([6, 18 + 20 * line]),
                _ACCEPTED if found.accepted else _REFUSED)
-    return canvas
+    if seen.layer is None or found.recognized is None or not found.recognized.keyframes:
+        return canvas
+    return beside_keyframe(canvas, found.recognized, seen.layer)
 
 
 def _similarity(observation: Observation, detection: int, landmark: int) -> str:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from cliploc_ros.core.geometry.frustum import frusta
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.joined_map import parts_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
@@ -21,16 +23,21 @@ _TEXT_HEIGHT_M = 0.08
 _LINE_WIDTH_M = 0.01
 _ACCEPTED = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.9)
 _REFUSED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=0.9)
+_KEYFRAMES = ColorRGBA(r=0.0, g=0.59, b=0.53, a=0.9)
+_FRUSTUM_M = 0.12
 
 
-def landmark_markers(landmark_map: LandmarkMap) -> MarkerArray:
+def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = None) -> MarkerArray:
     """Return an ellipsoid and a text for each landmark, one colour for each class.
 
-    Several maps get markers in their own coordinate frames.
+    Several maps get markers in their own coordinate frames. The cameras of keyframes are in the
+    namespace `keyframes`.
     """
     markers = [Marker(header=Header(frame_id=landmark_map.frame_id), action=Marker.DELETEALL)]
     for part in parts_of(landmark_map):
         markers += _markers_of(part.landmark_map, part.first)
+    if layer is not None:
+        markers.append(_keyframe_marker(layer))
     return MarkerArray(markers=markers)
 
 
@@ -54,6 +61,18 @@ def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
         text.scale.z = _TEXT_HEIGHT_M
         markers += [ellipsoid, text]
     return markers
+
+
+def _keyframe_marker(layer: KeyframeLayer) -> Marker:
+    """Return the frusta of keyframes; of more than MAX_SHOWN, every n-th."""
+    poses = layer.map_from_camera[::-(-len(layer) // MAX_SHOWN)]
+    lines = Marker(header=Header(frame_id=layer.frame_id), ns='keyframes', type=Marker.LINE_LIST,
+                   color=_KEYFRAMES)
+    lines.pose.orientation.w = 1.0
+    lines.scale.x = _LINE_WIDTH_M
+    lines.points = [_point(end) for edge in frusta(layer.camera, poses, _FRUSTUM_M)
+                    for end in edge]
+    return lines
 
 
 def no_markers() -> MarkerArray:

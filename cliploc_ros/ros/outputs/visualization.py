@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
@@ -35,6 +36,7 @@ class Visualization:
         self._lock = threading.Lock()
         self._map: LandmarkMap | None = None
         self._shown: LandmarkMap | None = None
+        self._layer: KeyframeLayer | None = None
         self._hypotheses = node.create_publisher(PoseArray, '~/hypotheses', qos.POSE)
         self._matches = node.create_publisher(MarkerArray, '~/matches', qos.POSE)
         self._debug_image = node.create_publisher(Image, '~/debug_image', qos.POSE)
@@ -47,10 +49,11 @@ class Visualization:
         """Return whether the debug image has subscribers."""
         return bool(self._debug_image.get_subscription_count() > 0)
 
-    def set_map(self, landmark_map: LandmarkMap | None) -> None:
-        """Show another map from now on, or none."""
+    def set_map(self, landmark_map: LandmarkMap | None, layer: KeyframeLayer | None = None
+                ) -> None:
+        """Show another map with its keyframes from now on, or none."""
         with self._lock:
-            self._map = landmark_map
+            self._map, self._layer = landmark_map, layer
         self._show_map()
 
     def show(self, header: Header, landmark_map: LandmarkMap, found: Relocalization,
@@ -99,7 +102,7 @@ class Visualization:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return
             self._landmarks.publish(no_markers() if self._map is None
-                                    else landmark_markers(self._map))
+                                    else landmark_markers(self._map, self._layer))
             self._shown = self._map
 
 

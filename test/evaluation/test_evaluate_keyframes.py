@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``evaluate`` with a map that has keyframes: what each pose comes from."""
+
+import csv
+import json
+import shutil
+import signal
+
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.evaluate import main
+from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.evaluation.paper_table import notes, table_rows
+from cliploc_ros.evaluation.summary import summarize
+from cliploc_ros.evaluation.trials import Result
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+            '--clip-pretrained', ASSETS / 'clip.safetensors')
+QUICK = ('--trials', 1, '--sweep', '--no-figures', '--workers', 1)
+
+
+@pytest.fixture(scope='module')
+def walk(tmp_path_factory):
+    """A folder with the demo's wake-ups, its map, and keyframes of its mapping walk."""
+    folder = tmp_path_factory.mktemp('walk')
+    shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
+    shutil.copy(ASSETS / 'map.yaml', folder)
+    images = tum_frames(read_tum(ASSETS / 'mapping'), find_camera(None, ASSETS / 'mapping')[0])
+    save_layer(layer_path(folder / 'map.yaml'), build_layer(
+        images, LandmarkMap.from_file(folder / 'map.yaml'), LayerOptions(0.0, 0.0, 300)))
+    (folder / 'objects.yaml').write_text('objects: {keyframes: false}\n')
+    return folder
+
+
+@pytest.fixture
+def evaluate(capsys):
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments):
+        code = main([*map(str, arguments)])
+        return (code, *capsys.readouterr())
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+def of_images(folder, *arguments):
+    return ('--tum', folder / 'sequence', '--every', 24, '--map', folder / 'map.yaml', *NETWORKS,
+            *QUICK, *arguments)
+
+
+def results_of(folder, method):
+    return [row for row in json.loads((folder / 'results.json').read_text())
+            if row['method'] == method]
+
+
+def test_the_source_of_each_pose_is_in_table_and_files(walk, evaluate, tmp_path):
+    code, out, err = evaluate(*of_images(
+        walk, '--methods', 'auto', walk / 'objects.yaml', '--out', tmp_path))
+    assert code == 0, err
+    both, objects = (results_of(tmp_path, name) for name in ('auto', 'objects'))
+    assert len(both) == len(objects) == 2
+    for row in both:
+        assert row['keyframe_inliers'] >= 8 and row['keyframes_ms'] > 0.0
+        assert row['source'] in ('keyframes', 'both')
+    assert [row['source'] for row in objects] == ['objects'] * 2
+    assert [row['keyframe_inliers'] for row in objects] == [0, 0]
+    assert min(row['error_m'] for row in both) < 0.03
+    counts = ' / '.join(str(sum(row['source'] == name for row in both))
+                        for name in ('objects', 'keyframes', 'both'))
+    for text in (out, (tmp_path / 'table.md').read_text()):
+        assert 'pose by objects / keyframes / both' in text
+        assert counts in text
+    with (tmp_path / 'summary.csv').open() as file:
+        figures = {row['method']: row for row in csv.DictReader(file)}
+    assert sum(float(figures['auto'][f'from_{name}'])
+               for name in ('objects', 'keyframes', 'both')) == pytest.approx(1.0)
+    assert float(figures['auto']['keyframe_inliers']) == np.median(
+        [row['keyframe_inliers'] for row in both])
+    assert figures['objects']['from_both'] == ''
+    code, out, err = evaluate(*of_images(
+        walk, '--methods', 'auto', '--no-keyframes', '--out', tmp_path / 'without'))
+    assert code == 0, err
+    assert 'keyframes' not in out.replace('--no-keyframes', '')
+    for row, other in zip(results_of(tmp_path / 'without', 'auto'), objects, strict=True):
+        assert row['map_from_camera'] == other['map_from_camera']
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--methods', 'class_bf'), 'none of the methods uses them'),
+    (('--methods', 'auto'), '--queries has no images')])
+def test_keyframes_that_cannot_be_used_are_refused(walk, evaluate, files, tmp_path, arguments,
+                                                   named):
+    given = ('--queries', files / 'queries.npz', '--map', walk / 'map.yaml', '--out', tmp_path)
+    code, _, err = evaluate(*given, *arguments, '--keyframes')
+    assert code == 1
+    assert named in err
+
+
+def test_a_missing_or_bad_layer_is_refused_only_where_it_is_asked_for(
+        walk, evaluate, files, tmp_path):
+    path = tmp_path / 'map.yaml'
+    shutil.copy(walk / 'map.yaml', path)
+    code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
+    assert code == 1
+    assert 'map.keyframes.npz: no such file' in err
+    layer_path(path).write_bytes(b'no layer')
+    code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
+    assert code == 1
+    assert 'is no complete layer' in err
+    # without being asked for, the layer is left out, and the next problem is named
+    code, out, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--out', tmp_path / 'out'))
+    assert code == 1
+    assert 'without keyframes' in out and 'sequence' in err
+
+
+def test_without_keyframes_the_table_is_as_it_was():
+    plain = {'method': 'auto', 'trial': 0, 'timestamp': 1.5, 'boxes': 4, 'solved': True,
+             'accepted': True, 'map_from_camera': np.eye(4).tolist(), 'error_m': 0.5,
+             'error_deg': 2.0, 'score': 3.0, 'confidence': 0.5, 'nees': 3.0, 'inliers': 4,
+             'hypotheses': 9, 'best_iteration': 2, 'coverage': 1.0, 'reason': '',
+             'search_ms': 1.0, 'source': 'objects'}
+    summaries = summarize([Result(query=number, **plain) for number in range(3)])
+    assert len(table_rows(summaries)[0]) == 8
+    assert not any('eyframes' in line for line in notes(summaries))
+    mixed = summarize([Result(query=number, **plain | {'source': source}, keyframe_inliers=count,
+                              keyframes_ms=9.0)
+                       for number, (source, count) in enumerate(
+                           [('objects', 0), ('both', 31), ('both', 40)])])
+    assert table_rows(mixed)[1][8:] == ('1 / 0 / 2', '31', '9.0')

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the keyframes next to a map reach: in the check's report, its page and its advice."""
+
+import json
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.cli.check_map import main
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.mapping.checking.advice import give_advice
+from cliploc_ros.mapping.checking.checking import check_map
+from cliploc_ros.mapping.checking.keyframe_reach import check_keyframes, in_reach
+from cliploc_ros.mapping.checking.options import CheckOptions
+
+ROOM = make_room()
+#: The camera looks along x, z is up.
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def layer_at(*poses):
+    count = len(poses)
+    return KeyframeLayer(
+        ROOM.frame_id, ROOM.landmark_ids, ROOM.centers.astype(np.float32), CAMERA, np.array(poses),
+        np.arange(count + 1) * 5, np.zeros((5 * count, 2), np.uint16),
+        np.ones((5 * count, 3), np.float32), np.ones((5 * count, 128), np.uint8),
+        np.zeros(5 * count, np.uint16), np.ones((1, 128), np.uint8))
+
+
+def view(x=0.0, degrees=0.0):
+    turn = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return make_transform(turn @ LEVEL, np.array([x, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize(('x', 'degrees', 'reached'), [
+    (0.0, 0.0, True), (1.9, 0.0, True), (2.1, 0.0, False), (0.0, 39.0, True), (0.0, -41.0, False),
+    (0.9, 20.0, True), (1.1, 20.0, False), (0.0, 180.0, False)])
+def test_reach_is_near_and_in_the_same_direction(x, degrees, reached):
+    here = view(x, degrees)
+    assert in_reach(layer_at(view()), here[None, :3, 3], here[None, :3, 2]) == [reached]
+
+
+@pytest.fixture(scope='module')
+def report():
+    return check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
+
+
+def test_places_without_a_keyframe_are_counted_and_named(report):
+    grid = report.grid
+    everywhere = layer_at(*(make_transform(
+        Rotation.from_euler('z', angle, degrees=True).as_matrix() @ LEVEL, place)
+        for place in grid.positions for angle in range(0, 360, 30)))
+    full = check_keyframes(everywhere, grid, np.array([view(), view(50.0)]))
+    assert full.reached_positions == 1.0 and not len(full.without)
+    assert (full.headings == grid.headings).all()
+    nowhere = check_keyframes(layer_at(view(500.0)), grid, np.array([view(), view(500.0)]))
+    assert nowhere.reached_positions == 0.0
+    assert nowhere.recorded.tolist() == [False, True]
+    assert len(nowhere.without) == len(grid.positions)
+    assert len(nowhere.as_dict()['positions_without']) == len(grid.positions)
+    assert nowhere.as_dict()['recorded_frames_in_reach'] == 0.5
+    text = 'no keyframe is within reach of'
+    assert any(text in line for line in give_advice(replace(report, keyframes=nowhere)))
+    assert not any(text in line for line in give_advice(replace(report, keyframes=full)))
+
+
+def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, capsys):
+    write_map(tmp_path / 'room.yaml', ROOM)
+    given = [str(tmp_path / 'room.yaml'), '--positions', '4', '--headings', '2',
+             '--min-positions', '0', '--out', str(tmp_path / 'out')]
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert main([*given, '--keyframes']) == 1
+        assert 'room.keyframes.npz: no such file' in capsys.readouterr().err
+        assert main(given) == 0
+        assert 'keyframes: ' not in capsys.readouterr().out
+        assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes'] is None
+        save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(view(), view(1.0)))
+        assert main(given) == 0
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    out = capsys.readouterr().out
+    assert 'keyframes: 2 with 10 points' in out
+    assert 'grid positions within reach of a keyframe: ' in out
+    assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes']['points'] == 10
+    assert '2 with 10 points' in (tmp_path / 'out/check.html').read_text()

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images of keyframes: stored only where they are asked for, small, and undistorted."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.layer import PIXEL_SCALE
+from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.datasets.depth import DepthImage
+from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.frames import Frame, Frames, RawFrame
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.errors import MapError
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+WITH_IMAGES = LayerOptions(most_points=200, images=True)
+
+
+@pytest.fixture(scope='module')
+def demo_map():
+    return LandmarkMap.from_file(ASSETS / 'map.yaml')
+
+
+@pytest.fixture(scope='module')
+def frame():
+    walk = tum_frames(read_tum(ASSETS / 'mapping'), find_camera(None, ASSETS / 'mapping')[0])
+    return next(iter(walk.read()))
+
+
+def wall(frame):
+    """Return the frame as a recording, its image on a wall 2 m away."""
+    depth = DepthImage(np.full(frame.image_rgb.shape[:2], 2.0, np.float32), None)
+    seen = replace(frame, depth=depth)
+
+    def read_raw(is_wanted):
+        if is_wanted(0, seen.stamp_ns, seen.map_from_camera):
+            yield RawFrame(0, seen.stamp_ns, seen.map_from_camera,
+                           lambda: (seen.image_rgb, seen.camera), lambda: depth)
+    return Frames(ASSETS, 1, read_raw)
+
+
+def test_no_image_is_stored_unless_asked_for(frame, demo_map, tmp_path):
+    path = tmp_path / 'map.keyframes.npz'
+    save_layer(path, build_layer(wall(frame), demo_map, LayerOptions(most_points=200)))
+    assert load_layer_of_map(path, demo_map).image_rgb(0) is None
+    with np.load(path) as content:
+        assert not [name for name in content.files if 'image' in name]
+
+
+def test_a_stored_image_is_small_and_shows_the_place(frame, demo_map, tmp_path):
+    path = tmp_path / 'map.keyframes.npz'
+    layer = build_layer(wall(frame), demo_map, WITH_IMAGES)
+    save_layer(path, layer)
+    image = load_layer_of_map(path, demo_map).image_rgb(0)
+    assert max(image.shape[:2]) == 256
+    assert layer.images.size < 15_000
+    expected = cv2.resize(frame.image_rgb, image.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(image.astype(float) - expected).mean() < 8.0
+
+
+def test_a_stored_image_is_undistorted_as_its_points_are(frame, demo_map):
+    camera = frame.camera
+    bent = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+                  'plumb_bob', (-0.25, 0.05, 0.0, 0.0, 0.0))
+    marked = frame.image_rgb // 2
+    at = np.array([camera.width // 6, camera.height // 6])
+    cv2.circle(marked, at.tolist(), 12, (255, 255, 255), cv2.FILLED)
+    layer = build_layer(wall(Frame(1, marked, bent, np.eye(4))), demo_map, WITH_IMAGES)
+    image = layer.image_rgb(0)
+    scale = camera.width / image.shape[1]
+    spot = (np.argwhere(image.mean(axis=2) > 215)[:, ::-1].mean(axis=0) + 0.5) * scale - 0.5
+    straight = bent.normalize_points(at[None])[0] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    assert np.linalg.norm(straight - at) > 8.0
+    assert np.abs(spot - straight).max() < 3.0
+    assert (np.asarray(layer.pixels) / PIXEL_SCALE).max() < 2 * camera.width
+
+
+def test_offsets_that_do_not_count_the_bytes_are_named(frame, demo_map, tmp_path):
+    layer = build_layer(wall(frame), demo_map, WITH_IMAGES)
+    path = tmp_path / 'map.keyframes.npz'
+    save_layer(path, replace(layer, image_offsets=layer.image_offsets + 1))
+    with pytest.raises(MapError, match='image_offsets does not count the bytes'):
+        load_layer_of_map(path, demo_map)
+    noise = replace(layer, images=np.zeros_like(layer.images))
+    assert noise.image_rgb(0) is None, 'a broken image is none'
