@@ -26,6 +26,7 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
+OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
 MODULES = re.compile(r'(cliploc_ros|demo_world)\.')
 
 
@@ -123,11 +124,12 @@ def check_ros2(words: tuple[str, ...]) -> None:
         assert rest[0] == 'call'
         assert rest[1] in names_of_interface()
     elif verb == 'param':
-        _, node, name, value = rest
+        action, node, name, *value = rest
         row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]
-        assert row.validated(yaml.safe_load(value)) is not None
+        assert len(value) == {'get': 0, 'set': 1}[action]
+        assert not value or row.validated(yaml.safe_load(value[0])) is not None
     else:
-        assert verb in OF_ROS or (verb == 'run' and rest[0] == 'tf2_ros'), verb
+        assert verb in OF_ROS or (verb == 'run' and rest[0] in OTHER_PACKAGES), verb
 
 
 def check_script(script: str, *arguments: str) -> None:
