@@ -190,7 +190,7 @@ def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     process = subprocess.Popen(command(*arguments, '--out', broken), cwd=PROJECT,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     journal = broken / 'unfinished.jsonl'
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + TIMEOUT_S
     while not (journal.exists() and len(journal.read_text().splitlines()) > 2):
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < deadline
