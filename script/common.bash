@@ -8,6 +8,9 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 logs=$root/build/setup
 
+# Some containers set it. Hundreds of processes would then compile what they import, each anew.
+unset PYTHONDONTWRITEBYTECODE
+
 say() { printf '==> %s\n' "$*"; }
 die() { printf '%s: %s\n' "script/$(basename "$0")" "$*" >&2; exit 1; }
 

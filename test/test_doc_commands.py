@@ -124,10 +124,10 @@ def check_ros2(words: tuple[str, ...]) -> None:
         assert rest[0] == 'call'
         assert rest[1] in names_of_interface()
     elif verb == 'param':
-        _, node, name, *values = rest  # get has none
+        action, node, name, *value = rest
         row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]
-        for value in values:
-            assert row.validated(yaml.safe_load(value)) is not None
+        assert len(value) == {'get': 0, 'set': 1}[action]
+        assert not value or row.validated(yaml.safe_load(value[0])) is not None
     else:
         assert verb in OF_ROS or (verb == 'run' and rest[0] in OTHER_PACKAGES), verb
 

@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 PROJECT = Path(__file__).resolve().parents[1]
 ROOT = 'cliploc_ros'
 MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffix('.__init__'):
@@ -91,19 +89,28 @@ def test_importing_the_package_imports_no_library():
     assert done.stdout.strip() == '[]'
 
 
-@pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PROJECT)))
-def test_modules_and_functions_are_short(path):
-    source = path.read_text()
-    assert len(source.splitlines()) <= MAX_MODULE_LINES
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            length = node.end_lineno - node.lineno + 1
-            assert length <= MAX_FUNCTION_LINES, f'{node.name} has {length} lines'
+def functions_of(source: str) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    return [node for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
 
 
-@pytest.mark.parametrize('path', MODULES.values(), ids=lambda path: str(path.relative_to(PROJECT)))
-def test_functions_have_few_parameters(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+def test_modules_and_functions_are_short():
+    long = []
+    for path in SOURCES:
+        source = path.read_text()
+        where = path.relative_to(PROJECT)
+        if (count := len(source.splitlines())) > MAX_MODULE_LINES:
+            long.append(f'{where} has {count} lines')
+        long += [f'{where}: {node.name} has {length} lines' for node in functions_of(source)
+                 if (length := node.end_lineno - node.lineno + 1) > MAX_FUNCTION_LINES]
+    assert not long, '\n' + '\n'.join(long)
+
+
+def test_functions_have_few_parameters():
+    many = []
+    for name, path in MODULES.items():
+        for node in functions_of(path.read_text()):
             count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
-            assert count <= MAX_PARAMETERS, f'{node.name} has {count} parameters'
+            if count > MAX_PARAMETERS:
+                many.append(f'{name}: {node.name} has {count} parameters')
+    assert not many, '\n' + '\n'.join(many)

@@ -69,8 +69,9 @@ def link_libraries(packages, site):
 
 
 def pip(*arguments):
+    """Run it without PYTHONPATH, where it would find the package of this workspace installed."""
     subprocess.run([sys.executable, '-m', 'pip', '--quiet', '--disable-pip-version-check',
-                    *map(str, arguments)], check=True, timeout=300)
+                    *map(str, arguments)], check=True, timeout=300, env=environment())
 
 
 def environment():

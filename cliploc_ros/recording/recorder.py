@@ -95,7 +95,8 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     return json.dumps({
         'source': [frames.source.name, _state(frames.source.resolve()), frames.count],
         'yolo': _settings(options.yolo), 'clip': None if clip is None else _settings(clip),
-        'files': [_state(Path(file)) for file in files],
+        # the path of '' would be the working folder, which changes with every file written there
+        'files': [_state(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
 
 

@@ -128,7 +128,7 @@ def children(pid):
 @pytest.mark.parametrize(('number', 'expected'), [
     (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
 def test_no_process_outlives_it(executables, tmp_path, number, expected):
-    process = start(executables, '--out', tmp_path, '--rate', '0.5')
+    process = start(executables, '--out', tmp_path, '--rate', '0.5', '--method', 'class_ransac')
     for line in process.stdout:
         if line.startswith('both are ready'):
             break

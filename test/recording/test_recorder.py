@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,11 @@ from clusters import killing_a_worker, local_cluster
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import load_recorded
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.recording.recorder import RecordingOptions, observation_file
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -73,6 +78,18 @@ def assert_equal(one, other):
     np.testing.assert_allclose(one.detections.embeddings.astype(float),
                                other.detections.embeddings.astype(float), atol=1e-3)
     assert (one.stamps_ns == other.stamps_ns).all()
+
+
+def test_the_working_folder_says_nothing_of_a_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = ASSETS / 'sequence'
+    frames = Frames(source, 48, lambda wanted: iter(()))
+    options = RecordingOptions(YoloOptions(), ClipOptions())
+    before = observation_file(frames, options)
+    (tmp_path / 'map.yaml').touch()
+    os.utime(tmp_path, (1.0, 1.0))
+    assert observation_file(frames, options) == before
+    assert observation_file(replace(frames, count=47), options) != before
 
 
 def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
