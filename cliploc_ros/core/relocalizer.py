@@ -159,7 +159,8 @@ class Relocalizer:
                                   f'{frames[-1].sample_size} distinct correspondence candidates; '
                                   'turn the camera to more objects')
         rig = make_rig([one.scene for one in frames], cameras,
-                       np.stack([one.vertical for one in frames]), self._map.position_sigmas)
+                       np.stack([one.vertical for one in frames]), self._map.position_sigmas,
+                       self._map.shared_sigmas)
         finalists, is_upright = self._finalists(frames, rig, budget.refinement_end)
         if not finalists:
             return _nothing_found(frames, budget, 'no pose explains the detections; turn the '

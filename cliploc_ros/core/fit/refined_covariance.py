@@ -9,6 +9,8 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
   errors of one edge are the same in all frames;
 * the position of a landmark, the same in all frames that see it. A landmark that is displaced acts
   like cameras that are displaced the other way;
+* the position of the map near the camera, the same for all landmarks: as if all cameras were
+  displaced and turned together about the last one;
 * the vertical, the same in all frames: one sensor on one mount;
 * odometry, a random walk: the error of a step displaces all frames beyond it.
 
@@ -78,6 +80,8 @@ class _Fit(NamedTuple):
         Of each match.
     sigmas : ndarray (n,)
         Of the objects' positions [m].
+    shared : ndarray (n, 2)
+        By how much each is displaced and turned with its neighbours [m] [rad].
     verticals : ndarray (F, 6, 6)
         Information of each frame's vertical.
     cameras : ndarray (F, 4, 4)
@@ -91,6 +95,7 @@ class _Fit(NamedTuple):
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
     sigmas: NDArray[np.float64]
+    shared: NDArray[np.float64]
     verticals: NDArray[np.float64]
     cameras: NDArray[np.float64]
 
@@ -115,8 +120,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Time of each frame, in which odometry joins them.
     """
     found = verify_rig(rig, rotation, translation)
-    fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
-                     translation)
+    fit = _linearize(one_to_one(rig, found, rotation, translation), rig, rotation, translation)
     of_matches, prior = fit.information, np.diag(1.0 / np.array(PRIOR_VARIANCES))
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
@@ -127,9 +131,10 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
              + _odometry_noise(fit.cameras, of_frames, stamps_ns))
     matched = _sandwich(information, noise)
+    shared = _sandwich(information, _shared_noise(fit, of_objects))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return PoseCovariance(matched, matched + _WRONG_SHARE * _change_without_each(
+    return PoseCovariance(matched + shared, matched + shared + _WRONG_SHARE * _change_without_each(
         information - of_objects, noise - noise_of_objects, gradients, matched))
 
 
@@ -161,7 +166,7 @@ def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[np.float64],
+def _linearize(inliers: Inliers, rig: Rig, rotation: NDArray[np.float64],
                translation: NDArray[np.float64]) -> _Fit:
     count, frames = len(inliers.pairs), len(inliers.cameras)
     jacobian, residuals = np.empty((count, 4, 6)), np.empty((count, 4))
@@ -187,8 +192,8 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
     pairs = inliers.pairs
     edges = RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION
     return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2), edges / pairs[:, 13], objects,
-                np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], verticals,
-                cameras)
+                np.repeat(np.arange(frames), np.diff(inliers.starts)), rig.sigmas[numbers],
+                rig.shared[numbers], verticals, cameras)
 
 
 def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -229,6 +234,12 @@ def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.fl
     """Return what the errors of the landmarks' positions add to M, for each object (n, 6, 6)."""
     pulls = fit.sigmas[:, None, None] * of_objects[:, :, :3]
     return np.asarray(pulls @ pulls.transpose(0, 2, 1))
+
+
+def _shared_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what the errors that the landmarks have in common add to M (6, 6)."""
+    pulls = (of_objects * np.repeat(fit.shared, 3, axis=1)[:, None, :]).sum(axis=0)
+    return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
