@@ -159,8 +159,7 @@ class Relocalizer:
                                   f'{frames[-1].sample_size} distinct correspondence candidates; '
                                   'turn the camera to more objects')
         rig = make_rig([one.scene for one in frames], cameras,
-                       np.stack([one.vertical for one in frames]), self._map.position_sigmas,
-                       self._map.shared_sigmas)
+                       np.stack([one.vertical for one in frames]), self._map.position_sigmas)
         finalists, is_upright = self._finalists(frames, rig, budget.refinement_end)
         if not finalists:
             return _nothing_found(frames, budget, 'no pose explains the detections; turn the '
@@ -169,7 +168,7 @@ class Relocalizer:
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
         likely = confidences(compared.supports, poses, self._setting(rig),
                              handicaps=compared.handicaps)
-        covariance = covariance_of(frames, rig, best, matches)
+        covariance = covariance_of(frames, rig, best, matches, self._map.shared_sigmas)
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
         distinct, twin = self._distinct(frames, rig, cameras, compared)

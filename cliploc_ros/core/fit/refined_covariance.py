@@ -80,8 +80,8 @@ class _Fit(NamedTuple):
         Of each match.
     sigmas : ndarray (n,)
         Of the objects' positions [m].
-    shared : ndarray (n, 2)
-        By how much each is displaced and turned with its neighbours [m] [rad].
+    numbers : ndarray (n,) of int
+        The objects' landmarks.
     verticals : ndarray (F, 6, 6)
         Information of each frame's vertical.
     cameras : ndarray (F, 4, 4)
@@ -95,7 +95,7 @@ class _Fit(NamedTuple):
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
     sigmas: NDArray[np.float64]
-    shared: NDArray[np.float64]
+    numbers: NDArray[np.int64]
     verticals: NDArray[np.float64]
     cameras: NDArray[np.float64]
 
@@ -107,7 +107,8 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       stamps_ns: NDArray[np.int64]) -> PoseCovariance:
+                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None
+                       ) -> PoseCovariance:
     """Return the covariance of a pose that was refined on its inliers.
 
     Parameters
@@ -118,9 +119,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Of camera_from_map, with information, see refine_rig.
     stamps_ns : ndarray (F,)
         Time of each frame, in which odometry joins them.
+    shared : ndarray (L, 2), optional
+        By how much each landmark and its neighbours are displaced and turned together [m] [rad].
     """
     found = verify_rig(rig, rotation, translation)
-    fit = _linearize(one_to_one(rig, found, rotation, translation), rig, rotation, translation)
+    fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
+                     translation)
     of_matches, prior = fit.information, np.diag(1.0 / np.array(PRIOR_VARIANCES))
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
@@ -131,11 +135,13 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
              + _odometry_noise(fit.cameras, of_frames, stamps_ns))
     matched = _sandwich(information, noise)
-    shared = _sandwich(information, _shared_noise(fit, of_objects))
+    of_map = 0.0 if shared is None else _sandwich(
+        information, _shared_noise(of_objects, shared[fit.numbers]))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return PoseCovariance(matched + shared, matched + shared + _WRONG_SHARE * _change_without_each(
-        information - of_objects, noise - noise_of_objects, gradients, matched))
+    return PoseCovariance(
+        matched + of_map, matched + of_map + _WRONG_SHARE * _change_without_each(
+            information - of_objects, noise - noise_of_objects, gradients, matched))
 
 
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
@@ -166,7 +172,7 @@ def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _linearize(inliers: Inliers, rig: Rig, rotation: NDArray[np.float64],
+def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[np.float64],
                translation: NDArray[np.float64]) -> _Fit:
     count, frames = len(inliers.pairs), len(inliers.cameras)
     jacobian, residuals = np.empty((count, 4, 6)), np.empty((count, 4))
@@ -192,8 +198,8 @@ def _linearize(inliers: Inliers, rig: Rig, rotation: NDArray[np.float64],
     pairs = inliers.pairs
     edges = RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION
     return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2), edges / pairs[:, 13], objects,
-                np.repeat(np.arange(frames), np.diff(inliers.starts)), rig.sigmas[numbers],
-                rig.shared[numbers], verticals, cameras)
+                np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], numbers,
+                verticals, cameras)
 
 
 def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -236,9 +242,18 @@ def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.fl
     return np.asarray(pulls @ pulls.transpose(0, 2, 1))
 
 
-def _shared_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what the errors that the landmarks have in common add to M (6, 6)."""
-    pulls = (of_objects * np.repeat(fit.shared, 3, axis=1)[:, None, :]).sum(axis=0)
+def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
+                  ) -> NDArray[np.float64]:
+    """Return what the errors that n objects have in common add to M (6, 6).
+
+    Parameters
+    ----------
+    of_objects : ndarray (n, 6, 6)
+        What each object tells.
+    shared : ndarray (n, 2)
+        See refined_covariance.
+    """
+    pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
     return np.asarray(pulls @ pulls.T)
 
 

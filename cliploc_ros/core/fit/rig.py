@@ -52,8 +52,6 @@ class Rig(NamedTuple):
         See VERTICAL_UNKNOWN.
     sigmas : ndarray (L,)
         Standard deviation of each landmark's centre on each axis [m].
-    shared : ndarray (L, 2)
-        By how much it and its neighbours are displaced and turned together [m] [rad].
     """
 
     scene: Scene
@@ -61,12 +59,10 @@ class Rig(NamedTuple):
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
     sigmas: NDArray[np.float64]
-    shared: NDArray[np.float64]
 
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
-             verticals: NDArray[np.float64], sigmas: NDArray[np.float64],
-             shared: NDArray[np.float64] | None = None) -> Rig:
+             verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
     """Return the rig of some frames.
 
     Parameters
@@ -77,7 +73,6 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     verticals : ndarray (F, 7)
         See VERTICAL_UNKNOWN.
     sigmas : ndarray (L,)
-    shared : ndarray (L, 2), optional
         See Rig.
     """
     first = scenes[0]
@@ -91,8 +86,7 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
     starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
     return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
-               np.ascontiguousarray(verticals), sigmas,
-               np.zeros((len(sigmas), 2)) if shared is None else shared)
+               np.ascontiguousarray(verticals), sigmas)
 
 
 def _sizes(scene: Scene) -> list[int]:
