@@ -74,8 +74,8 @@ def parse_written_map(text: str) -> WrittenMap | None:
     head = _HEAD.match(text)
     if head is None:
         return None
-    rows, scan, end = [], _LANDMARK.scanner(text, head.end()), head.end()
-    while (found := scan.match()) is not None:
+    rows, end = [], head.end()
+    while (found := _LANDMARK.match(text, end)) is not None:
         rows.append(found.groups())
         end = found.end()
     if end != len(text) or not rows:
@@ -85,9 +85,11 @@ def parse_written_map(text: str) -> WrittenMap | None:
     details = _details(columns[_PLAIN:], len(rows))
     if len(set(ids)) < len(ids) or details is None:
         return None
-    return WrittenMap(json.loads(head[1]), ids, labels, class_ids,
-                      *(np.array(_values(columns[place]), dtype=np.float64).reshape(len(rows), -1)
-                        for place in range(3, _PLAIN)), details)
+    centers, semi_axes, quats_xyzw = (
+        np.array(_values(column), dtype=np.float64).reshape(len(rows), -1)
+        for column in columns[3:_PLAIN])
+    return WrittenMap(json.loads(head[1]), ids, labels, class_ids, centers, semi_axes, quats_xyzw,
+                      details)
 
 
 def _values(texts: Iterable[str]) -> list[Any]:
