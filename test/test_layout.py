@@ -23,7 +23,7 @@ LAYERS = (
     ('core.kernel_cache',),
     ('core.compiled', 'core.landmark_details', 'core.landmark_embeddings', 'core.parameter_file',
      'core.time_budget'),
-    ('core.geometry',),
+    ('core.geometry', 'core.written_map'),
     ('core.index',),
     ('core.observation', 'core.landmark_map', 'core.options'),
     ('core.joined_map',),
