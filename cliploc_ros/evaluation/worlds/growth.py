@@ -202,7 +202,8 @@ def _of_worlds(options: argparse.Namespace) -> list[list[Answer]]:
 
 
 def _of_recordings(options: argparse.Namespace) -> list[list[Answer]]:
-    landmark_map, groups = LandmarkMap.from_file(options.map), []
+    landmark_map = LandmarkMap.from_file(options.map)
+    groups: list[list[Answer]] = []
     for path in options.queries:
         recorded = load_queries(path, landmark_map.landmark_ids)
         groups += answers_of(landmark_map, make_queries(recorded, landmark_map, True),
