@@ -137,7 +137,7 @@ class Relocalizer:
         joined = JoinedFrames(self._map, self._options, frames, rig, cameras)
         compared = compare(joined, finalists, is_upright)
         best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
-        covariance = covariance_of(frames, rig, best, matches)
+        covariance = covariance_of(frames, rig, best, matches, self._map.shared_sigmas)
         nearby = np.zeros((6, 6)) if best.information is None else spread(
             poses, utilities(compared.supports) - compared.handicaps)
         evidence = evidence_of(joined, compared, covariance.matched, looks)

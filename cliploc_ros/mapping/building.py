@@ -33,13 +33,13 @@ from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pos
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
 from cliploc_ros.mapping.selection import reasons_against
+from cliploc_ros.mapping.shared_errors import left_by_poses, shared_by_neighbours
 from cliploc_ros.mapping.triangulation import SUPPORT_IOU, triangulate
 from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_out
 
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
-# Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
-_POSE_ERROR_S = 3.0
+
 
 class NothingFoundError(MappingError):
     """The boxes show no landmark that is good enough for a map."""
@@ -102,12 +102,13 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         mount, draft = _with_mount(given, draft, options, rng, tell)
         given, notes = mount.views, notes + mount.lines()
         odometry = None if odometry is None else odometry @ mount.given_from_corrected
-    views, draft, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
+    views, draft, errors, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
     notes += pose_notes
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
         raise NothingFoundError(_nothing_found(draft))
-    return replace(_finish(detections, given, views, draft, options, notes), mount=mount)
+    return replace(_finish(detections, given, views, draft, errors, options, notes),
+                   mount=mount)
 
 
 def _with_depths(detections: PosedDetections, views: Views, options: MappingOptions,
@@ -136,10 +137,11 @@ def _with_mount(given: Views, draft: '_Draft', options: MappingOptions,
 
 def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: '_Draft',
                 options: MappingOptions, rng: np.random.Generator, tell: Progress
-                ) -> tuple[Views, '_Draft', list[str]]:
-    """Return the views with refined poses, the landmarks that fit them, and notes.
+                ) -> tuple[Views, '_Draft', PoseErrors | None, list[str]]:
+    """Return the views with refined poses, the landmarks that fit them, errors, and notes.
 
-    Poses are refined where their errors are given, or estimated and significant.
+    Poses are refined where their errors are given, or estimated and significant. None: they are
+    taken as exact.
     """
     views, errors, notes = given, options.pose_errors, list[str]()
     is_estimated = errors is None and options.estimate_pose_errors
@@ -147,7 +149,7 @@ def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: '_Dra
         tell('estimating pose errors', 0.0)
         errors = significant_pose_errors(given, draft.landmarks, draft.shown)
     if errors is None:
-        return views, draft, [] if odometry is None else [
+        return views, draft, None, [] if odometry is None else [
             'odometry is not used: the poses are taken as they are']
     steps, link_notes = _links(given, odometry, errors, options)
     for number in range(options.rebuilds):
@@ -163,7 +165,7 @@ def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: '_Dra
                      f'{errors.sigma_deg:.1f} degrees on each axis for {errors.correlation_s:.1f} '
                      's, estimated from the boxes; refined')
     views, draft = _refine(given, views, draft, errors, steps, options)
-    return views, draft, notes + link_notes
+    return views, draft, errors, notes + link_notes
 
 
 def _links(given: Views, odometry: NDArray[np.float64] | None, errors: PoseErrors,
@@ -276,7 +278,7 @@ def _nothing_found(draft: _Draft) -> str:
 
 
 def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
-            options: MappingOptions, notes: list[str]) -> BuiltMap:
+            errors: PoseErrors | None, options: MappingOptions, notes: list[str]) -> BuiltMap:
     landmarks, shown = merge_classes(views, draft.landmarks, draft.shown, options)
     evidence = gather_evidence(views, landmarks, shown)
     explained, median_iou = explained_boxes(views, landmarks, shown)
@@ -291,39 +293,16 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
                                    draft.reasons),
         notes=tuple(notes))
     evidence = evidence._replace(position_sigma=np.hypot(
-        evidence.position_sigma, _left_by_poses(views, changes, shown, len(landmarks.centers))))
-    return BuiltMap(_make_map(detections, landmarks, shown, evidence, options), report, shown,
-                    map_from_cameras(views))
-
-
-def _left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.int64],
-                   count: int) -> NDArray[np.float64]:
-    """Return by how much errors of the poses displace each landmark on each axis (count,) [m].
-
-    Refinement makes poses and landmarks agree. What a landmark's frames have in common stays: the
-    mean of as many independent errors as there are spans of time in which it was seen.
-
-    Parameters
-    ----------
-    views : Views
-    changes : ndarray (F, 6)
-        Squares of what refinement changed; 0 where the poses were taken as they are.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    count : int
-        Number of landmarks.
-    """
-    squares = np.zeros(count)
-    for row, boxes in enumerate(group_boxes(shown, count)):
-        frames = np.unique(views.frames[boxes])
-        spans = len(np.unique(views.stamps_s[frames] // _POSE_ERROR_S))
-        if spans:
-            squares[row] = changes[frames, :3].mean() / spans
-    return np.sqrt(squares)
+        evidence.position_sigma, left_by_poses(views, changes, shown, len(landmarks.centers))))
+    shared = None if errors is None else shared_by_neighbours(views, shown,
+                                                              len(landmarks.centers), errors)
+    return BuiltMap(_make_map(detections, landmarks, shown, evidence, shared, options), report,
+                    shown, map_from_cameras(views))
 
 
 def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[np.int64],
-              evidence: Evidence, options: MappingOptions) -> LandmarkMap:
+              evidence: Evidence, shared: NDArray[np.float64] | None,
+              options: MappingOptions) -> LandmarkMap:
     """Return landmarks as a map; labels are the class names."""
     names = tuple(detections.class_names[number] for number in landmarks.classes)
     semi_axes = np.linalg.norm(landmarks.bases, axis=1)
@@ -334,6 +313,8 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
         LandmarkDetails(
             class_weights=_class_weights(detections, boxes_of[row]),
             position_sigma=float(evidence.position_sigma[row]),
+            shared_sigma=None if shared is None else float(shared[row, 0]),
+            shared_sigma_deg=None if shared is None else float(shared[row, 1]),
             support=int(evidence.support[row]), seen_ratio=float(evidence.seen_ratio[row]),
             baseline_deg=float(evidence.baseline_deg[row]),
             last_seen=float(evidence.last_seen[row]), source=options.source)

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing maps, and the optional fields of a map file."""
 
-from dataclasses import replace
+import time
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -17,13 +18,16 @@ from cliploc_ros.core.maps.landmark_embeddings import (
 )
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.maps.written_map import parse_written_map
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],
        'orientation': [0.0, 0.0, 0.0, 1.0]}
 FULL = LandmarkDetails(
     labels=(('a "red" cup: with #', 0.75), ('a mug', 0.25)),
-    class_weights=(('cup', 0.9), ('wine glass', 0.1)), position_sigma=0.0125, support=37,
+    class_weights=(('cup', 0.9), ('wine glass', 0.1)), position_sigma=0.0125,
+    shared_sigma=0.0175, shared_sigma_deg=0.375, support=37,
     seen_ratio=0.625, baseline_deg=71.5, last_seen=1341847980.75, source='build_map: office.npz')
 
 
@@ -117,3 +121,77 @@ def test_labels_may_stand_in_place_of_a_label():
 def test_refuses_wrong_details(fields, message):
     with pytest.raises(MapError, match=f"here: landmark 'cup_1': .*{message}|{message}"):
         read(CUP | fields)
+
+
+def by_yaml(path):
+    tree = read_parameter_file(path)['/**']['ros__parameters']['map']
+    return LandmarkMap.from_mapping(tree, str(path))
+
+
+def equal(one, other):
+    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name))
+               if field.name in ('centers', 'semi_axes', 'quats_xyzw')
+               else getattr(one, field.name) == getattr(other, field.name)
+               for field in fields(LandmarkMap))
+
+
+@pytest.mark.parametrize('details', [
+    (), (FULL,) * 12, (LandmarkDetails(), FULL) * 6,
+    (LandmarkDetails(shared_sigma=0.02, shared_sigma_deg=0.5, support=3, last_seen=5.0),) * 12])
+@pytest.mark.parametrize('label', ['a mug', 'caf\u00e9 "x" \\ #1: [a]', 'tab\tand\nline', '\x7f'])
+def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
+    path, room = tmp_path / 'map.yaml', make_room()
+    write_map(path, replace(room, details=details, labels=(label, *room.labels[1:])), ['h\u00f6'])
+    assert parse_written_map(path.read_text(encoding='utf-8')) is not None
+    assert equal(LandmarkMap.from_file(path), by_yaml(path))
+
+
+@pytest.mark.parametrize(('before', 'after'), [
+    ('center: [', 'center: [0'), ('0.', '.'), ('label: "', 'label: '),
+    ('semi_axes: [0', 'semi_axes: [-0'), ('semi_axes: [0', 'semi_axes: [1e9'),
+    ('support: 37', 'support: 37.5'), ('support: 37', 'support: -37'), ('"cup": ', '"c\\ud83d": '),
+    ('position_sigma: 0.0125', 'position_sigma: .nan'), ('    text: [', '    text: ["one more", '),
+    ('0.7500', '0.0000'), ('source: "build', 'source: "  " #'), ('label: "', 'label: "\\x41'),
+    ('frame_id: "', 'frame_id: "" #'), ('orientation: [', 'orientation: [9'), ('\n', '\r\n'),
+    ('          label', '\t  label'), ('landmarks:', 'landmarks: # all'),
+    ('class_id: "', "class_id: '")])
+def test_a_changed_file_is_read_or_refused_as_by_yaml(tmp_path, before, after):
+    path = tmp_path / 'map.yaml'
+    write_map(path, replace(make_room(), details=(FULL,) * 12))
+    text = path.read_bytes().decode()
+    assert before in text
+    path.write_bytes(text.replace(before, after, 1).encode())
+    try:
+        expected = by_yaml(path)
+    except MapError as error:
+        with pytest.raises(MapError) as raised:
+            LandmarkMap.from_file(path)
+        assert str(raised.value) == str(error)
+    else:
+        assert equal(LandmarkMap.from_file(path), expected)
+
+
+def test_repeated_ids_and_classes_are_refused(tmp_path):
+    path = tmp_path / 'map.yaml'
+    write_map(path, replace(make_room(), details=(FULL,) * 12))
+    text, first = path.read_text(), make_room().landmark_ids[:2]
+    for changed in (text.replace(f'"{first[1]}":', f'"{first[0]}":'),
+                    text.replace('"wine glass": ', '"cup": ', 1)):
+        assert changed != text
+        path.write_text(changed)
+        with pytest.raises(MapError, match='is repeated'):
+            LandmarkMap.from_file(path)
+
+
+def test_a_large_map_is_read_soon(tmp_path):
+    count, path = 10_000, tmp_path / 'map.yaml'
+    ids, ones = tuple(map(str, range(count))), np.ones((count, 3))
+    write_map(path, LandmarkMap('map', ids, ids, ids, ones, ones,
+                                np.tile([0, 0, 0, 1.0], (count, 1)), (FULL,) * count))
+    times = []
+    for read_map in (LandmarkMap.from_file, by_yaml):
+        begin = time.process_time()
+        assert len(read_map(path)) == count
+        times.append(time.process_time() - begin)
+    print(f'\n{count} landmarks with all fields: {times[0]:.2f} s, as YAML {times[1]:.2f} s')
+    assert times[0] < 0.4 * times[1]

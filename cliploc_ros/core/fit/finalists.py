@@ -219,7 +219,8 @@ def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> i
 
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
-                  matches: Sequence[Sequence[Match]]) -> PoseCovariance:
+                  matches: Sequence[Sequence[Match]],
+                  shared: NDArray[np.float64] | None = None) -> PoseCovariance:
     """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
@@ -230,12 +231,14 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
     pose : Finalist
     matches : sequence of sequence of Match
         Inliers of the pose in each frame.
+    shared : ndarray (L, 2), optional
+        See refined_covariance.
     """
     if pose.information is not None:
         if not pose.information.any():
             return POSE_UNKNOWN
         stamps_ns = np.array([frame.observation.stamp_ns for frame in frames])
-        return refined_covariance(rig, pose.rotation, pose.translation, stamps_ns)
+        return refined_covariance(rig, pose.rotation, pose.translation, stamps_ns, shared)
     cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
     covariance = (_sample_covariance(frames, cameras, pose,
                                      _scatter(frames, cameras, pose, matches))

@@ -9,6 +9,8 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
   errors of one edge are the same in all frames;
 * the position of a landmark, the same in all frames that see it. A landmark that is displaced acts
   like cameras that are displaced the other way;
+* the position of the map near the camera, the same for all landmarks: as if all cameras were
+  displaced and turned together about the last one;
 * the vertical, the same in all frames: one sensor on one mount;
 * odometry, a random walk: the error of a step displaces all frames beyond it.
 
@@ -78,6 +80,8 @@ class _Fit(NamedTuple):
         Of each match.
     sigmas : ndarray (n,)
         Of the objects' positions [m].
+    numbers : ndarray (n,) of int
+        The objects' landmarks.
     verticals : ndarray (F, 6, 6)
         Information of each frame's vertical.
     cameras : ndarray (F, 4, 4)
@@ -91,6 +95,7 @@ class _Fit(NamedTuple):
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
     sigmas: NDArray[np.float64]
+    numbers: NDArray[np.int64]
     verticals: NDArray[np.float64]
     cameras: NDArray[np.float64]
 
@@ -102,7 +107,8 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       stamps_ns: NDArray[np.int64]) -> PoseCovariance:
+                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None
+                       ) -> PoseCovariance:
     """Return the covariance of a pose that was refined on its inliers.
 
     Parameters
@@ -113,6 +119,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Of camera_from_map, with information, see refine_rig.
     stamps_ns : ndarray (F,)
         Time of each frame, in which odometry joins them.
+    shared : ndarray (L, 2), optional
+        By how much each landmark and its neighbours are displaced and turned together [m] [rad].
     """
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
@@ -127,10 +135,13 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
              + _odometry_noise(fit.cameras, of_frames, stamps_ns))
     matched = _sandwich(information, noise)
+    of_map = 0.0 if shared is None else _sandwich(
+        information, _shared_noise(of_objects, shared[fit.numbers]))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return PoseCovariance(matched, matched + _WRONG_SHARE * _change_without_each(
-        information - of_objects, noise - noise_of_objects, gradients, matched))
+    return PoseCovariance(
+        matched + of_map, matched + of_map + _WRONG_SHARE * _change_without_each(
+            information - of_objects, noise - noise_of_objects, gradients, matched))
 
 
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
@@ -187,8 +198,8 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
     pairs = inliers.pairs
     edges = RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION
     return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2), edges / pairs[:, 13], objects,
-                np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], verticals,
-                cameras)
+                np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], numbers,
+                verticals, cameras)
 
 
 def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -229,6 +240,21 @@ def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.fl
     """Return what the errors of the landmarks' positions add to M, for each object (n, 6, 6)."""
     pulls = fit.sigmas[:, None, None] * of_objects[:, :, :3]
     return np.asarray(pulls @ pulls.transpose(0, 2, 1))
+
+
+def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
+                  ) -> NDArray[np.float64]:
+    """Return what the errors that n objects have in common add to M (6, 6).
+
+    Parameters
+    ----------
+    of_objects : ndarray (n, 6, 6)
+        What each object tells.
+    shared : ndarray (n, 2)
+        See refined_covariance.
+    """
+    pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
+    return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],

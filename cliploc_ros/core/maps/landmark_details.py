@@ -27,6 +27,9 @@ class LandmarkDetails:
         Detector classes with their share of the landmark's boxes, all above 0.
     position_sigma : float
         Standard deviation of the centre on each axis [m].
+    shared_sigma, shared_sigma_deg : float
+        Besides, the landmark and its neighbours are displaced together, and turned together about
+        the cameras near them: standard deviations on each axis [m] [deg].
     support : int
         Frames that the landmark was fitted to.
     seen_ratio : float
@@ -42,6 +45,8 @@ class LandmarkDetails:
     labels: WeightedLabels | None = None
     class_weights: tuple[tuple[str, float], ...] | None = None
     position_sigma: float | None = None
+    shared_sigma: float | None = None
+    shared_sigma_deg: float | None = None
     support: int | None = None
     seen_ratio: float | None = None
     baseline_deg: float | None = None
@@ -70,7 +75,8 @@ class LandmarkDetails:
 
 
 OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))
-_NUMBERS = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')
+_NUMBERS = ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'support', 'seen_ratio',
+            'baseline_deg', 'last_seen')
 
 
 def read_details(tree: Mapping[str, Any], where: str) -> LandmarkDetails:

@@ -24,7 +24,8 @@ from cliploc_ros.core.maps.landmark_details import (
     WeightedLabels,
     read_details,
 )
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.maps.parameter_file import parse_parameters, read_text
+from cliploc_ros.core.maps.written_map import WrittenMap, parse_written_map
 from cliploc_ros.errors import MapError
 
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
@@ -89,7 +90,7 @@ class LandmarkMap:
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""
         _ = self.shapes, self.classes, self.sorted_landmarks, self.tree, self.pairs
-        _ = self.objects, self.position_sigmas
+        _ = self.objects, self.position_sigmas, self.shared_sigmas
 
     @cached_property
     def shapes(self) -> NDArray[np.float64]:
@@ -101,6 +102,17 @@ class LandmarkMap:
         """Return the standard deviation of each centre on each axis (L,) [m]."""
         given = [one.position_sigma for one in self.details] or [None] * len(self)
         return np.array([DEFAULT_SIGMA_M if one is None else one for one in given])
+
+    @cached_property
+    def shared_sigmas(self) -> NDArray[np.float64]:
+        """Return by how much each landmark and its neighbours are off together (L, 2) [m] [rad].
+
+        0 where the map does not say.
+        """
+        given = [(one.shared_sigma or 0.0, one.shared_sigma_deg or 0.0) for one in self.details]
+        if not given:
+            return np.zeros((len(self), 2))
+        return np.array(given) * [1.0, np.radians(1.0)]
 
     @property
     def weighted_labels(self) -> tuple[WeightedLabels, ...]:
@@ -189,7 +201,10 @@ class LandmarkMap:
         MapError
             Names the file, the landmark and the field to correct.
         """
-        tree = read_parameter_file(path)
+        text = read_text(path)
+        if (written := parse_written_map(text)) is not None and _is_valid(written):
+            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)))
+        tree = parse_parameters(text, path)
         found = [node['ros__parameters']['map'] for node in tree.values()
                  if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
                  and 'map' in node['ros__parameters']]
@@ -222,11 +237,27 @@ class LandmarkMap:
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
-        quats_xyzw = np.array(quats)
-        quats_xyzw /= np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
-                           np.array(centers), np.array(semi_axes), quats_xyzw,
+                           np.array(centers), np.array(semi_axes), _unit(np.array(quats)),
                            details if any(one != LandmarkDetails() for one in details) else ())
+
+
+def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True))
+
+
+def _is_valid(written: WrittenMap) -> bool:
+    """Return whether from_mapping would accept a map that is finite and has unique ids."""
+    low, high = _SEMI_AXIS_RANGE_M
+    norms = np.linalg.norm(written.quats_xyzw, axis=1)
+    texts = ((written.frame_id,), written.labels, written.class_ids)
+    return bool(
+        ((written.semi_axes >= low) & (written.semi_axes <= high)).all()
+        and np.abs(written.centers).max() <= _MAX_COORDINATE_M
+        and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
+        and not any('.' in one for one in written.landmark_ids)
+        and all(len(one) <= _MAX_TEXT_LENGTH and not one.isspace() and one
+                for column in texts for one in set(column)))
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:

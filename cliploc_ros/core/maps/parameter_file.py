@@ -35,6 +35,17 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
         The file is unreadable, not a regular file, too large, no YAML mapping, nested too deeply,
         or has an alias or a repeated key. The message names file and line.
     """
+    return parse_parameters(read_text(path), path)
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Return the text of a regular file in UTF-8 that is not too large.
+
+    Raises
+    ------
+    MapError
+        Names the file and what is wrong with it.
+    """
     path = Path(path)
     try:
         if not S_ISREG(path.stat().st_mode):
@@ -44,11 +55,15 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
             content = file.read(MAX_FILE_BYTES + 1)
         if len(content) > MAX_FILE_BYTES:
             raise MapError(f'{path}: larger than {MAX_FILE_BYTES // 2**20} MiB')
-        text = content.decode('utf-8')
+        return content.decode('utf-8')
     except OSError as error:
         raise MapError(f'{path}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         raise MapError(f'{path}: not a text file in UTF-8 (byte {error.start})') from error
+
+
+def parse_parameters(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the tree of a YAML text as read_parameter_file does; messages name the path."""
     try:
         tree = _build_tree(text)
     except yaml.YAMLError as error:
