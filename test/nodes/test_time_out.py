@@ -18,7 +18,7 @@ from tester import make_frame
 from cliploc_ros.core.observation import Detections
 
 # ViT-B-32 takes 20 s and more for so many crops.
-BOXES, TIMEOUT_S = 400, 4.0
+BOXES, TIMEOUT_S = 400, 6.0
 # For the answer's way back on a busy machine.
 LATE_S = 0.5
 
