@@ -26,7 +26,7 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.landmark_map import LandmarkMap
 from cliploc_ros.core.map_file import write_map
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
-from cliploc_ros.datasets.frames import Frame, Frames, RawFrame, Wanted
+from cliploc_ros.datasets.frames import Frame, Frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.evaluation.keyframe_study.asking import Place, Query, Row, table
@@ -67,7 +67,7 @@ class Study:
     def place(self, rows: Sequence[int], out: Path, options: LayerOptions) -> Place:
         """Return what is built of some images, and write it."""
         built = build_map(self.recorded.select_frames(rows), MappingOptions()).landmark_map
-        layer = build_layer(some_frames(self._frames, rows), built, options)
+        layer = build_layer(self._frames.select(rows), built, options)
         name = out.name.partition('.')[0]
         write_map(out.with_name(f'{name}.yaml'), built, ['study of keyframes'], None)
         save_layer(out, layer)
@@ -110,16 +110,6 @@ def _elsewhere(images: Sequence[Frame], row: int, mapped: Sequence[int],
     cosines = axes @ images[row].map_from_camera[:3, 2]  # type: ignore[index]
     away = np.nonzero(cosines < 0.5)[0]
     return mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
-
-
-def some_frames(frames: Frames, rows: Sequence[int]) -> Frames:
-    """Return some of the frames."""
-    chosen = set(rows)
-
-    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
-        return frames.read_raw(lambda place, stamp_ns, pose: place in chosen
-                               and is_wanted(place, stamp_ns, pose))
-    return Frames(frames.source, len(chosen), read_raw)
 
 
 def _with_moved_objects(landmark_map: LandmarkMap, seed: int) -> LandmarkMap:
