@@ -97,9 +97,8 @@ class Study:
         for row in rows:
             frame = self.images[row]
             other = elsewhere(frame, [self.images[one] for one in mapped], rng)
-            if other is not None:
-                yield self.query(replace(frame, image_rgb=put_poster(
-                    frame.image_rgb, other.image_rgb, share)))
+            yield self.query(replace(frame, image_rgb=put_poster(
+                frame.image_rgb, other.image_rgb, share)))
 
     def query(self, frame: Frame, is_here: bool = True) -> Query:
         """Return an image with its detections."""

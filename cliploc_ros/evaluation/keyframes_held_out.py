@@ -96,10 +96,11 @@ def sites(rooms: Sequence[Path], room_model: str, office: Path | None, office_mo
         detector = YoloDetector(YoloOptions(office_model, conf=0.25))
         landmark_map = LandmarkMap.from_file(office / 'map.yaml')
         frames = read_walk(office)
-        parts = [range(start, frames.count, 2) for start in (0, 1)]
-        for name, mapped, asked in (('even to odd', *parts), ('odd to even', *parts[::-1])):
-            yield make_site('fr3', frames.select(mapped), landmark_map, detector,
-                            {name: list(frames.select(asked).read())})
+        even, odd = range(0, frames.count, 2), range(1, frames.count, 2)
+        yield make_site('fr3 even', frames.select(even), landmark_map, detector,
+                        {'odd': list(frames.select(odd).read())})
+        yield make_site('fr3 odd', frames.select(odd), landmark_map, detector,
+                        {'even': list(frames.select(even).read())})
 
 
 def right_cases(site: Site) -> Iterator[list[Row]]:
@@ -121,8 +122,7 @@ def wrong_cases(site: Site, others: Sequence[Site], every: int, seed: int
         posters = [(frame, elsewhere(frame, site.mapped, rng)) for frame in own]
         yield site.ask(f'poster on {share:.0%}', [
             replace(frame, image_rgb=put_poster(frame.image_rgb, other.image_rgb, share))
-            for frame, other in posters if other is not None
-            and other.image_rgb.shape == frame.image_rgb.shape])
+            for frame, other in posters])
     strange = [frame for other in others for frames in other.queries.values()
                for frame in islice(frames, 0, None, every)]
     yield site.ask('images of other rooms', strange, is_here=False)

@@ -64,12 +64,13 @@ def put_poster(image: Image, other: Image, share: float) -> Image:
     return changed
 
 
-def elsewhere(frame: Frame, others: Sequence[Frame], rng: np.random.Generator) -> Frame | None:
-    """Return one of the frames that looks another way, by more than 60 degrees; None without."""
+def elsewhere(frame: Frame, others: Sequence[Frame], rng: np.random.Generator) -> Frame:
+    """Return a frame that looks another way, by more than 60 degrees or else the most."""
     assert frame.map_from_camera is not None
     axes = np.array([one.map_from_camera[:3, 2] for one in others])  # type: ignore[index]
-    away = np.nonzero(axes @ frame.map_from_camera[:3, 2] < _AWAY_COS)[0]
-    return others[int(rng.choice(away))] if len(away) else None
+    cosines = axes @ frame.map_from_camera[:3, 2]
+    away = np.nonzero(cosines < _AWAY_COS)[0]
+    return others[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
 
 
 def twin_map(landmark_map: LandmarkMap, removed: int, rng: np.random.Generator) -> LandmarkMap:
