@@ -7,6 +7,7 @@ import pytest
 
 from cliploc_ros.core.combination import ObjectsThere, combine
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.landmark_map import LandmarkMap
@@ -99,6 +100,28 @@ def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
     found = answer(KeyframeLocalizer(layer), image, frame.camera)
     assert not found.accepted or pose_error(found.map_from_camera,
                                             frame.map_from_camera)[0] < 1.0
+
+
+def test_of_two_places_the_one_in_more_parts_of_the_image_leads(layer, queries, kitchen):
+    frame = queries[0]
+    elsewhere = next(kitchen.select([27]).read())
+    seen = KeyframeLocalizer(layer).localize(
+        put_poster(frame.image_rgb, elsewhere.image_rgb, 0.4), frame.camera)
+    assert pose_error(seen.map_from_camera, frame.map_from_camera)[0] < 0.25
+    assert pose_error(seen.rival_pose, elsewhere.map_from_camera)[0] < 0.25
+    assert seen.rival > seen.inliers, 'the poster has more points'
+
+
+def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
+    localizer, frame = KeyframeLocalizer(layer), queries[2]
+    monkeypatch.setattr(localization, '_SIMILAR', 1)
+    monkeypatch.setattr(localization, '_ELSEWHERE', 0)
+    monkeypatch.setattr(localization, '_ENOUGH_INLIERS', 0)
+    few = localizer.localize(frame.image_rgb, frame.camera)
+    monkeypatch.setattr(localization, '_ENOUGH_INLIERS', few.inliers + 1)
+    more = localizer.localize(frame.image_rgb, frame.camera)
+    assert len(few.keyframes) == 1 < len(more.keyframes)
+    assert more.inliers > few.inliers
 
 
 def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
