@@ -6,7 +6,7 @@ The one reader of evaluation, mapping and map editor. A source is read as a stre
 what is not wanted is never decoded, and a raw frame can be decoded in another process.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -102,6 +102,15 @@ class Frames:
         """Yield all frames, decoded."""
         for raw in self.read_raw(lambda place, stamp_ns, pose: True):
             yield raw.decode()
+
+    def select(self, places: Iterable[int]) -> 'Frames':
+        """Return some of the frames, by their places: 0 is the first."""
+        chosen = frozenset(places)
+
+        def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+            return self.read_raw(lambda place, stamp_ns, pose: place in chosen
+                                 and is_wanted(place, stamp_ns, pose))
+        return Frames(self.source, len(chosen), read_raw)
 
 
 @dataclass(frozen=True)

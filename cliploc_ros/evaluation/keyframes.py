@@ -26,18 +26,20 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
-from cliploc_ros.datasets.frames import Frame, Frames, RawFrame, Wanted
+from cliploc_ros.datasets.frames import Frame, Frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.evaluation.keyframe_study.asking import Place, Query, Row, table
+from cliploc_ros.evaluation.keyframe_study.asking import Place, Query, Row, query_of, table
 from cliploc_ros.evaluation.keyframe_study.baseline import Baseline
 from cliploc_ros.evaluation.keyframe_study.changes import (
     IMAGE_CHANGES,
     ImageChange,
+    elsewhere,
     put_poster,
     twin_layer,
     twin_map,
 )
+from cliploc_ros.evaluation.keyframe_study.reliability import false_accepts, reliability
 from cliploc_ros.evaluation.output import make_folder, write_text
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.options import MappingOptions
@@ -46,12 +48,15 @@ from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.recording.networks import MAX_DETECTIONS, Look
+from cliploc_ros.recording.networks import Look
 from cliploc_ros.recording.recorder import record_every_frame
 
 _POSTER_SHARES = (0.3, 0.6)
 _MOVED_SHARE, _MOVED_M = 0.3, 0.5
 _TWIN_LACKS = 3
+# Parts of the study that can run alone: those that map a part of the images, and the changes.
+_PARTS = {'interleaved': 'interleaved', 'first': 'first half to second',
+          'second': 'second half to first', 'changed': 'changed'}
 
 
 class Study:
@@ -67,7 +72,7 @@ class Study:
     def place(self, rows: Sequence[int], out: Path, options: LayerOptions) -> Place:
         """Return what is built of some images, and write it."""
         built = build_map(self.recorded.select_frames(rows), MappingOptions()).landmark_map
-        layer = build_layer(some_frames(self._frames, rows), built, options)
+        layer = build_layer(self._frames.select(rows), built, options)
         name = out.name.partition('.')[0]
         write_map(out.with_name(f'{name}.yaml'), built, ['study of keyframes'], None)
         save_layer(out, layer)
@@ -91,35 +96,13 @@ class Study:
         rng = np.random.default_rng(self._seed)
         for row in rows:
             frame = self.images[row]
-            other = self.images[_elsewhere(self.images, row, mapped, rng)]
+            other = elsewhere(frame, [self.images[one] for one in mapped], rng)
             yield self.query(replace(frame, image_rgb=put_poster(
                 frame.image_rgb, other.image_rgb, share)))
 
     def query(self, frame: Frame, is_here: bool = True) -> Query:
         """Return an image with its detections."""
-        camera = frame.camera
-        boxes = self._detector.detect(frame.image_rgb).usable(camera.width, camera.height,
-                                                              MAX_DETECTIONS)
-        return Query(frame.image_rgb, camera, boxes, frame.map_from_camera if is_here else None)
-
-
-def _elsewhere(images: Sequence[Frame], row: int, mapped: Sequence[int],
-               rng: np.random.Generator) -> int:
-    """Return a mapped image that looks another way, by more than 60 degrees."""
-    axes = np.array([images[one].map_from_camera[:3, 2] for one in mapped])  # type: ignore[index]
-    cosines = axes @ images[row].map_from_camera[:3, 2]  # type: ignore[index]
-    away = np.nonzero(cosines < 0.5)[0]
-    return mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
-
-
-def some_frames(frames: Frames, rows: Sequence[int]) -> Frames:
-    """Return some of the frames."""
-    chosen = set(rows)
-
-    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
-        return frames.read_raw(lambda place, stamp_ns, pose: place in chosen
-                               and is_wanted(place, stamp_ns, pose))
-    return Frames(frames.source, len(chosen), read_raw)
+        return query_of(frame, self._detector, is_here)
 
 
 def _with_moved_objects(landmark_map: LandmarkMap, seed: int) -> LandmarkMap:
@@ -170,32 +153,37 @@ def run(arguments: list[str]) -> int:
                         metavar=('METRES', 'DEGREES'), help='distance of keyframes (0 0: all)')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='change each N-th query only (%(default)s)')
-    parser.add_argument('--plain', action='store_true', help='without changed images')
+    parser.add_argument('--parts', nargs='+', choices=_PARTS, default=list(_PARTS),
+                        help='which parts to run (all)')
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     make_folder(options.out)
     study = Study(rgbd_frames(options.rgbd, FolderOptions()),
                   YoloDetector(YoloOptions(options.model, conf=0.25)), options.seed)
-    count, rows = len(study.images), []
-    half = count // 2
-    splits = {'interleaved': (range(0, count, 2), range(1, count, 2)),
-              'first half to second': (range(half), range(half, count)),
-              'second half to first': (range(half, count), range(half))}
-    print(table([])[0], flush=True)
-    places = {name: study.place(mapped, options.out / f'{name.replace(" ", "_")}.keyframes.npz',
-                                LayerOptions(*options.choose))
-              for name, (mapped, _) in splits.items()}
-    for name, (_, asked) in splits.items():
-        rows += _ask(places[name], name, study.queries(asked))
-    if not options.plain:
-        mapped, asked = splits['interleaved']
-        for found in _cases(study, places['interleaved'], mapped, asked[::options.every],
-                            options.other, options.every, options.seed):
+    rows: list[Row] = []
+    for name in options.parts:
+        for found in _part(study, name, options):
             rows += found
             _write(options.out, rows)
-    _write(options.out, rows)
+    print('\n'.join([*table(rows), '', *false_accepts(rows), '', *reliability(rows)]))
     return 0
+
+
+def _part(study: Study, name: str, options: argparse.Namespace) -> Iterator[list[Row]]:
+    """Yield the results of a split, or of the changed images and other rooms."""
+    count = len(study.images)
+    half = count // 2
+    interleaved = range(0, count, 2), range(1, count, 2)
+    mapped, asked = {'first': (range(half), range(half, count)),
+                     'second': (range(half, count), range(half))}.get(name, interleaved)
+    place = study.place(mapped, options.out / f'{name}.keyframes.npz',
+                        LayerOptions(*options.choose))
+    if name == 'changed':
+        yield from _cases(study, place, mapped, asked[::options.every], options.other,
+                          options.every, options.seed)
+    else:
+        yield _ask(place, _PARTS[name], study.queries(asked))
 
 
 def _write(folder: Path, rows: Sequence[Row]) -> None:

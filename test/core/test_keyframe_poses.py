@@ -9,7 +9,14 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.features import DIMENSIONS, extract, match, unit_rows
+from cliploc_ros.core.keyframes import localization
+from cliploc_ros.core.keyframes.features import (
+    DIMENSIONS,
+    Features,
+    extract,
+    match,
+    unit_rows,
+)
 from cliploc_ros.core.keyframes.point_pose import find_pose
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 
@@ -57,6 +64,24 @@ def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
     found = find_pose(points, rng.permutation(bearings), CAMERA)
     assert found is None or len(found.inliers) < 12
     assert find_pose(np.ones((20, 3)), np.zeros((20, 2)), CAMERA) is None
+
+
+def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_points():
+    rng = np.random.default_rng(8)
+    room, points, bearings = look(rng, 60)
+    poster, shown, inside = look(rng, 120, offset=(9.0, 0.0, 0.0))
+    inside *= 0.3  # as seen from there, in the middle of the image
+    rays = np.column_stack([inside, np.ones(120)]) * rng.uniform(1.0, 4.0, (120, 1))
+    shown = rays @ poster[:3, :3].T + poster[:3, 3]
+    seen = np.concatenate([bearings, inside])
+    features = Features(seen * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
+                        np.zeros((180, DIMENSIONS), np.uint8), np.ones(180, np.float32))
+    matched = localization._Matched(np.arange(180), np.concatenate([points, shown]),
+                                    np.repeat([0, 1], [60, 120]))
+    first, second = localization._places(matched, localization._Look(features, seen, CAMERA))
+    assert pose_error(first.map_from_camera, room)[0] < 1e-3
+    assert pose_error(second.map_from_camera, poster)[0] < 1e-3
+    assert (first.agreed, second.agreed) == (60, 120)
 
 
 def test_rays_of_equal_features_meet_in_their_point():

@@ -8,6 +8,7 @@ import pytest
 from cliploc_ros.core.acceptance.recognition import ObjectsThere
 from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -18,7 +19,6 @@ from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.evaluation.keyframe_study.baseline import Baseline
 from cliploc_ros.evaluation.keyframe_study.changes import IMAGE_CHANGES, put_poster, twin_layer
-from cliploc_ros.evaluation.keyframes import some_frames
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 
 EVERY = LayerOptions(0.0, 0.0)
@@ -46,14 +46,14 @@ def office(shared_data):
 
 @pytest.fixture(scope='module')
 def queries(kitchen):
-    return list(some_frames(kitchen, ASKED).read())
+    return list(kitchen.select(ASKED).read())
 
 
 @pytest.fixture(scope='module')
 def layer(kitchen, room, tmp_path_factory):
     """Ten images of the kitchen, written and read."""
     path = tmp_path_factory.mktemp('layer') / 'kitchen.keyframes.npz'
-    save_layer(path, build_layer(some_frames(kitchen, MAPPED), room, EVERY))
+    save_layer(path, build_layer(kitchen.select(MAPPED), room, EVERY))
     assert path.stat().st_size < 5e6 * len(MAPPED) / 50
     return load_layer_of_map(path, room)
 
@@ -82,7 +82,7 @@ def test_changed_images_are_found_or_refused(layer, queries, name):
 
 def test_another_room_is_refused(layer, office):
     localizer = KeyframeLocalizer(layer)
-    for frame in some_frames(office, range(0, 17, 4)).read():
+    for frame in office.select(range(0, 17, 4)).read():
         assert not answer(localizer, frame.image_rgb, frame.camera).accepted
 
 
@@ -95,12 +95,24 @@ def test_a_second_room_that_looks_the_same_is_refused(layer, queries):
 
 
 def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
-    elsewhere = next(some_frames(kitchen, [27]).read())  # mapped
+    elsewhere = next(kitchen.select([27]).read())  # mapped
     frame = queries[0]
     image = put_poster(frame.image_rgb, elsewhere.image_rgb, 0.3)
     found = answer(KeyframeLocalizer(layer), image, frame.camera)
     assert not found.accepted or pose_error(found.map_from_camera,
                                             frame.map_from_camera)[0] < 1.0
+
+
+def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
+    localizer, frame = KeyframeLocalizer(layer), queries[2]
+    monkeypatch.setattr(localization, '_SIMILAR', 1)
+    monkeypatch.setattr(localization, '_ELSEWHERE', 0)
+    monkeypatch.setattr(localization, '_ENOUGH_INLIERS', 0)
+    few = localizer.localize(frame.image_rgb, frame.camera)
+    monkeypatch.setattr(localization, '_ENOUGH_INLIERS', few.inliers + 1)
+    more = localizer.localize(frame.image_rgb, frame.camera)
+    assert len(few.keyframes) == 1 < len(more.keyframes)
+    assert more.inliers > few.inliers
 
 
 def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
@@ -112,17 +124,17 @@ def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
 
 
 def test_the_office_is_triangulated_without_depth(office, room):
-    layer = build_layer(some_frames(office, range(0, 17, 2)), room, EVERY)
+    layer = build_layer(office.select(range(0, 17, 2)), room, EVERY)
     assert (np.diff(layer.offsets) > 100).all()
     localizer = KeyframeLocalizer(layer)
-    for frame in some_frames(office, range(1, 17, 4)).read():
+    for frame in office.select(range(1, 17, 4)).read():
         found = answer(localizer, frame.image_rgb, frame.camera)
         assert found.accepted, found.reason
         assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.05
 
 
 def test_the_baseline_finds_the_kitchen(kitchen, queries):
-    baseline = Baseline(list(some_frames(kitchen, range(0, 6, 3)).read()))
+    baseline = Baseline(list(kitchen.select(range(0, 6, 3)).read()))
     frame = queries[0]
     pose = baseline.localize(frame.image_rgb, frame.camera)
     assert pose_error(pose, frame.map_from_camera)[0] < 0.1

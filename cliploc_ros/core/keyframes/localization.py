@@ -21,6 +21,9 @@ from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_
 # ones elsewhere, so that a place that looks alike is found, and those where objects propose.
 _QUERY_FEATURES = 2000
 _SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
+# With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
+# next similar ones.
+_ENOUGH_INLIERS, _MORE = 100, 5
 # Places differ by more than 1 m or 45 degrees, as poses that do not agree.
 _MOST_RANKED = 500
 _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
@@ -49,6 +52,7 @@ class Recognized(NamedTuple):
         Number of points that agree.
     rival : int
         Number of points that agree with the best pose elsewhere, without those; 0 without one.
+        Those may be more: the pose whose points lie in more parts of the image comes first.
     rival_pose : ndarray (4, 4) or None
         That pose.
     confirmed : float
@@ -87,10 +91,31 @@ class _Matched(NamedTuple):
         return _Matched(self.features[chosen], self.points[chosen], self.keyframes[chosen],
                         self.rows[chosen])
 
+    def join(self, other: '_Matched') -> '_Matched':
+        return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
 
 def query_features(image_rgb: NDArray[np.uint8]) -> Features:
     """Return the features of an image (h, w, 3) that is to be localized."""
     return extract(image_rgb, _QUERY_FEATURES)
+
+
+class _Look(NamedTuple):
+    """An image: its features, their bearings (n, 2), the camera."""
+
+    features: Features
+    bearings: NDArray[np.float64]
+    camera: Camera
+
+
+class _Place(NamedTuple):
+    """A pose, the matches that agree, the number of their features, and that in each cell."""
+
+    map_from_camera: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    inliers: _Matched
+    agreed: int
+    cells: NDArray[np.int64]
 
 
 class KeyframeLocalizer:
@@ -132,27 +157,32 @@ class KeyframeLocalizer:
         if len(features) < LEAST_INLIERS:
             return None
         descriptors = unit_rows(features.descriptors)
-        matched = self._match(descriptors, self._choose(descriptors, guesses), deadline)
-        best = find_pose(matched.points, bearings[matched.features], camera)
-        if best is None:
-            return None
-        inliers = matched.select(best.inliers)
-        rival, rival_pose = self._rival(matched, bearings, camera, best.map_from_camera)
-        counts = np.bincount(inliers.keyframes, minlength=len(self.layer))
+        look = _Look(features, bearings, camera)
+        ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
+        chosen = self._choose(ranks, guesses)
+        matched = self._match(descriptors, chosen, deadline)
+        places = _places(matched, look)
+        if not places or places[0].agreed < _ENOUGH_INLIERS:
+            more = self._more(ranks, chosen, places)
+            matched = matched.join(self._match(descriptors, more, deadline))
+            places = _places(matched, look)
+        return self._recognized(places, look) if places else None
+
+    def _recognized(self, places: Sequence['_Place'], look: '_Look') -> Recognized:
+        """Return the first place, with what speaks for and against it."""
+        best, rival = places[0], places[1] if len(places) > 1 else None
+        counts = np.bincount(best.inliers.keyframes, minlength=len(self.layer))
         used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
         return Recognized(
-            best.map_from_camera,
-            best.covariance + self._shared(best.map_from_camera, counts),
-            len(np.unique(inliers.features)), rival, rival_pose,
-            *self._confirmed(best.map_from_camera, camera, features, inliers, used),
-            tuple(used.tolist()), features.pixels[inliers.features], inliers.rows)
+            best.map_from_camera, best.covariance + self._shared(best.map_from_camera, counts),
+            best.agreed, rival.agreed if rival else 0, rival.map_from_camera if rival else None,
+            *self._confirmed(best, look, used), tuple(used.tolist()),
+            look.features.pixels[best.inliers.features], best.inliers.rows)
 
-    def _choose(self, descriptors: NDArray[np.float32], guesses: Sequence[NDArray[np.float64]]
-                ) -> list[int]:
+    def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""
         poses = self.layer.map_from_camera
-        ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
-        chosen = ranks[:_SIMILAR]
+        chosen = list(ranks[:_SIMILAR])
         others = (one for one in ranks[_SIMILAR:_MOST_RANKED]
                   if not any(_same_place(poses[one], poses[other]) for other in chosen))
         chosen += islice(others, _ELSEWHERE)
@@ -160,6 +190,14 @@ class KeyframeLocalizer:
             near = _keyframes_near(poses, guess)
             chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
         return chosen
+
+    def _more(self, ranks: Sequence[int], chosen: Sequence[int], places: Sequence['_Place']
+              ) -> list[int]:
+        """Return more keyframes: those near the pose so far, and the next similar ones."""
+        near = _keyframes_near(self.layer.map_from_camera, places[0].map_from_camera
+                               )[:_MORE].tolist() if places else []
+        return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
+                if one not in chosen]
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
@@ -178,20 +216,8 @@ class KeyframeLocalizer:
         return _Matched(np.concatenate(features), np.concatenate(points),
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
-    def _rival(self, matched: _Matched, bearings: NDArray[np.float64], camera: Camera,
-               best: NDArray[np.float64]) -> tuple[int, NDArray[np.float64] | None]:
-        """Return the best pose elsewhere and how many features agree with it."""
-        taken = agreeing(matched.points, bearings[matched.features], invert_transform(best),
-                         _RIVAL_TOLERANCE)
-        left = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
-        other = find_pose(left.points, bearings[left.features], camera)
-        if other is None or _same_place(best, other.map_from_camera):
-            return 0, None
-        count = len(np.unique(left.features[other.inliers]))
-        return (count, other.map_from_camera) if count >= LEAST_INLIERS else (0, None)
-
-    def _confirmed(self, pose: NDArray[np.float64], camera: Camera, features: Features,
-                   inliers: _Matched, used: NDArray[np.int64]) -> tuple[float, float]:
+    def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
+                   ) -> tuple[float, float]:
         """Return the share of cells with inliers, of those where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The second
@@ -200,15 +226,15 @@ class KeyframeLocalizer:
         """
         expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
         for keyframe in used[:_SIMILAR].tolist():
-            pixels = _project(self.layer.points_in_map(keyframe), pose, camera)
-            expected = np.maximum(expected, _count(pixels, camera))
-        seen = _count(features.pixels, camera)
-        matched = _count(features.pixels[np.unique(inliers.features)], camera)
+            pixels = _project(self.layer.points_in_map(keyframe), place.map_from_camera,
+                              look.camera)
+            expected = np.maximum(expected, _count(pixels, look.camera))
+        seen = _count(look.features.pixels, look.camera)
         comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
         if not comparable.any():
             return 0.0, 0.0
-        density = len(np.unique(inliers.features)) / comparable.sum()
-        return float((matched[comparable] > 0).mean()), float(density / (1.0 + density))
+        density = place.agreed / comparable.sum()
+        return (float((place.cells[comparable] > 0).mean()), float(density / (1.0 + density)))
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""
@@ -221,6 +247,34 @@ class KeyframeLocalizer:
         position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
         rotation = _KEYFRAME_RAD**2 + (_PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
+
+
+def _places(matched: _Matched, look: _Look) -> list[_Place]:
+    """Return the pose that most matches agree with, and the best one elsewhere if there is one.
+
+    The one whose points lie in more parts of the image comes first: a poster has many points, but
+    shows only a part of its place.
+    """
+    first = _place(matched, look)
+    if first is None:
+        return []
+    taken = agreeing(matched.points, look.bearings[matched.features],
+                     invert_transform(first.map_from_camera), _RIVAL_TOLERANCE)
+    second = _place(matched.select(np.setdiff1d(np.arange(len(matched.features)), taken)), look)
+    if second is None or second.agreed < LEAST_INLIERS or _same_place(
+            first.map_from_camera, second.map_from_camera):
+        return [first]
+    return sorted([first, second], key=lambda one: -np.count_nonzero(one.cells))
+
+
+def _place(matched: _Matched, look: _Look) -> _Place | None:
+    found = find_pose(matched.points, look.bearings[matched.features], look.camera)
+    if found is None:
+        return None
+    inliers = matched.select(found.inliers)
+    features = np.unique(inliers.features)
+    return _Place(found.map_from_camera, found.covariance, inliers, len(features),
+                  _count(look.features.pixels[features], look.camera))
 
 
 def _select(features: Features, rows: NDArray[np.bool_]) -> Features:

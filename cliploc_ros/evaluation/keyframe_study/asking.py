@@ -21,7 +21,10 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.datasets.frames import Frame
 from cliploc_ros.evaluation.keyframe_study.baseline import Baseline
+from cliploc_ros.models.protocols import ObjectDetector
+from cliploc_ros.recording.networks import MAX_DETECTIONS
 
 #: Classes alone: no CLIP weights are at hand for the kitchen.
 OPTIONS = RelocalizerOptions(matching='class', time_budget_s=0.25)
@@ -39,14 +42,22 @@ class Query(NamedTuple):
     truth: NDArray[np.float64] | None
 
 
+def query_of(frame: Frame, detector: ObjectDetector, is_here: bool = True) -> Query:
+    """Return an image with its detections; not here: of another room."""
+    camera = frame.camera
+    boxes = detector.detect(frame.image_rgb).usable(camera.width, camera.height, MAX_DETECTIONS)
+    return Query(frame.image_rgb, camera, boxes, frame.map_from_camera if is_here else None)
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What one way of localizing says: error [m], accepted, CPU time [ms], NEES."""
+    """What one way of localizing says: error [m], accepted, CPU time [ms], NEES, probability."""
 
     error_m: float
     accepted: bool
     cpu_ms: float
     nees: float
+    confidence: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +115,8 @@ def _outcome(found: Relocalization, truth: NDArray[np.float64] | None, spent_s: 
     pose, nees = found.map_from_camera, np.inf
     if pose is not None and truth is not None and found.covariance is not None:
         nees = normalized_square(pose, found.covariance, truth)
-    return Outcome(_error(pose, truth), found.accepted, 1e3 * spent_s, float(nees))
+    return Outcome(_error(pose, truth), found.accepted, 1e3 * spent_s, float(nees),
+                   found.confidence)
 
 
 def _error(pose: NDArray[np.float64] | None, truth: NDArray[np.float64] | None) -> float:
@@ -124,12 +136,12 @@ def _evidence(seen: Recognized | None, there: ObjectsThere, found: Relocalizatio
 
 def table(rows: Sequence[Row]) -> list[str]:
     """Return the figures of each case and way, one line each."""
-    lines = [f'{"case":30} {"way":10} {"n":>3}   .1  .25   .5    1  median  accepted  '
+    lines = [f'{"case":45} {"way":10} {"n":>3}   .1  .25   .5    1  median  accepted  '
              'precision  recall  in 95 %  CPU ms']
     for case in dict.fromkeys(row.case for row in rows):
         of_case = [row for row in rows if row.case == case]
         for way in of_case[0].ways:
-            lines.append(f'{case:30} {way:10} ' + _figures([row.ways[way] for row in of_case]))
+            lines.append(f'{case:45} {way:10} ' + _figures([row.ways[way] for row in of_case]))
     return lines
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated changes: of images, and of the world that a map and a layer show."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.datasets.frames import Frame
 
 Image = NDArray[np.uint8]
 #: Takes an image and a generator; returns the changed image.
 ImageChange = Callable[[Image, np.random.Generator], Image]
-_TWIN_AWAY_M = 20.0
+_TWIN_AWAY_M, _AWAY_COS = 20.0, 0.5
 
 
 def _darken(image: Image, rng: np.random.Generator) -> Image:
@@ -61,6 +62,15 @@ def put_poster(image: Image, other: Image, share: float) -> Image:
     inside = np.s_[rows:height - rows, columns:width - columns]
     changed[inside] = other[inside]
     return changed
+
+
+def elsewhere(frame: Frame, others: Sequence[Frame], rng: np.random.Generator) -> Frame:
+    """Return a frame that looks another way, by more than 60 degrees or else the most."""
+    assert frame.map_from_camera is not None
+    axes = np.array([one.map_from_camera[:3, 2] for one in others])  # type: ignore[index]
+    cosines = axes @ frame.map_from_camera[:3, 2]
+    away = np.nonzero(cosines < _AWAY_COS)[0]
+    return others[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
 
 
 def twin_map(landmark_map: LandmarkMap, removed: int, rng: np.random.Generator) -> LandmarkMap:
