@@ -41,6 +41,9 @@ _CONTRADICTS = 0.5
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 # So many points elsewhere contradict accepted objects, whatever else they lack; a guess.
 _CONTRADICTING_INLIERS = 100
+# A dozen points can agree on a pose that is far off, by more than their covariance says: on the
+# demo, 12 points were wrong by .89 m and claimed some 4 cm. A guess.
+_WEAK_COVARIANCE = 100.0
 # Poses of objects that propose keyframes.
 _MOST_GUESSES = 3
 
@@ -127,13 +130,14 @@ def _both(found: Relocalization, seen: Recognized, chance: float, refusal: str,
     """Return the answer of two poses that agree.
 
     A strong pose of keyframes stays as it is: objects are rougher (measured on the kitchen's
-    halves, fusing them cost .08 at .1 m). A weak one is fused. Each is wrong with its own
-    probability, and both lead to the same wrong place only by chance: the product is an upper
-    bound where their errors are independent.
+    halves, fusing them cost .08 at .1 m). A weak one is fused, with a larger covariance than its
+    own. Each is wrong with its own probability, and both lead to the same wrong place only by
+    chance: the product is an upper bound where their errors are independent.
     """
     assert found.map_from_camera is not None and found.covariance is not None
     pose, covariance = (seen.map_from_camera, seen.covariance) if not refusal else fuse(
-        found.map_from_camera, found.covariance, seen.map_from_camera, seen.covariance)
+        found.map_from_camera, found.covariance, seen.map_from_camera,
+        _WEAK_COVARIANCE * seen.covariance)
     confidence = min(MOST_CONFIDENCE, 1.0 - (1.0 - found.confidence) * (1.0 - chance))
     reason = '' if found.accepted or confidence >= options.min_confidence else \
         f'{found.reason}; keyframes: {refusal}'

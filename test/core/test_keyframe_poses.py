@@ -77,7 +77,7 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
     features = Features(seen * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
                         np.zeros((180, DIMENSIONS), np.uint8), np.ones(180, np.float32))
     matched = localization._Matched(np.arange(180), np.concatenate([points, shown]),
-                                    np.repeat([0, 1], [60, 120]))
+                                    np.repeat([0, 1], [60, 120]), np.arange(180))
     first, second = localization._places(matched, localization._Look(features, seen, CAMERA))
     assert pose_error(first.map_from_camera, room)[0] < 1e-3
     assert pose_error(second.map_from_camera, poster)[0] < 1e-3
