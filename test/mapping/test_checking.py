@@ -23,7 +23,7 @@ from cliploc_ros.mapping.checking.detector_model import measure_detector
 from cliploc_ros.mapping.checking.grid import make_grid
 from cliploc_ros.mapping.checking.label_model import LabelModel
 from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
-from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
+from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.options import MappingOptions
@@ -138,6 +138,14 @@ def test_neighbours_that_frames_show_apart_are_no_duplicates():
     assert 0.3 < alone.distance < 0.5
     assert alone.is_duplicate
     assert not recorded.is_duplicate
+
+
+def test_a_symmetric_place_is_one_place(detections):
+    report = check_map(TABLE, detections, options=QUICK)
+    pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
+    advice = give_advice(replace(report, look_alikes=(pair,)))
+    assert any(text.startswith('the place around x 5.7, y 3.5 looks the same when turned by 180 '
+                               'degrees') for text in advice)
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])

@@ -65,7 +65,8 @@ class RelocalizerStatus:
             return (f'{self._name} has sent no diagnostics yet: it is starting, or its '
                     '/diagnostics is remapped')
         if silent_s > SILENT_S:
-            return f'{self._name} has been silent for {silent_s:.0f} s: it died; start it again'
+            return (f'{self._name} has been silent for {silent_s:.0f} s: it died, or its '
+                    'machine is overloaded; start it again if it died')
         if state != 'active':
             reason = self._report.message if self._report.message != state else \
                 'it is loading, or its lifecycle manager must configure and activate it'
