@@ -42,8 +42,9 @@ _WEIGHTS = np.linspace(0.0, 1.0, 11)
 # So many points elsewhere contradict accepted objects, whatever else they lack; a guess.
 _CONTRADICTING_INLIERS = 100
 # A dozen points can agree on a pose that is far off, by more than their covariance says: on the
-# demo, 12 points were wrong by .89 m and claimed some 4 cm. A guess.
-_WEAK_COVARIANCE = 100.0
+# demo, 12 points were wrong by .89 m and claimed some 4 cm. From so many points on, poses of the
+# kitchen were as good as their covariance, whatever else made them weak. A guess.
+_GOOD_COVARIANCE_INLIERS = 40
 # Poses of objects that propose keyframes.
 _MOST_GUESSES = 3
 
@@ -112,15 +113,13 @@ def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere 
     refusal = refusal_of(seen, there, chance, options)
     if agree:
         return _both(found, seen, chance, refusal, options)
-    if found.accepted:
-        return replace(found, accepted=False, reason=_contradiction(found, seen),
-                       refusal_kind=RefusalKind.CONTRADICTION) \
-            if _contradicts(seen, found, options) else found
-    if not refusal and found.confidence >= _CONTRADICTS:
+    if found.accepted and not _contradicts(seen, found, options):
+        return found
+    if found.accepted or (not refusal and found.confidence >= _CONTRADICTS):
         refusal = _contradiction(found, seen)
-        found = replace(found, refusal_kind=RefusalKind.CONTRADICTION)
-    reason = f'{found.reason}; keyframes: {refusal}' if refusal else ''
-    if refusal and found.confidence >= chance:
+        found = replace(found, accepted=False, refusal_kind=RefusalKind.CONTRADICTION)
+    reason = '; keyframes: '.join(filter(None, (found.reason, refusal))) if refusal else ''
+    if refusal and found.confidence >= chance:  # of two refused poses, the likelier leads
         return replace(found, reason=reason)
     return _with_pose(found, seen.map_from_camera, seen.covariance, chance, 'keyframes', reason)
 
@@ -130,14 +129,14 @@ def _both(found: Relocalization, seen: Recognized, chance: float, refusal: str,
     """Return the answer of two poses that agree.
 
     A strong pose of keyframes stays as it is: objects are rougher (measured on the kitchen's
-    halves, fusing them cost .08 at .1 m). A weak one is fused, with a larger covariance than its
-    own. Each is wrong with its own probability, and both lead to the same wrong place only by
-    chance: the product is an upper bound where their errors are independent.
+    halves, fusing them cost .08 at .1 m). A weak one is fused, with a larger covariance if it
+    has few points. Each is wrong with its own probability, and both lead to the same wrong place
+    only by chance: the product is an upper bound where their errors are independent.
     """
     assert found.map_from_camera is not None and found.covariance is not None
     pose, covariance = (seen.map_from_camera, seen.covariance) if not refusal else fuse(
         found.map_from_camera, found.covariance, seen.map_from_camera,
-        _WEAK_COVARIANCE * seen.covariance)
+        max(1.0, _GOOD_COVARIANCE_INLIERS / seen.inliers) ** 4 * seen.covariance)
     confidence = min(MOST_CONFIDENCE, 1.0 - (1.0 - found.confidence) * (1.0 - chance))
     reason = '' if found.accepted or confidence >= options.min_confidence else \
         f'{found.reason}; keyframes: {refusal}'

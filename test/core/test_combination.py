@@ -9,6 +9,7 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.acceptance.recognition import ObjectsThere, objects_there
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.combination import combine, fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
@@ -51,12 +52,26 @@ def test_many_points_accept_what_objects_could_not():
 
 
 def test_a_weak_pose_of_keyframes_improves_that_of_objects():
-    weak = by_keyframes(0.0, inliers=9, confirmed=0.4)
+    weak = by_keyframes(0.0, inliers=60, confirmed=0.2)  # of few cells
     found = combine(by_objects(0.1, 0.995, True), weak, SOME, OPTIONS)
     assert found.accepted
     assert found.source == 'both'
     assert pose_error(found.map_from_camera, at(0.0))[0] < 0.01
     assert not combine(by_objects(0.1, 0.5, False), weak, SOME, OPTIONS).accepted
+
+
+def test_a_dozen_points_hardly_move_the_pose_of_objects():
+    few = by_keyframes(0.0, inliers=12, confirmed=0.2)
+    found = combine(by_objects(0.1, 0.995, True), few, SOME, OPTIONS)
+    assert found.accepted
+    assert pose_error(found.map_from_camera, at(0.1))[0] < 0.01
+
+
+def test_of_two_poses_that_contradict_each_other_the_likelier_leads():
+    found = combine(by_objects(5.0, 0.93, True), by_keyframes(0.0), SOME, OPTIONS)
+    assert not found.accepted
+    assert found.refusal_kind == RefusalKind.CONTRADICTION
+    assert pose_error(found.map_from_camera, at(0.0))[0] == 0.0
 
 
 def test_of_agreeing_poses_the_strong_one_of_keyframes_stays():
