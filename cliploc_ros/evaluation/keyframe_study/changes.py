@@ -67,10 +67,11 @@ def put_poster(image: Image, other: Image, share: float) -> Image:
 def elsewhere(frame: Frame, others: Sequence[Frame], rng: np.random.Generator) -> Frame:
     """Return a frame that looks another way, by more than 60 degrees or else the most."""
     assert frame.map_from_camera is not None
-    axes = np.array([one.map_from_camera[:3, 2] for one in others])  # type: ignore[index]
-    cosines = axes @ frame.map_from_camera[:3, 2]
+    posed = [(one, one.map_from_camera[:3, 2]) for one in others
+             if one.map_from_camera is not None]
+    cosines = np.array([axis for _, axis in posed]) @ frame.map_from_camera[:3, 2]
     away = np.nonzero(cosines < _AWAY_COS)[0]
-    return others[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
+    return posed[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))][0]
 
 
 def twin_map(landmark_map: LandmarkMap, removed: int, rng: np.random.Generator) -> LandmarkMap:
