@@ -66,7 +66,8 @@ class MapServices:
     def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
             description = self._node.worker.run(self._pipeline.reload_map)
-            response.message = f'loaded: {description}'
+            assert self._pipeline.localizer is not None
+            response.message = f'loaded: {description}; map {self._pipeline.localizer.map_hash}'
             response.success = True
         except CliplocError as error:
             response.message = f'not loaded: {error}'
