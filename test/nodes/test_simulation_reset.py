@@ -192,6 +192,8 @@ def test_a_request_goes_on_across_a_reset(world, tester):
     assert 'time jumped back by ' in world.process.output()
 
 
+# on a busy machine the time-out may end the request before the jump is noticed
+@pytest.mark.flaky(reruns=2)
 def test_a_frame_from_before_that_comes_late_is_not_answered(world, tester):
     """No other frame comes, and the robot is elsewhere."""
     assert tester.set_parameter('timeout_s', 2.0).successful
