@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 # Shares of the budget at which the search and the refinement end; acceptance takes the rest.
 _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
-# Both end earlier by this time [s] for each further frame, since poses are scored on all frames.
-# A budget below _SHORT_BUDGET_S scales these times down.
-_EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0025, 0.001, 0.05
+# Both end earlier by this time [s] for each further frame, up to four, since poses are scored and
+# compared on all frames. A budget below _SHORT_BUDGET_S scales these times down.
+_EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0045, 0.002, 0.05
+_MOST_FURTHER_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -50,4 +51,5 @@ class TimeBudget:
 
     def _time_s(self, share: float, earlier_s: float) -> float:
         scale = min(1.0, self.total_s / _SHORT_BUDGET_S)
-        return share * self.total_s - scale * earlier_s * (self.frames - 1)
+        further = min(self.frames - 1, _MOST_FURTHER_FRAMES)
+        return share * self.total_s - scale * earlier_s * further

@@ -160,24 +160,26 @@ def _rarities(landmark_map: LandmarkMap, landmarks: NDArray[np.int64],
 def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
                       objects: NDArray[np.int64]) -> list[Match]:
     """Return the best match of each landmark's object and of each box."""
-    distinct: list[Match] = []
+    distinct, boxes, taken = [], list[list[float]](), set[int]()
     for match in sorted(matches, key=lambda match: -match.iou):
-        boxes = bboxes_xyxy[[other.detection for other in distinct]]
-        if objects[match.landmark] in objects[[other.landmark for other in distinct]]:
-            continue
-        if (_box_iou(bboxes_xyxy[match.detection], boxes) > _SAME_BOX_IOU).any():
+        owner, box = int(objects[match.landmark]), bboxes_xyxy[match.detection].tolist()
+        if owner in taken or any(_box_iou(box, other) > _SAME_BOX_IOU for other in boxes):
             continue
         distinct.append(match)
+        boxes.append(box)
+        taken.add(owner)
     return distinct
 
 
-def _box_iou(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the IoU of a box (4,) with others (m, 4)."""
-    others = others.reshape(-1, 4)
-    overlap = np.prod(np.maximum(0.0, np.minimum(box[2:], others[:, 2:])
-                                 - np.maximum(box[:2], others[:, :2])), axis=1)
-    areas = np.prod(others[:, 2:] - others[:, :2], axis=1)
-    return overlap / (np.prod(box[2:] - box[:2]) + areas - overlap)
+def _box_iou(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the IoU of two boxes; a few plain numbers are faster than arrays here."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    if width <= 0.0 or height <= 0.0:
+        return 0.0
+    overlap = width * height
+    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
+    return overlap / (areas - overlap)
 
 
 def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
