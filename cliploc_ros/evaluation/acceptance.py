@@ -41,7 +41,8 @@ from cliploc_ros.parallel import run_tasks
 
 _MATCHINGS = ('hybrid', 'class')
 _THRESHOLDS = (0.99, 0.97, 0.95, 0.9)
-# So low that only what has nothing to do with the confidence refuses a pose.
+# So low that only what has nothing to do with the confidence refuses a pose. All crops are
+# compared: on demand, such a pose would be taken from the first of them.
 _LOWEST = 1e-6
 _SEED = 7
 
@@ -92,7 +93,7 @@ def _search(task: Task, place: Place, is_elsewhere: bool) -> Iterator[Outcome]:
         rng = np.random.default_rng(_SEED)
         landmark_map = exchange_landmarks(landmark_map, queries, 1.0, rng)[0]
     options = place.options(task.mode, RelocalizerOptions(
-        matching=task.matching, min_confidence=_LOWEST))
+        matching=task.matching, min_confidence=_LOWEST, crops='all'))
     method = Method(AUTO, replace(options, k=min(options.k, len(landmark_map))))
     for one in run_trial(landmark_map, method, 0, queries):
         yield Outcome(task.name, task.mode, task.matching, is_elsewhere,
