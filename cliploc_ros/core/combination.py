@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.agreement import agreeing_poses
+from cliploc_ros.core.acceptance.confidence import MOST_CONFIDENCE
 from cliploc_ros.core.acceptance.recognition import (
-    MOST_CONFIDENCE,
     NO_OBJECTS,
     ObjectsThere,
     chance_recognized,

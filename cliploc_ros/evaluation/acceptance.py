@@ -22,8 +22,9 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.evaluation.confidence_fit import RIGHT_M, best_recall, draw_judged
+from cliploc_ros.evaluation.confidence_fit import best_recall, draw_judged
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.places import (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.agreement import agreeing_poses
+from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT
 from cliploc_ros.core.acceptance.confidence import (
     DEFAULT,
@@ -27,7 +27,6 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.summary import wilson_interval
 
-RIGHT_M = 1.0
 #: Confidences (n,), and whether each pose is right (n,).
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)

@@ -15,15 +15,13 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
 from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
+from cliploc_ros.evaluation.worlds.modes import HEIGHT_M, MODES, STEP_DEG, STEP_M
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
 
-ONE, UPRIGHT, LEVEL = 'one image', 'vertical', 'vertical, height'
-FIVE, ALL = 'five images', 'five, vertical, height'
-#: What is known besides one image: the vertical and the height, odometry of further images.
-MODES = (ONE, UPRIGHT, LEVEL, FIVE, ALL)
-# Deviations of honest sensors, and by how much the height range exceeds the true heights.
-_VERTICAL_DEG, _ODOMETRY, _HEIGHT_M = 1.0, (0.01, 0.5), 0.2
+ONE, UPRIGHT, LEVEL, FIVE, ALL = MODES
+# Deviation of an honest vertical.
+_VERTICAL_DEG = 1.0
 _SEED = 7
 
 
@@ -52,7 +50,7 @@ class Place(NamedTuple):
         if mode in (UPRIGHT, LEVEL, ALL):
             queries = with_vertical(queries, _VERTICAL_DEG, _SEED)
         if is_fused:
-            queries = with_neighbours(queries, self.groups, *_ODOMETRY, _SEED)
+            queries = with_neighbours(queries, self.groups, STEP_M, STEP_DEG, _SEED)
         return [one for one, is_main in zip(queries, self.is_main, strict=True)
                 if is_main or (self.every_frame and not is_fused)]
 
@@ -61,8 +59,8 @@ class Place(NamedTuple):
         if mode not in (LEVEL, ALL):
             return options
         heights = [one.map_from_camera[2, 3] for one in self.frames]
-        return replace(options, height_range_m=(min(heights) - _HEIGHT_M,
-                                                max(heights) + _HEIGHT_M))
+        return replace(options, height_range_m=(min(heights) - HEIGHT_M,
+                                                max(heights) + HEIGHT_M))
 
 
 class Recording(NamedTuple):

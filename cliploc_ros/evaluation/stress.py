@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation import sensors, troubles
@@ -35,7 +36,6 @@ from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, run_trial
 from cliploc_ros.parallel import run_tasks
 
-_RIGHT_M = 1.0
 _SEED = 7
 
 Sensor = Callable[[Sequence[Query]], Sequence[Query]]
@@ -117,7 +117,7 @@ def try_place(place: Place, trouble: Trouble, matching: str) -> Iterator[Outcome
                                               np.random.default_rng(_SEED))
         options = replace(options, k=min(options.k, len(changed)))
         found = run_trial(changed, Method(AUTO, options), 0, queries)
-        right = np.array([one.error_m is not None and one.error_m <= _RIGHT_M for one in found],
+        right = np.array([one.error_m is not None and one.error_m <= RIGHT_M for one in found],
                          dtype=np.bool_)
         accepted = np.array([one.accepted for one in found], dtype=np.bool_)
         yield Outcome(trouble.name, mode, len(found), int(right.sum()), int(accepted.sum()),

@@ -73,7 +73,7 @@ def test_what_all_cases_have_in_common_keeps_its_coefficient():
 
 
 def test_places_elsewhere_lower_the_confidence_by_their_share():
-    """They count for a tenth: so many of all poses of these supports are right."""
+    """They have a weight of one tenth, so the share of right poses falls by a factor of 1.1."""
     cases = make_cases(np.random.default_rng(4), 1000)
     wrong = [replace(case, is_elsewhere=True, right=np.zeros_like(case.right)) for case in cases]
     likely, right = outcomes(cases, fit([*cases, *wrong]))

@@ -21,8 +21,8 @@ from cliploc_ros.core.acceptance.support import Support
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
-# The data are too few to justify a higher confidence.
-_MOST_CONFIDENCE = 0.9999
+#: The data are too few to justify a higher confidence.
+MOST_CONFIDENCE = 0.9999
 
 
 class Setting(NamedTuple):
@@ -113,14 +113,14 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64], setting
     shares = np.exp(np.append(odds, none) - max(odds.max(), none))
     shares = shares[:-1] / shares.sum()
     agreeing = agreeing_poses(poses)
-    likely = np.clip(agreeing @ shares, 1.0 - _MOST_CONFIDENCE, _MOST_CONFIDENCE)
+    likely = np.clip(agreeing @ shares, 1.0 - MOST_CONFIDENCE, MOST_CONFIDENCE)
     log_odds = np.log(likely / (1.0 - likely))
     log_odds += calibration.slope * np.maximum(0.0, log_odds - calibration.knee)
     sharpened = 1.0 / (1.0 + np.exp(-log_odds))
     lead = int(np.argmax(likely))
     # the other places lose what the leading place gains
     lost = (1.0 - sharpened[lead]) / (1.0 - likely[lead])
-    return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), _MOST_CONFIDENCE)
+    return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), MOST_CONFIDENCE)
 
 
 def utilities(supports: Sequence[Support], calibration: Calibration = DEFAULT

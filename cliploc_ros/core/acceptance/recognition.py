@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.acceptance.confidence import MOST_CONFIDENCE
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -29,8 +30,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 _INLIERS, _CONFIRMED, _EXPLAINED, _UNEXPLAINED, _NONE = 5.0, 6.0, 0.7, -0.7, -15.3
 # Of the inliers, so many are lost for each that a pose elsewhere has.
 _RIVAL_COUNTS = 3.0
-#: The most that a confidence says.
-MOST_CONFIDENCE = 0.9999
 # Features alone are accepted only where they confirm so much of the image.
 _LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 20
 # As many points elsewhere contradict a pose; of 231 right poses of the kitchen, none had more

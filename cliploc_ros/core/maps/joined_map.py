@@ -21,8 +21,8 @@ from cliploc_ros.errors import MapError
 
 #: The most maps of a request: each adds candidates, which share the time budget.
 MAX_MAPS = 100
-# Maps are apart by so many of the greatest semi-axes. Landmarks halfway away cannot match the
-# smallest box that is used, a pixel wide, with focal lengths below 10,000 px (IoU above .2).
+# Distance between joined maps, in multiples of the largest semi-axis. A landmark half that far
+# away cannot match even a box one pixel wide, at focal lengths below 10,000 px (IoU above .2).
 _APART = 100_000.0
 
 

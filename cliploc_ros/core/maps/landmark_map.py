@@ -40,7 +40,8 @@ _MAX_COORDINATE_M = 1e7
 _MAX_QUATERNION_NORM_ERROR = 0.01
 # Distance of two classes in the tree that has the class as a fourth coordinate.
 _CLASS_DISTANCE_M = 10.0
-# A landmark is compared with so many of its class, nearer than this, to find duplicates.
+# To find duplicates, each landmark is compared with its three nearest neighbours of the same class
+# within this distance.
 _COMPARED, _NEAR_M = 3, 0.5
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -28,7 +29,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.confidence_fit import RIGHT_M, draw_judged
+from cliploc_ros.evaluation.confidence_fit import draw_judged
 from cliploc_ros.evaluation.sensors import with_mount_error, with_neighbours
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, make_queries

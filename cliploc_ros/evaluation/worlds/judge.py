@@ -17,12 +17,13 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.confidence_fit import RIGHT_M, draw_judged
+from cliploc_ros.evaluation.confidence_fit import draw_judged
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.worlds.modes import MODES, Request, requests
 from cliploc_ros.evaluation.worlds.places import KINDS

@@ -14,8 +14,8 @@ from cliploc_ros.evaluation.worlds.world import World
 
 #: What is known besides one image.
 MODES = ('one image', 'vertical', 'vertical, height', 'five images', 'five, vertical, height')
-# Deviations of the simulated sensors.
-_STEP_M, _STEP_DEG, _HEIGHT_M = 0.01, 0.5, 0.2
+#: Deviations of a step of odometry, and by how much the height range exceeds the true heights.
+STEP_M, STEP_DEG, HEIGHT_M = 0.01, 0.5, 0.2
 
 
 class Request(NamedTuple):
@@ -48,9 +48,9 @@ def requests(world: World, seed: int, options: RelocalizerOptions) -> Iterator[R
     """
     heights = [one.map_from_camera[2, 3] for one in world.queries]
     options = replace(options, k=min(options.k, len(world.landmark_map)))
-    known = replace(options, height_range_m=(min(heights) - _HEIGHT_M, max(heights) + _HEIGHT_M))
+    known = replace(options, height_range_m=(min(heights) - HEIGHT_M, max(heights) + HEIGHT_M))
     level = with_vertical(world.queries, options.vertical_deviation_deg, seed)
-    odometry = (world.groups, _STEP_M, _STEP_DEG, seed)
+    odometry = (world.groups, STEP_M, STEP_DEG, seed)
     for mode, queries, its in zip(MODES, (
             world.queries, level, level, with_neighbours(world.queries, *odometry),
             with_neighbours(level, *odometry)), (options, options, known, options, known),
