@@ -49,6 +49,15 @@ def test_a_written_map_is_read_back(tmp_path):
     assert loaded.quats_xyzw == pytest.approx(room.quats_xyzw, abs=2e-5)
 
 
+@pytest.mark.parametrize('label', ['a 😀 cup', 'Käfer ☕', '\\ud83d\\ude00', 'a\u2028b "\\'])
+def test_any_text_is_read_back(tmp_path, label):
+    room = make_room()
+    write_map(tmp_path / 'map.yaml', replace(room, labels=(label, *room.labels[1:])))
+    assert LandmarkMap.from_file(tmp_path / 'map.yaml').labels[0] == label
+    tree = read_parameter_file(tmp_path / 'map.yaml')['/**']['ros__parameters']['map']
+    assert tree['landmarks'][room.landmark_ids[0]]['label'] == label
+
+
 def test_tiny_weights_stay_above_zero(tmp_path):
     tiny = LandmarkDetails(labels=(('a cup', 1.0), ('a mug', 1e-9)),
                            class_weights=(('cup', 1.0), ('bowl', 1e-9)))

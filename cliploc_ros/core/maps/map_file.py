@@ -110,8 +110,11 @@ def _weight(weight: float) -> float:
 
 
 def _quoted(text: str) -> str:
-    """Return text as YAML: a JSON string is one, whatever the text holds."""
-    return json.dumps(text, ensure_ascii=True)
+    """Return text as YAML: a JSON string is one, except beyond 16 bits, as of an emoji."""
+    if max(text, default='') <= '\uffff':
+        return json.dumps(text)
+    return '"' + ''.join(f'\\U{ord(one):08x}' if one > '\uffff' else json.dumps(one)[1:-1]
+                         for one in text) + '"'
 
 
 def _floats(values: Iterable[float] | NDArray[np.float64]) -> str:
