@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.command import run_command
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import DIMENSIONS
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -79,7 +80,7 @@ def _memory_mib() -> float:
     return int(status.split('VmRSS:')[1].split()[0]) / 1024
 
 
-def main() -> None:
+def run() -> int:
     """Print one line for the layer as it is and one for the large one."""
     parser = argparse.ArgumentParser(prog='keyframes', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -93,7 +94,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.ask is not None:
         print(json.dumps(ask(options.map, options.ask, options.rgbd, options.requests)))
-        return
+        return 0
     small = layer_path(options.map)
     layer = load_layer_of_map(small, LandmarkMap.from_file(options.map))
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_keyframes_') as folder:
@@ -103,7 +104,13 @@ def main() -> None:
             subprocess.run([sys.executable, '-m', 'cliploc_ros.benchmark.keyframes', options.map,
                             '--rgbd', options.rgbd, '--requests', str(options.requests),
                             '--ask', file], check=True)
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(run)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.confidence_fit import best_recall, draw_judged
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.output import make_folder
@@ -174,6 +175,8 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write outcomes.json and draw a reliability diagram there')
     options = parser.parse_args(arguments)
+    if not all(0.0 <= one <= 1.0 for one in options.min_confidence):
+        raise OptionsError('--min-confidence must be from 0 to 1')
     tasks = [Task(place.name, place, mode, matching) for place in chosen_places(options)
              for matching in _MATCHINGS for mode in MODES]
     found = {}

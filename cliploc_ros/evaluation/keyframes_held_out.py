@@ -28,6 +28,7 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.frames import Frame, Frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.keyframe_study.asking import Place, Row, query_of, table
 from cliploc_ros.evaluation.keyframe_study.changes import (
     elsewhere,
@@ -41,6 +42,8 @@ from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+_ROOM_MODEL = Path(__file__).parents[1] / 'demo' / 'assets' / 'yolo.pt'
 
 _EVERY_IMAGE = LayerOptions(0.0, 0.0)
 _POSTER_SHARES = (0.3, 0.6)
@@ -133,7 +136,7 @@ def run(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog='keyframes_held_out', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--rooms', type=Path, nargs='*', default=[], metavar='DIR')
-    parser.add_argument('--room-model', default='cliploc_ros/demo/assets/yolo.pt',
+    parser.add_argument('--room-model', default=str(_ROOM_MODEL),
                         help='weights of YOLO for the rooms (%(default)s)')
     parser.add_argument('--office', type=Path, metavar='DIR', help='the folder of TUM fr3')
     parser.add_argument('--office-model', default='', help='weights of YOLO for the office')
@@ -142,6 +145,8 @@ def run(arguments: list[str]) -> int:
                         help='of queries that must not be accepted, take each N-th (%(default)s)')
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args(arguments)
+    if not options.rooms and options.office is None:
+        raise OptionsError('nothing to measure: give --rooms or --office')
     cv2.setNumThreads(1)
     make_folder(options.out)
     places = list(sites(options.rooms, options.room_model, options.office, options.office_model))

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation import acceptance
 from cliploc_ros.evaluation.acceptance import Outcome
 from cliploc_ros.evaluation.places import ALL, FIVE, MODES, ONE, Simulated
@@ -54,3 +55,10 @@ def test_a_place_elsewhere_has_false_accepts_only():
     row = cells(acceptance.elsewhere_table(outcomes, [0.97]).splitlines()[2])
     assert row[:2] == ['room', '2']
     assert row[2].startswith('1 [')
+
+
+@pytest.mark.parametrize('words', [[], ['--worlds', '1', '--min-confidence', 'nan'],
+                                   ['--queries', '/nowhere.npz', '--map', '/nowhere.yaml']])
+def test_bad_options_are_named(words):
+    with pytest.raises(CliplocError):
+        acceptance.run(words)
