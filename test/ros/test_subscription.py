@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
 import threading
+import time
 from contextlib import suppress
 
 import pytest
@@ -40,6 +41,11 @@ class Ear:
 
     def withdraw(self, publisher):
         self._speaker.destroy_publisher(publisher)
+
+    def endpoints(self):
+        """Return the identity of every subscription there is, as the publishers' node sees."""
+        return [bytes(info.endpoint_gid) for info in
+                self._speaker.get_subscriptions_info_by_topic(self.topic)]
 
     def policies(self):
         """Return the reliability of every subscription there is, as the publishers' node sees."""
@@ -150,6 +156,40 @@ def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
         spin()
     wait(lambda: beside, 'a message of the other subscription', work)
     executor.shutdown()
+
+
+def test_after_an_empty_message_it_subscribes_anew(ear):
+    """What Fast DDS leaves of an image that was on its way as the subscription came."""
+    publisher = ear.offer(RELIABLE)
+    ear.wait_for_hearing(publisher, 'before')
+    former, = ear.endpoints()
+    publisher.publish(b'')
+    ear.wait(lambda: ear.endpoints() not in ([], [former]), 'another subscription')
+    ear.wait_for_policies(RELIABLE)
+    ear.wait_for_hearing(publisher, 'after')
+
+
+def test_a_publisher_of_empty_messages_does_not_keep_it_busy(ear):
+    publisher = ear.offer(RELIABLE)
+    ear.wait_for_hearing(publisher, 'before')
+    seen, end = set(ear.endpoints()), time.monotonic() + 2.0
+
+    def publish():
+        publisher.publish(b'')
+        seen.update(ear.endpoints())
+    ear.wait(lambda: time.monotonic() > end, 'two seconds', publish)
+    assert 2 <= len(seen) <= 4  # once a second
+    ear.wait_for_hearing(publisher, 'after')
+
+
+def test_a_message_that_cannot_be_read_is_dropped(ear):
+    publisher = ear.offer(RELIABLE)
+    ear.wait_for_hearing(publisher, 'before')
+    former = ear.endpoints()
+    publisher.publish(b'\x00\x01\x00\x00nonsense')
+    ear.wait_for_hearing(publisher, 'after')
+    assert {msg.frame_id for msg in ear.heard} == {'before', 'after'}
+    assert ear.endpoints() == former
 
 
 def test_destroyed_it_hears_nobody_and_stays_away(ear):
