@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.benchmark.floors import CAMERA, SeenFloor, make_floor, see_floor
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.maps.joined_map import join_maps
@@ -39,7 +40,6 @@ from cliploc_ros.evaluation.worlds.things import CLASS_NAMES
 _OF_CLASS, _NOISE = 0.775, 5.6
 _LEAST_BOXES = 5
 _FRAMES = 400
-_RIGHT_M = 1.0
 
 
 class Query(NamedTuple):
@@ -138,7 +138,7 @@ def show(name: str, options: argparse.Namespace, requests: Sequence[tuple[Query,
         found, part = in_its_map(found, where.landmark_map)
         is_right = (found.map_from_camera is not None
                     and part.landmark_map.frame_id == f'floor_{query.floor}'
-                    and pose_error(found.map_from_camera, query.map_from_camera)[0] <= _RIGHT_M)
+                    and pose_error(found.map_from_camera, query.map_from_camera)[0] <= RIGHT_M)
         right += is_right
         accepted += found.accepted
         false += found.accepted and not is_right

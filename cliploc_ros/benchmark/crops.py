@@ -17,6 +17,7 @@ import numpy as np
 
 import cliploc_ros
 from cliploc_ros.command import run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -35,7 +36,6 @@ from cliploc_ros.models.yolo_weights import YoloOptions
 
 _ASSETS = Path(cliploc_ros.__file__).parent / 'demo' / 'assets'
 _INFERENCES = ('pytorch', 'openvino')
-_RIGHT_M = 1.0
 _LIMITS_M = (0.25, 0.5, 1.0)
 _MAX_DETECTIONS = 50
 
@@ -106,7 +106,7 @@ def describe(answers: Sequence[Answer]) -> str:
     """Return a row of the table."""
     errors = np.array([one.error_m for one in answers])
     accepted = np.array([one.accepted for one in answers])
-    right = errors < _RIGHT_M
+    right = errors < RIGHT_M
     compared = sum(one.compared for one in answers) / max(sum(one.crops for one in answers), 1)
     wall, cpu, detect = (np.array([getattr(one, name) for one in answers])
                          for name in ('wall_s', 'cpu_s', 'detect_s'))

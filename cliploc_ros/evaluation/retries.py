@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -34,7 +35,6 @@ from cliploc_ros.evaluation.troubles import exchange_landmarks
 
 LOOKS = 20
 _PERIOD_NS = 100_000_000
-_RIGHT_M = 1.0
 # What a detector does to the same view another time. Guesses.
 _MISSED_SHARE = 0.2
 _SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
@@ -114,11 +114,11 @@ def _report(name: str, robots: Sequence[Retries]) -> str:
     first = sum(bool(one.accepted[0]) for one in robots)
     alone = sum(bool(one.alone.any()) for one in robots)
     accepted = sum(bool(one.accepted.any()) for one in robots)
-    wrong = sum(one.first_error_m > _RIGHT_M for one in robots)
+    wrong = sum(one.first_error_m > RIGHT_M for one in robots)
     return (f'{name}:\n  accepted at the first look: {_share(first, total)}\n'
             f'  within {LOOKS} looks, each alone: {_share(alone, total)}\n'
             f'  within {LOOKS} looks that agree: {_share(accepted, total)}\n'
-            f'  more than {_RIGHT_M:g} m off: {wrong}')
+            f'  more than {RIGHT_M:g} m off: {wrong}')
 
 
 def run(arguments: list[str]) -> int:

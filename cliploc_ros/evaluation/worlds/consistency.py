@@ -20,6 +20,7 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_difference
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -34,7 +35,6 @@ from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
 
 MODES = ('one image', 'vertical', 'five images', 'five, vertical')
-_RIGHT_M = 1.0
 # Deviations of the simulated sensors.
 _VERTICAL_DEG, _STEP_M, _STEP_DEG = 1.0, 0.01, 0.5
 
@@ -83,7 +83,7 @@ def squares_of(landmark_map: LandmarkMap, queries: Sequence[Query], groups: Sequ
                 continue
             assert found.map_from_camera is not None and found.covariance is not None
             error = pose_difference(found.map_from_camera, query.map_from_camera)
-            if np.linalg.norm(error[:3]) < _RIGHT_M:
+            if np.linalg.norm(error[:3]) < RIGHT_M:
                 yield mode, tuple(float(one @ np.linalg.solve(own, one)) for one, own in (
                     (error, found.covariance), (error[:3], found.covariance[:3, :3]),
                     (error[3:], found.covariance[3:, 3:])))
