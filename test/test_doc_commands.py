@@ -69,6 +69,11 @@ def program_of(command: Command) -> tuple[str, list[str]]:
     return (f'cliploc_ros.nodes.{name}', rest) if name in NODES else ('', [])
 
 
+# runpy warns of a module that it runs and that another test has imported.
+AS_MAIN = pytest.mark.filterwarnings('ignore:.* found in sys.modules:RuntimeWarning')
+
+
+@AS_MAIN
 @pytest.mark.parametrize('command', commands(), ids=str)
 def test_a_command_is_accepted(command, capsys):
     module, arguments = program_of(command)
@@ -139,6 +144,7 @@ def check_script(script: str, *arguments: str) -> None:
         assert not word.startswith('test/') or (PROJECT / word).exists(), word
 
 
+@AS_MAIN
 @pytest.mark.parametrize('command', [one for one in inline_commands() if program_of(one)[0]],
                          ids=str)
 def test_an_option_in_a_sentence_exists(command):

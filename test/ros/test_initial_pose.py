@@ -5,12 +5,14 @@
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import MultiThreadedExecutor
 from std_srvs.srv import Empty
 
@@ -80,7 +82,11 @@ def robot(context, make_node, wait):
     executor = MultiThreadedExecutor(4, context=context)
     for node in (robot.node, robot.localizer.node):
         executor.add_node(node)
-    spinning = threading.Thread(target=executor.spin)
+
+    def spin():
+        with suppress(InvalidHandle):  # the shutdown below may come while it waits
+            executor.spin()
+    spinning = threading.Thread(target=spin)
     spinning.start()
     yield robot
     robot.localizer.may_answer.set()
