@@ -92,6 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
 def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.core.keyframes.layer_file import remove_layer
     from cliploc_ros.core.maps.map_file import write_map
 
     begin = time.monotonic()
@@ -108,7 +109,10 @@ def build(options: argparse.Namespace) -> int:
     made = _build(options, detections, labeller) if old is None else _update(
         options, old, detections, labeller)
     write_map(options.out, made.landmark_map, made.comments, made.embeddings)
-    lines = made.lines + write_layer(options, made.landmark_map)
+    lines = made.lines
+    if old is None or options.out.resolve() != options.update.resolve():
+        lines += filter(None, [remove_layer(options.out)])
+    lines += write_layer(options, made.landmark_map)
     if options.report is not None:
         _write_report(options.report, made.report)
     print('\n'.join(lines))

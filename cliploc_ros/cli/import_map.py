@@ -89,6 +89,7 @@ def make_parser() -> argparse.ArgumentParser:
 def import_map(options: argparse.Namespace) -> int:
     """Import as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.core.keyframes.layer_file import remove_layer
     from cliploc_ros.core.maps.map_file import write_map
     from cliploc_ros.datasets.map_formats.given_map import place
 
@@ -105,6 +106,8 @@ def import_map(options: argparse.Namespace) -> int:
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
                *result.lines[:1]])
+    if note := remove_layer(options.out):
+        print(note)
     if options.report is not None:
         _write_report(options.report, result)
     print('\n'.join(printable(line) for line in result.lines))

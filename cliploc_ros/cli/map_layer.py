@@ -48,6 +48,9 @@ def check_layer_options(options: argparse.Namespace) -> None:
             raise OptionsError(f'--keyframe-layer is not for --{name}: keyframes need the images '
                                'of the recording that the map is built from; give --bag, --tum or '
                                '--rgbd')
+    if options.every > 1:
+        raise OptionsError('--keyframe-layer is not for --every: choose frames with '
+                           '--keyframes METRES DEGREES')
     if options.refine_mount:
         raise OptionsError('--keyframe-layer is not for --refine-mount: build again with the '
                            'corrected --mount')

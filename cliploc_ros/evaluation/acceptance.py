@@ -13,13 +13,11 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
@@ -36,10 +34,10 @@ from cliploc_ros.evaluation.places import (
     add_arguments,
     chosen_places,
 )
+from cliploc_ros.evaluation.run import run_all
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Result, run_trial
 from cliploc_ros.evaluation.troubles import exchange_landmarks
-from cliploc_ros.parallel import run_tasks
 
 _MATCHINGS = ('hybrid', 'class')
 _THRESHOLDS = (0.99, 0.97, 0.95, 0.9)
@@ -179,11 +177,7 @@ def run(arguments: list[str]) -> int:
         raise OptionsError('--min-confidence must be from 0 to 1')
     tasks = [Task(place.name, place, mode, matching) for place in chosen_places(options)
              for matching in _MATCHINGS for mode in MODES]
-    found = {}
-    with closing(run_tasks(_make_search, tasks, workers=options.workers)) as results:
-        for task, outcomes in tqdm(results, 'searches', len(tasks), disable=None):
-            found[task] = outcomes or []
-    every = [one for task in tasks for one in found[task]]
+    every = run_all(_make_search, tasks, 'searches', options.workers)
     print(table(every, options.min_confidence))
     print()
     print(elsewhere_table(every, options.min_confidence))

@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import batched
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -16,7 +18,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
-from cliploc_ros.parallel import run_tasks
+from cliploc_ros.parallel import MakeWork, run_tasks
 
 # A stopped run loses at most this many queries of each core.
 _QUERIES_A_PART = 8
@@ -25,6 +27,33 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 class RunError(CliplocError):
     """The run could not be finished."""
+
+
+def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
+    """Return the outcomes of all tasks, in their order; show a progress bar.
+
+    Parameters
+    ----------
+    make_search : MakeWork
+        Makes the function that returns the outcomes of a task, a sequence.
+    tasks : sequence of hashable
+    what : str
+        Name of the tasks in the plural.
+    workers : int
+
+    Raises
+    ------
+    RunError
+        Workers died at a task: without its outcomes the rest would not be a fair sample.
+    """
+    found = {}
+    with closing(run_tasks(make_search, tasks, workers=workers)) as results:
+        for task, outcomes in tqdm(results, what, len(tasks), disable=None):
+            if outcomes is None:
+                raise RunError(f'workers died again and again at one of the {what}; use fewer '
+                               '--workers')
+            found[task] = outcomes
+    return [one for task in tasks for one in found[task]]
 
 
 class _Part(NamedTuple):

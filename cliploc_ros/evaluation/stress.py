@@ -10,12 +10,10 @@ the share of the right poses that is accepted.
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
@@ -32,9 +30,9 @@ from cliploc_ros.evaluation.places import (
     add_arguments,
     chosen_places,
 )
+from cliploc_ros.evaluation.run import run_all
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, run_trial
-from cliploc_ros.parallel import run_tasks
 
 _SEED = 7
 
@@ -153,12 +151,7 @@ def run(arguments: list[str]) -> int:
              if any(text in trouble.name for text in options.only)]
     if not tasks:
         raise OptionsError('nothing to test: --only must name a trouble')
-    found = {}
-    work = MakeTrial(options.matching)
-    with closing(run_tasks(work, tasks, workers=options.workers)) as results:
-        for task, outcomes in tqdm(results, 'troubles', len(tasks), disable=None):
-            found[task] = outcomes or []
-    print(table([one for task in tasks for one in found[task]]))
+    print(table(run_all(MakeTrial(options.matching), tasks, 'troubles', options.workers)))
     return 0
 
 

@@ -41,6 +41,8 @@ _LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.32, 300
 _MOST_UNEXPLAINED, _LEAST_EXPLAINED = 4, 0.25
 # A detection is explained by a landmark of its class whose outline overlaps it so much.
 _EXPLAINS_IOU = 0.2
+# Points along each side of the image that tell how far it reaches.
+_STEPS = 33
 
 
 class ObjectsThere(NamedTuple):
@@ -122,9 +124,13 @@ def refusal_of(seen: Recognized, there: ObjectsThere, chance: float,
 def _inside(boxes: NDArray[np.float64], observation: Observation) -> NDArray[np.float64]:
     """Return boxes (n, 4) of the plane z = 1, cut at the border of the image."""
     camera = observation.camera
-    corners = camera.normalize_points(np.array([[0.0, 0.0], [camera.width, camera.height]]))
-    corners = np.nan_to_num(corners, nan=0.0)
-    return np.clip(boxes, np.tile(corners.min(axis=0), 2), np.tile(corners.max(axis=0), 2))
+    steps = np.linspace(0.0, 1.0, _STEPS)
+    grid = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1)
+    points = camera.normalize_points(grid.reshape(-1, 2))
+    points = points[np.isfinite(points).all(axis=1)]  # wide lenses show nothing in the corners
+    if len(points) == 0:
+        return boxes
+    return np.clip(boxes, np.tile(points.min(axis=0), 2), np.tile(points.max(axis=0), 2))
 
 
 def _overlaps(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -50,8 +50,9 @@ _HASH_DIGITS = 12
 #: Files up to this size are read into memory [bytes].
 MOST_READ = 256_000_000
 _MOST_DEVIATION = 1.0
-# A map whose landmarks of the same name have moved so far in general is another map [m].
-_MOST_MOVED_M = 1.0
+# A map whose landmarks of the same name have moved so far in general is another map [m]. An update
+# or an edit moves few of them.
+_MOST_MOVED_M = 0.25
 _MAKE_AGAIN = 'make the layer again with build_map --keyframe-layer, or remove the file'
 
 
@@ -81,6 +82,25 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
+
+
+def remove_layer(map_path: str | os.PathLike[str]) -> str:
+    """Remove the layer of a map that another one has replaced; return a note, '' without one.
+
+    Raises
+    ------
+    MapError
+        The file cannot be removed.
+    """
+    path = layer_path(map_path)
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return ''
+    except OSError as error:
+        raise MapError(f'{path}: belongs to the map before and cannot be removed: '
+                       f'{error.strerror}; remove it') from error
+    return f'removed {path}: its keyframes belonged to the map before'
 
 
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:

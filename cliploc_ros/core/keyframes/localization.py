@@ -143,7 +143,8 @@ class KeyframeLocalizer:
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
-            No further keyframe is matched then (monotonic clock) [s].
+            No further keyframe is matched then (monotonic clock) [s], and None is returned: a
+            pose elsewhere might not have been looked for.
         """
         return self.localize_features(query_features(image_rgb), camera, guesses, deadline)
 
@@ -166,7 +167,9 @@ class KeyframeLocalizer:
             more = self._more(ranks, chosen, places)
             matched = matched.join(self._match(descriptors, more, deadline))
             places = _places(matched, look)
-        return self._recognized(places, look) if places else None
+        if not places or time.monotonic() > deadline:
+            return None
+        return self._recognized(places, look)
 
     def _recognized(self, places: Sequence['_Place'], look: '_Look') -> Recognized:
         """Return the first place, with what speaks for and against it."""

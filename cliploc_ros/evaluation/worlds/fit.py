@@ -13,12 +13,10 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.confidence import Calibration, Setting
@@ -35,11 +33,11 @@ from cliploc_ros.evaluation.confidence_fit import (
     paste,
     report,
 )
+from cliploc_ros.evaluation.run import run_all
 from cliploc_ros.evaluation.troubles import exchange_landmarks
 from cliploc_ros.evaluation.worlds.modes import MODES, Request, requests
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
-from cliploc_ros.parallel import run_tasks
 
 #: The kinds that fit; the others have places that look alike.
 FITTED_KINDS = ('room', 'office', 'shop', 'bare room')
@@ -134,11 +132,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, metavar='DIR', help='draw a reliability diagram there')
     options = parser.parse_args(arguments)
     tasks = [(kind, seed) for kind in KINDS for seed in range(options.worlds)]
-    found = {}
-    with closing(run_tasks(_make_search, tasks, workers=options.workers)) as results:
-        for task, its in tqdm(results, 'worlds', len(tasks), disable=None):
-            found[task] = its or []
-    searched = [one for task in tasks for one in found[task]]
+    searched = run_all(_make_search, tasks, 'worlds', options.workers)
     calibrations = cross_fitted(searched)
     _print_report(searched, calibrations)
     if options.out is not None:

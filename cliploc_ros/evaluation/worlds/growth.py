@@ -10,7 +10,6 @@ of the poses with confidence .9 to .95, .9 to .95 should be right after any numb
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
@@ -30,13 +28,13 @@ from cliploc_ros.core.session import Session
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.confidence_fit import draw_judged
+from cliploc_ros.evaluation.run import run_all
 from cliploc_ros.evaluation.sensors import with_mount_error, with_neighbours
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, make_queries
 from cliploc_ros.evaluation.worlds.cameras import GROUP_SIZE
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
-from cliploc_ros.parallel import run_tasks
 
 # Deviations of the simulated sensors.
 _VERTICAL_DEG, _STEP_M, _STEP_DEG = 1.0, 0.01, 0.5
@@ -195,11 +193,7 @@ def _of_worlds(options: argparse.Namespace) -> list[list[Answer]]:
     tasks = [(kind, options.first_seed + number) for kind in options.kinds
              for number in range(options.worlds)]
     make = MakeWalker(options.vertical, RelocalizerOptions(matching=options.matching))
-    found: dict[tuple[str, int], list[list[Answer]]] = {}
-    with closing(run_tasks(make, tasks, workers=options.workers)) as results:
-        for task, answers in tqdm(results, 'worlds', len(tasks), disable=None):
-            found[task] = answers or []
-    return [one for task in tasks for one in found[task]]
+    return run_all(make, tasks, 'worlds', options.workers)
 
 
 def _of_recordings(options: argparse.Namespace) -> list[list[Answer]]:

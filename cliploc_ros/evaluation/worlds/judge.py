@@ -9,12 +9,10 @@ and with the vertical and the height.
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
@@ -24,11 +22,11 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.confidence_fit import draw_judged
+from cliploc_ros.evaluation.run import run_all
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.worlds.modes import MODES, Request, requests
 from cliploc_ros.evaluation.worlds.places import KINDS
 from cliploc_ros.evaluation.worlds.world import make_world
-from cliploc_ros.parallel import run_tasks
 
 
 class Verdict(NamedTuple):
@@ -109,12 +107,8 @@ def run(arguments: list[str]) -> int:
         raise OptionsError(f'--first-seed: {options.first_seed} is below 0')
     tasks = [(kind, options.first_seed + number) for kind in options.kinds
              for number in range(options.worlds)]
-    found = {}
-    with closing(run_tasks(MakeJudge(options.matching, options.min_confidence), tasks,
-                           workers=options.workers)) as results:
-        for task, verdicts in tqdm(results, 'worlds', len(tasks), disable=None):
-            found[task] = verdicts or []
-    verdicts = [one for task in tasks for one in found[task]]
+    verdicts = run_all(MakeJudge(options.matching, options.min_confidence), tasks, 'worlds',
+                       options.workers)
     print(table(verdicts))
     if options.out is not None:
         draw_judged(options.out, 'simulated worlds', {mode: (

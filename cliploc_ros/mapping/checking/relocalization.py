@@ -87,22 +87,27 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     trials, done = [], 0
     for fold in folds:
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
-        if not frames or len(fold.rows) == 0:
+        if not frames:
             continue
-        relocalizer = _relocalizer(fold_map(landmark_map, fold), options)
+        relocalizer = _relocalizer(fold_map(landmark_map, fold), options) if len(fold.rows) \
+            else None
         for frame in frames:
             rows = slice(*detections.frame_offsets[frame:frame + 2])
             rng = np.random.default_rng([options.random_seed, frame])
             class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
             boxes, seen = detections.bboxes_xyxy[rows], shown[rows]
+            pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
+            done += 1
+            tell(done / len(chosen))
+            if relocalizer is None:
+                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(boxes), 0, None,
+                                    None, 'the other parts show no landmark', stamp_s))
+                continue
             similarities = labels.similarities(seen, class_ids, boxes, rng)[:, fold.rows]
             trials.append(_try(
                 relocalizer, detections.camera, Detections(boxes, class_ids,
                                                            detections.scores[rows]),
-                similarities, detections.map_from_camera[frame], int((seen >= 0).sum()), options,
-                float(detections.stamps_s[frame])))
-            done += 1
-            tell(done / len(chosen))
+                similarities, pose, int((seen >= 0).sum()), options, stamp_s))
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
 
