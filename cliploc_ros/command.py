@@ -3,6 +3,8 @@
 """Shared by the executables: errors in one line, and a clean end on Ctrl-C or SIGTERM."""
 
 import argparse
+import os
+import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -86,6 +88,38 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
         if arg == '--' and target is ros_args:
             target = plain_args
     return plain_args, ros_args
+
+
+class Interruption:
+    """A flag that signals set, and that ends a wait.
+
+    Not a threading.Event: a signal may come while its thread holds the lock of the event, in a
+    wait or in the handler of another signal, and the handler would wait for that lock for ever.
+    It lasts as long as its process.
+    """
+
+    def __init__(self) -> None:
+        self._happened = False
+        self._descriptor = os.eventfd(0, os.EFD_CLOEXEC)
+
+    def catch(self, *numbers: signal.Signals) -> None:
+        """Set the flag on these signals from now on."""
+        for number in numbers:
+            signal.signal(number, lambda *_: self.set())
+
+    def set(self) -> None:
+        """Set the flag, and end all waits."""
+        self._happened = True
+        os.eventfd_write(self._descriptor, 1)
+
+    def is_set(self) -> bool:
+        """Return whether the flag is set."""
+        return self._happened
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until the flag is set, or until the time-out; return whether it is set."""
+        select.select([self._descriptor], [], [], max(0.0, timeout_s))
+        return self._happened
 
 
 def interrupt_on_sigterm() -> None:

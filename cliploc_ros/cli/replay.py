@@ -6,16 +6,14 @@ import argparse
 import math
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cliploc_ros.command import run_command, split_ros_args
+from cliploc_ros.command import Interruption, run_command, split_ros_args
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
@@ -35,13 +33,8 @@ examples:
 def main(args: Sequence[str] | None = None) -> int:
     """Publish a recording; return the exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
-    stop = threading.Event()
-
-    def end(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
+    stop = Interruption()
+    stop.catch(signal.SIGINT, signal.SIGTERM)
     return run_command(lambda: replay(arguments, stop))
 
 
@@ -96,14 +89,14 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def replay(args: list[str], stop: threading.Event) -> int:
+def replay(args: list[str], stop: Interruption) -> int:
     """Publish a recording until its end or until stopped.
 
     Parameters
     ----------
     args : list of str
         The command line, including the arguments for ROS.
-    stop : threading.Event
+    stop : Interruption
         Ends the replay.
 
     Returns
@@ -137,7 +130,7 @@ def replay(args: list[str], stop: threading.Event) -> int:
 
 
 def _make_player(
-    reader: BagReader, options: argparse.Namespace, stop: threading.Event
+    reader: BagReader, options: argparse.Namespace, stop: Interruption
 ) -> 'Player':
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.node import Node
@@ -161,7 +154,7 @@ def _make_player(
         raise OptionsError(f'--remap: {error}') from error
 
 
-def _play(player: 'Player', options: argparse.Namespace, stop: threading.Event) -> int:
+def _play(player: 'Player', options: argparse.Namespace, stop: Interruption) -> int:
     if options.wait_for_subscribers is not None:
         names = [_absolute(name) for name in options.wait_for_subscribers]
         player.wait_for_subscribers(names, options.wait_timeout)

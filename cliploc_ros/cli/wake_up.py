@@ -6,10 +6,9 @@ import argparse
 import math
 import signal
 import sys
-import threading
 from collections.abc import Sequence
 
-from cliploc_ros.command import run_command, split_ros_args
+from cliploc_ros.command import Interruption, run_command, split_ros_args
 from cliploc_ros.errors import OptionsError
 
 _NOT_READY = 2
@@ -27,9 +26,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Wake the robot up; return the exit code."""
     plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
     options = make_parser().parse_args(plain_args)
-    interrupted = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: interrupted.set())
+    interrupted = Interruption()
+    interrupted.catch(signal.SIGINT, signal.SIGTERM)
     return run_command(lambda: wake_up(options, ros_args, interrupted), failure=_NOT_READY)
 
 
@@ -50,7 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: threading.Event
+def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Interruption
             ) -> int:
     """Wake the robot up with the options of the command line; return the exit code.
 

@@ -5,6 +5,7 @@
 import math
 import re
 import time
+import traceback
 from dataclasses import replace
 from typing import NoReturn
 
@@ -110,14 +111,14 @@ class RelocalizerNode(ManagedNode):
                           'base frame': self.settings['base_frame'],
                           'time limit [s]': self.settings['timeout_s'],
                           'missing': '; '.join(self._missing())}
-        if self._pipeline.localizer is not None:
-            keyframes = self._pipeline.localizer.keyframes
+        localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
+        if localizer is not None:
+            keyframes = localizer.keyframes
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
-            health.values |= {'map': self._pipeline.localizer.description,
-                              'map hash': self._pipeline.localizer.map_hash,
-                              'device': self._pipeline.localizer.device}
+            health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,
+                              'device': localizer.device}
 
     def _missing(self) -> list[str]:
         """Return what a request needs and does not find, one line each."""
@@ -143,12 +144,16 @@ class RelocalizerNode(ManagedNode):
             response.success = True
         except CliplocError as error:
             response.message = f'not recorded: {error}'
+        except Exception as error:  # rclpy would never answer
+            self.get_logger().error(traceback.format_exc())
+            response.message = f'not recorded: internal error: {error}'
         self.get_logger().info(f'record: {response.message}')
         return response
 
     @property
     def _map_hash(self) -> str:
-        return '' if self._pipeline.localizer is None else self._pipeline.localizer.map_hash
+        localizer = self._pipeline.localizer
+        return '' if localizer is None else localizer.map_hash
 
     def _answer(self) -> Answer:
         began_at = time.monotonic()

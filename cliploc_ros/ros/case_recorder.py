@@ -5,6 +5,7 @@
 import threading
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -159,19 +160,31 @@ def _report(newest: _Seen, last: Answer, values: Mapping[str, Any]) -> dict[str,
 
 
 def _made_folder(name: str) -> Path:
-    folder = Path(name).expanduser()
     try:
+        folder = Path(name).expanduser()
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DatasetError(f'record_folder: {folder}: {error.strerror}') from error
+        raise DatasetError(f'record_folder: {name}: {error.strerror}') from error
+    except RuntimeError as error:
+        raise DatasetError(f'record_folder: {name}: {error}') from error
     return folder
+
+
+def _bytes_in(folder: Path) -> int:
+    """Return the size of all files; some may be moved away meanwhile."""
+    used = 0
+    for parent, _, names in folder.walk():
+        for name in names:
+            with suppress(FileNotFoundError):
+                used += (parent / name).stat().st_size
+    return used
 
 
 def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
     """Raise unless the case fits into what the recordings of the folder may take."""
     size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
                for frame in case.frames)
-    used = sum(file.stat().st_size for file in folder.rglob('*') if file.is_file())
+    used = _bytes_in(folder)
     if used + size > limit_mb * _MIB:
         raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
                            f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: move '

@@ -3,6 +3,7 @@
 """Maps at run time: ``~/reload_map``, and ``~/load_map`` where nav2_msgs is installed."""
 
 import importlib
+import threading
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -29,6 +30,8 @@ class MapServices:
     def __init__(self, node: ManagedNode, pipeline: Pipeline, group: CallbackGroup) -> None:
         self._node = node
         self._pipeline = pipeline
+        # Between the parameters of a map and its reading, nobody else may set them.
+        self._lock = threading.Lock()
         node.create_service(Trigger, '~/reload_map', self._on_reload, qos_profile=qos.SERVICE,
                             callback_group=group)
         try:
@@ -51,13 +54,14 @@ class MapServices:
         CliplocError
             Names what to fix; parameters and maps stay as they were.
         """
-        before = {name: self._node.settings[name] for name in ('map_file', 'map_files')}
-        self._set(map_file=map_url, map_files=[''])
-        try:
-            return self._node.worker.run(self._pipeline.reload_map)
-        except CliplocError:
-            self._set(**before)
-            raise
+        with self._lock:
+            before = {name: self._node.settings[name] for name in ('map_file', 'map_files')}
+            self._set(map_file=map_url, map_files=[''])
+            try:
+                return self._node.worker.run(self._pipeline.reload_map)
+            except CliplocError:
+                self._set(**before)
+                raise
 
     def _set(self, **values: Any) -> None:
         self._node.set_parameters_atomically(
@@ -65,14 +69,20 @@ class MapServices:
 
     def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            description = self._node.worker.run(self._pipeline.reload_map)
-            assert self._pipeline.localizer is not None
-            response.message = f'loaded: {description}; map {self._pipeline.localizer.map_hash}'
+            with self._lock:
+                description, map_hash = self._node.worker.run(self._reload)
+            response.message = f'loaded: {description}; map {map_hash}'
             response.success = True
         except CliplocError as error:
             response.message = f'not loaded: {error}'
         self._node.get_logger().info(f'map {response.message}')
         return response
+
+    def _reload(self) -> tuple[str, str]:
+        """Read the map again, in the worker's thread; return what was loaded, and its hash."""
+        description = self._pipeline.reload_map()
+        assert self._pipeline.localizer is not None
+        return description, self._pipeline.localizer.map_hash
 
     def _on_load(self, request: Any, response: Any) -> Any:
         try:

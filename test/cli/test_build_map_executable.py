@@ -28,9 +28,12 @@ def build_map(*args):
 
 def test_builds_a_map_and_a_report(observations, tmp_path):
     out, report = tmp_path / 'office.yaml', tmp_path / 'office.json'
+    old_layer = tmp_path / 'office.keyframes.npz'
+    old_layer.touch()
     done = build_map('--observations', observations, '--out', out, '--report', report,
                      '--frame-id', 'world')
     assert done.returncode == 0, done.stderr
+    assert not old_layer.exists() and f'removed {old_layer}' in done.stdout
     built = LandmarkMap.from_file(out)
     assert built.frame_id == 'world'
     assert len(built) > 30

@@ -9,16 +9,17 @@ import pytest
 
 from cliploc_ros.cli.build_map import main, make_parser
 from cliploc_ros.cli.map_layer import write_layer
-from cliploc_ros.core.keyframes.layer_file import load_layer_of_map
+from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, remove_layer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import MapError, MappingError
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
 
 
 @pytest.mark.parametrize('others', [
-    ['--observations', 'none.npz'], [*WALK, '--update', 'old.yaml'], [*WALK, '--refine-mount']])
+    ['--observations', 'none.npz'], [*WALK, '--update', 'old.yaml'], [*WALK, '--refine-mount'],
+    [*WALK, '--every', '2']])
 def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, capsys, others):
     out = tmp_path / 'map.yaml'
     assert main([*others, '--keyframe-layer', '--out', str(out)]) == 1
@@ -51,3 +52,14 @@ def test_images_that_do_not_overlap_give_an_error(tmp_path):
                                         '--out', str(tmp_path / 'a.yaml')])
     with pytest.raises(MappingError, match='no keyframe: of 1 images none has'):
         write_layer(options, LandmarkMap.from_file(ASSETS / 'map.yaml'))
+
+
+def test_the_layer_of_a_map_that_is_replaced_is_removed(tmp_path):
+    layer = layer_path(tmp_path / 'a.yaml')
+    layer.touch()
+    assert remove_layer(tmp_path / 'a.yaml') == (
+        f'removed {layer}: its keyframes belonged to the map before')
+    assert remove_layer(tmp_path / 'a.yaml') == ''
+    layer.mkdir()
+    with pytest.raises(MapError, match='cannot be removed: Is a directory; remove it'):
+        remove_layer(tmp_path / 'a.yaml')

@@ -12,6 +12,7 @@ from cliploc_ros.core.acceptance.recognition import ObjectsThere, objects_there
 from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.combination import combine, fuse
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.observation import Observation
@@ -136,6 +137,20 @@ def test_fusing_twice_the_same_gains_nothing():
     pose, covariance = fuse(at(0.2), ROUGH, at(0.0), FINE)
     assert np.allclose(pose, at(0.0))
     assert np.allclose(covariance, FINE)
+
+
+@pytest.mark.parametrize('lens', [
+    ('plumb_bob', (-0.3, 0.0, 0.0, 0.0)), ('equidistant', (-0.02, 0.01, -0.005, 0.001))])
+def test_a_wide_lens_explains_its_objects_too(lens):
+    """In the corners of its image the lens shows nothing."""
+    room = make_room()
+    wide = Camera(640, 480, 230.0, 230.0, 320.0, 240.0, *lens)
+    assert np.isnan(wide.normalize_points(np.zeros((1, 2)))).any()
+    seen = see_room(room)
+    corners = CAMERA.normalize_points(seen.bboxes_xyxy.reshape(-1, 2))
+    boxes = wide.project_normalized(corners).reshape(-1, 4)
+    observation = Observation(wide, replace(seen, bboxes_xyxy=boxes))
+    assert objects_there(room, observation, MAP_FROM_CAMERA) == ObjectsThere(len(room), 0)
 
 
 def test_a_perfect_view_explains_its_objects_only_where_it_is():

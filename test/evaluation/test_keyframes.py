@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframes of real images: the kitchen with depth, the office without."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -101,6 +103,20 @@ def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
     found = answer(KeyframeLocalizer(layer), image, frame.camera)
     assert not found.accepted or pose_error(found.map_from_camera,
                                             frame.map_from_camera)[0] < 1.0
+
+
+def test_a_search_that_time_cuts_short_gives_no_pose(layer, queries):
+    """It might have missed the same room elsewhere."""
+    localizer, frame = KeyframeLocalizer(twin_layer(layer)), queries[0]
+    features = localization.query_features(frame.image_rgb)
+    found = []
+    for wait_s in np.linspace(0.0, 0.2, 21):
+        seen = localizer.localize_features(features, frame.camera,
+                                           deadline=time.monotonic() + wait_s)
+        found.append(seen is not None)
+        assert seen is None or seen.rival > 0.5 * seen.inliers
+    assert not found[0]
+    assert localizer.localize_features(features, frame.camera) is not None
 
 
 def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):

@@ -25,6 +25,7 @@ from cliploc_ros.mapping.checking.label_model import LabelModel
 from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
 from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+from cliploc_ros.mapping.checking.relocalization import try_recording
 from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import make_views
@@ -264,6 +265,20 @@ def test_a_landmark_of_one_block_is_missing_from_its_fold():
     assert sorted(np.concatenate([one.frames for one in folds])) == list(range(120))
     assert 0 not in folds[0].rows
     assert all(0 in one.rows for one in folds[1:])
+
+
+def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
+    views, witness = witness_of(TABLE, detections)
+    first, *others = make_folds(views, witness, QUICK)
+    bare = first._replace(rows=first.rows[:0])
+    trials = try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
+                           lambda share: None)
+    assert len(trials) == 12
+    bare_stamps = detections.stamps_s[bare.frames]
+    of_bare = [one for one in trials if one.stamp_s in bare_stamps]
+    assert of_bare
+    assert {one.reason for one in of_bare} == {'the other parts show no landmark'}
+    assert any(one.verdict == 'accepted' for one in trials)
 
 
 def test_stretches_without_landmarks_become_advice(detections):

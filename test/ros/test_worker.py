@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError
+from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError, TimeUpError
 from cliploc_ros.ros.node.worker import LatestOnly, Worker
 
 PATIENCE_S = 60.0
@@ -97,6 +97,18 @@ def test_a_defect_is_reported_with_its_traceback_and_survived(worker, reports, e
     assert len(reports) == 1
     assert 'Traceback' in reports[0] and 'raise error' in reports[0]
     assert worker.run(lambda: 'alive') == 'alive'
+
+
+def test_a_task_whose_time_is_up_before_its_turn_never_runs(worker, gate):
+    """Else requests that time out would pile up behind a slow task."""
+    running, ran = gate.hold(worker), []
+    for number in range(3):
+        with pytest.raises(TimeUpError):
+            worker.run(lambda number=number: ran.append(number), time.monotonic() + 0.01)
+    gate.open()
+    running.result(PATIENCE_S)
+    assert worker.run(lambda: 'next') == 'next'
+    assert ran == []
 
 
 def test_stop_of_an_idle_worker_is_immediate_and_final(worker):

@@ -7,13 +7,13 @@ import ctypes
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
 import rclpy
 
+from cliploc_ros.command import Interruption
 from cliploc_ros.ros.node.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
@@ -29,8 +29,8 @@ def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     _bound_arenas()
     # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback.
-    interrupted = threading.Event()
-    signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    interrupted = Interruption()
+    interrupted.catch(signal.SIGINT)
     try:
         rclpy.init(args=sys.argv)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders

@@ -48,7 +48,8 @@ class Worker:
         ----------
         task : callable
         deadline : float
-            When to stop waiting (monotonic clock) [s]. The task itself goes on.
+            When to stop waiting (monotonic clock) [s]. A task that has begun goes on; one that
+            still waits is dropped, else requests would pile up behind a slow task.
 
         Raises
         ------
@@ -65,6 +66,8 @@ class Worker:
             return future.result()
         if self._stopped.done() or future.cancelled():
             raise StoppedError('the node is shutting down')
+        if not future.cancel() and future.done():
+            return future.result()  # it has just ended
         raise TimeUpError('localizing took longer than timeout_s: raise timeout_s, or choose '
                           'smaller networks')
 

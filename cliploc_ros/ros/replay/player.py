@@ -5,7 +5,6 @@
 Own code, because neither PyPI's ROS nor ROS's base installation has `ros2 bag play`.
 """
 
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -17,6 +16,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
+from cliploc_ros.command import Interruption
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.ros.replay.bag_publisher import create_publisher, is_latched
@@ -93,7 +93,7 @@ class Player:
         The open recording.
     options : PlayOptions
         How to play it.
-    stop : threading.Event
+    stop : Interruption
         Ends every wait and the playback within milliseconds.
 
     Raises
@@ -104,7 +104,7 @@ class Player:
     """
 
     def __init__(
-        self, node: Node, reader: BagReader, options: PlayOptions, stop: threading.Event
+        self, node: Node, reader: BagReader, options: PlayOptions, stop: Interruption
     ) -> None:
         self._reader, self._options, self._stop = reader, options, stop
         self.topics = select_topics(reader, options)
@@ -271,7 +271,7 @@ class Player:
 class _Timeline:
     """Maps recorded stamps to the monotonic clock from one origin, so that no drift adds up."""
 
-    def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: threading.Event) -> None:
+    def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: Interruption) -> None:
         self.start_ns, self.rate = start_ns, rate
         self._origin_ns, self._stop = origin_ns, stop
 

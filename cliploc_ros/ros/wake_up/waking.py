@@ -5,7 +5,6 @@
 import math
 import re
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from cliploc_ros.command import Interruption
 from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.wake_up.status import SILENT_S, RelocalizerStatus
 from cliploc_ros.ros.wake_up.turning import Turning
@@ -62,12 +62,12 @@ class WakeUp(Node):
     Parameters
     ----------
     options : WakeUpOptions
-    interrupted : threading.Event
+    interrupted : Interruption
         Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
         and nothing would cancel it.
     """
 
-    def __init__(self, options: WakeUpOptions, interrupted: threading.Event) -> None:
+    def __init__(self, options: WakeUpOptions, interrupted: Interruption) -> None:
         super().__init__('wake_up', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
@@ -91,7 +91,7 @@ class WakeUp(Node):
         try:
             return self._look_about()
         finally:
-            self._interrupted = threading.Event()  # this one is handled
+            self._interrupted = Interruption()  # this one is handled
             self._turning.stop()
 
     def _look_about(self) -> Outcome:

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A flag that signals set, at any moment."""
+
+import signal
+import threading
+import time
+
+import pytest
+
+from cliploc_ros.command import Interruption
+
+ALARMS = 300
+
+
+@pytest.fixture
+def alarm():
+    """The process's timer, and its handler as it was."""
+    handler = signal.getsignal(signal.SIGALRM)
+    yield lambda after_s: signal.setitimer(signal.ITIMER_REAL, after_s)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, handler)
+
+
+def test_a_signal_may_come_at_any_moment_of_a_wait(alarm):
+    """With threading.Event one of these signals comes while the event's lock is held."""
+    for number in range(ALARMS):
+        interruption = Interruption()
+        interruption.catch(signal.SIGALRM)
+        alarm(1e-4 + 1e-6 * number)
+        while not interruption.wait(0.0):
+            pass
+        assert interruption.is_set()
+
+
+def test_a_wait_ends_with_the_signal_or_with_its_time(alarm):
+    interruption = Interruption()
+    interruption.catch(signal.SIGALRM)
+    start = time.monotonic()
+    assert not interruption.wait(0.05)
+    assert time.monotonic() - start >= 0.05
+    alarm(0.02)
+    assert interruption.wait(60.0)
+    assert interruption.wait(60.0)
+    assert time.monotonic() - start < 30.0
+
+
+def test_another_thread_may_set_it():
+    interruption = Interruption()
+    threading.Timer(0.02, interruption.set).start()
+    assert interruption.wait(60.0)
