@@ -96,11 +96,13 @@ def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
     assert 'the last request saw no frame: no fresh frame' in record(tester).message
 
 
-def test_a_folder_that_cannot_be_made(own_relocalizer, tester, tmp_path):
+@pytest.mark.parametrize(('folder', 'message'), [
+    ('{}/file/cases', 'Not a directory'), ('~nobody-here/cases', 'Could not determine home')])
+def test_a_folder_that_cannot_be_made(own_relocalizer, tester, tmp_path, folder, message):
     (tmp_path / 'file').touch()
-    process = own_relocalizer(record_folder=tmp_path / 'file/cases')
+    process = own_relocalizer(record_folder=folder.format(tmp_path))
     assert tester.relocalize(make_frame()).success
-    assert 'Not a directory' in record(tester).message
+    assert message in record(tester).message
     assert tester.relocalize(make_frame()).success
     assert 'Traceback' not in process.output()
 
