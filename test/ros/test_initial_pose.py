@@ -202,6 +202,58 @@ def rest(wheels):
         wheels.publish(odometry)
 
 
+def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
+    """Publish one message of odometry for each moment, and wait until the last is heard."""
+    for moment_s in moments_s:
+        odometry = Odometry()
+        odometry.header.stamp = Time(sec=int(moment_s), nanosec=round(moment_s % 1 * 1e9))
+        odometry.pose.pose.position.x = speed_m_s * moment_s
+        odometry.twist.twist.linear.x = twist_m_s
+        wheels.publish(odometry)
+    robot.wait(lambda: (newest := robot.odometry.recent(60.0, 0.0)) is not None
+               and newest == odometry, 'odometry')
+
+
+ONE_HZ = (0.0, 1.0, 2.0)
+TEN_HZ = tuple(tick / 10 for tick in range(10))
+
+
+@pytest.mark.parametrize('moments_s', [ONE_HZ, TEN_HZ, (0.0, 0.5, 2.5)])
+@pytest.mark.parametrize('speeds', [{'speed_m_s': 0.5}, {'twist_m_s': 0.5}])
+def test_a_robot_that_drives_gets_no_pose_however_slow_its_odometry(robot, wheels, moments_s,
+                                                                    speeds):
+    """By poses without a twist, or by a twist with poses that stand still."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s, **speeds)
+    with pytest.raises(HandOffError, match=r'^the robot moves at 0\.50 m/s'):
+        robot.hand_over()
+    assert not robot.localizer.poses
+
+
+@pytest.mark.parametrize('moments_s', [ONE_HZ, TEN_HZ])
+def test_a_robot_at_rest_gets_its_pose_however_slow_its_odometry(robot, wheels, moments_s):
+    """A source that sends only a twist looks the same at rest."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s)
+    assert robot.hand_over() < 1.5, 'two messages at 1 Hz are enough'
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize('speed_m_s', [0.0, 0.5])
+@pytest.mark.parametrize('moments_s', [(7.0, 7.0, 7.0), (0.0, 10.0)])
+def test_odometry_that_tells_no_speed_is_not_taken_for_rest(robot, wheels, moments_s, speed_m_s):
+    """Its stamps stand still, or its poses are too far apart; the twist is empty."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s, speed_m_s)
+    with pytest.raises(HandOffError, match=r'^/odom shows neither a twist nor poses that tell a '
+                       r'speed: the robot may be moving; stamp its poses'):
+        robot.hand_over()
+    assert not robot.localizer.poses
+
+
 @pytest.mark.clock
 def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
     robot.localizer.subscribe()

@@ -154,8 +154,24 @@ def test_poses_give_the_speed_where_the_twist_is_empty(source):
     assert source.speeds_by_poses(1.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
 
 
+@pytest.mark.parametrize('moments', [
+    [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8], [7.0, 10.0]])
+def test_slow_odometry_gives_its_mean_speed(source, moments):
+    talk(source, *moments)
+    assert source.speeds_by_poses(0.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
+
+
+def test_no_speed_is_taken_across_a_restart(source):
+    talk(source, 9.0, 10.0)
+    restarted = message(11.0)
+    restarted.pose.pose.position.x = -100.0
+    source.take(restarted)
+    assert source.speeds_by_poses(0.0) is None
+
+
 @pytest.mark.clock
-@pytest.mark.parametrize('moments', [[], [10.0], [9.9, 10.0], [9.0, 10.0]])
+@pytest.mark.parametrize('moments', [
+    [], [10.0], [10.0, 10.0], [9.9, 10.0], [9.0, 9.9, 10.0], [6.9, 10.0]])
 def test_too_few_poses_give_no_speed(source, moments):
     talk(source, *moments)
     start = time.monotonic()

@@ -28,6 +28,8 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of the poses would look like a speed.
 _MOMENT_NS = 300_000_000
+# Over a longer time the mean speed says little about now (a guess): slow sources send at 1 Hz.
+_LONG_NS = 3_000_000_000
 #: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
 #: taking a moving robot on a busy machine for one at rest.
 MOMENT_PATIENCE_S = 2.0
@@ -131,8 +133,10 @@ class OdometrySource:
     def speeds_by_poses(self, patience_s: float) -> tuple[float, float] | None:
         """Return speed [m/s] and turn rate [rad/s] over the last 0.3 s of poses.
 
-        Many sources of poses leave the twist empty. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; None where it does not.
+        Many sources of poses leave the twist empty. Where the last two poses are further apart,
+        up to 3 s, it is the mean speed between them. Odometry that has just begun may take
+        `patience_s`, at most 2 s, to cover that time; None where it does not, or where the
+        stamps stand still.
         """
         with self._heard:
             self._heard.wait_for(lambda: self._last_moment() is not None,
@@ -140,17 +144,23 @@ class OdometrySource:
             moment = self._last_moment()
         if moment is None:
             return None
-        distance_m, angle_deg = pose_error(*moment)
-        seconds = _MOMENT_NS / NS_PER_S
+        before, now, seconds = moment
+        distance_m, angle_deg = pose_error(before, now)
         return distance_m / seconds, math.radians(angle_deg) / seconds
 
-    def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the robot's poses a moment ago and now; None where they are not known."""
+    def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+        """Return the robot's poses a moment ago and now, and the time between them [s].
+
+        None where the poses are not known.
+        """
         if self._newest is None:
             return None
         now_ns = stamp_ns(self._newest.header.stamp)
+        step_ns = self._window.since_previous_ns(now_ns)
+        moment_ns = step_ns if _MOMENT_NS < step_ns <= _LONG_NS else _MOMENT_NS
         try:
-            return self._window.pose_at(now_ns - _MOMENT_NS), self._window.pose_at(now_ns)
+            return (self._window.pose_at(now_ns - moment_ns), self._window.pose_at(now_ns),
+                    moment_ns / NS_PER_S)
         except NoOdometryError:
             return None
 

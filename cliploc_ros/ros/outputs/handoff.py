@@ -155,8 +155,13 @@ class HandOff:
         if by_poses is None and left_s < MOMENT_PATIENCE_S:
             raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
                                'left to see whether the robot moves: ask again')
+        by_twist = speeds(odometry)
+        if by_poses is None and by_twist == (0.0, 0.0):
+            raise HandOffError(f'{self._odometry.topic} shows neither a twist nor poses that tell '
+                               'a speed: the robot may be moving; stamp its poses, send at 1 Hz '
+                               'or more')
         # np.maximum passes NaN on, which no limit allows
-        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), by_poses or (0.0, 0.0))
+        speed_m_s, turn_rad_s = np.maximum(by_twist, by_poses or (0.0, 0.0))
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')
