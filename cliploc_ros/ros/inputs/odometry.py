@@ -5,6 +5,7 @@
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ class OdometrySource:
         self._newest: Odometry | None = None
         self._newest_at = 0.0
         self._frames = ('', '')
+        self._on_restart: list[Callable[[int], None]] = []
         self._subscription: AdaptiveSubscription | None = None
 
     @property
@@ -78,6 +80,17 @@ class OdometrySource:
     def is_published(self) -> bool:
         """Return whether the topic has a publisher."""
         return bool(self._node.count_publishers(self.topic))
+
+    def on_restart(self, callback: Callable[[int], None]) -> None:
+        """Have each restart of odometry reported: its poses are not related to those before.
+
+        Parameters
+        ----------
+        callback : callable
+            Takes the stamp of the first message after the restart [ns]. Called in the thread that
+            takes odometry; it must not block. What this node itself forgets is not reported.
+        """
+        self._on_restart.append(callback)
 
     def open(self) -> None:
         """Subscribe."""
@@ -100,15 +113,23 @@ class OdometrySource:
     def take(self, msg: Odometry) -> None:
         """Take one message."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        at_ns = stamp_ns(msg.header.stamp)
         with self._heard:
+            run, had_poses = self._window.run, bool(len(self._window))
             self._newest, self._newest_at = msg, time.monotonic()
             frames = (msg.header.frame_id, msg.child_frame_id)
             if frames != self._frames:
                 self._window.clear()
                 self._frames = frames
-            self._window.add(stamp_ns(msg.header.stamp), np.array([p.x, p.y, p.z]),
-                             np.array([q.x, q.y, q.z, q.w]))
+            self._window.add(at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+            has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
+        if has_restarted:
+            self._node.get_logger().warning(
+                f'{self.topic} restarted, for its time, place or frames jumped: all poses from '
+                'before are forgotten', throttle_duration_sec=5.0)
+            for callback in self._on_restart:
+                callback(at_ns)
 
     def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
         """Return the newest message, or the next one if that arrives in time; else None.
