@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handing a pose over: real subscribers, odometry and services that answer, or never do."""
 
+import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -239,6 +240,31 @@ def test_a_robot_at_rest_gets_its_pose_however_slow_its_odometry(robot, wheels, 
     tell(robot, wheels, moments_s)
     assert robot.hand_over() < 1.5, 'two messages at 1 Hz are enough'
     robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize(('x_m', 'angle_rad', 'is_withheld'), [
+    (0.12, 0.0, True), (-0.12, 0.0, True), (0.0, 0.1, True), (0.08, 0.07, False)])
+def test_a_robot_that_has_moved_since_its_image_gets_no_pose(robot, wheels, x_m, angle_rad,
+                                                              is_withheld):
+    """It stopped half a second before the hand-over."""
+    robot.localizer.subscribe()
+    robot.meet()
+    for tick in range(11):
+        odometry = Odometry()
+        odometry.header.stamp = Time(sec=100 + tick // 10, nanosec=tick % 10 * 10**8)
+        share = min(1.0, tick / 5)
+        odometry.pose.pose.position.x = share * x_m
+        odometry.pose.pose.orientation.z = math.sin(share * angle_rad / 2)
+        odometry.pose.pose.orientation.w = math.cos(share * angle_rad / 2)
+        wheels.publish(odometry)
+    robot.wait(lambda: robot.odometry.recent(60.0, 0.0) == odometry, 'odometry')
+    if is_withheld:
+        with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+            robot.hand_over()
+        assert not robot.localizer.poses
+    else:
+        robot.hand_over()
+        robot.wait(lambda: robot.localizer.poses, 'the pose')
 
 
 @pytest.mark.parametrize('speed_m_s', [0.0, 0.5])

@@ -185,6 +185,20 @@ class OdometrySource:
         except NoOdometryError:
             return None
 
+    def moved_since(self, stamp: Time) -> tuple[float, float] | None:
+        """Return how far the robot is from where it was at an image [m], [degrees].
+
+        None where odometry does not cover that time.
+        """
+        with self._heard:
+            if self._newest is None:
+                return None
+            try:
+                return pose_error(self._window.pose_at(stamp_ns(stamp)),
+                                  self._window.pose_at(stamp_ns(self._newest.header.stamp)))
+            except NoOdometryError:
+                return None
+
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers about the time of an image, and so of the next.
 
