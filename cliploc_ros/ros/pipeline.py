@@ -45,6 +45,7 @@ class Pipeline:
         self.localizer: Localizer | None = None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._map_to_odom = MapToOdom(node, robot.transforms)
+        robot.odometry.on_restart(self._map_to_odom.forget)
         self._visualization = Visualization(node)
 
     def load(self) -> str:

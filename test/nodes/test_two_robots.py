@@ -69,6 +69,7 @@ def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tes
         future = client.call_async(Trigger.Request())
 
         def answered():
+            odometry.header.stamp = tester.get_clock().now().to_msg()
             odom.publish(odometry)
             for publisher, message in zip(publishers[camera], frame, strict=True):
                 publisher.publish(message)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handing a pose over: real subscribers, odometry and services that answer, or never do."""
 
+import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -200,6 +201,83 @@ def rest(wheels):
         odometry.header.stamp = Time(nanosec=tick * 10**8)
         odometry.pose.pose.orientation.w = 1.0
         wheels.publish(odometry)
+
+
+def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
+    """Publish one message of odometry for each moment, and wait until the last is heard."""
+    for moment_s in moments_s:
+        odometry = Odometry()
+        odometry.header.stamp = Time(sec=int(moment_s), nanosec=round(moment_s % 1 * 1e9))
+        odometry.pose.pose.position.x = speed_m_s * moment_s
+        odometry.twist.twist.linear.x = twist_m_s
+        wheels.publish(odometry)
+    robot.wait(lambda: (newest := robot.odometry.recent(60.0, 0.0)) is not None
+               and newest == odometry, 'odometry')
+
+
+ONE_HZ = (0.0, 1.0, 2.0)
+TEN_HZ = tuple(tick / 10 for tick in range(10))
+
+
+@pytest.mark.parametrize('moments_s', [ONE_HZ, TEN_HZ, (0.0, 0.5, 2.5)])
+@pytest.mark.parametrize('speeds', [{'speed_m_s': 0.5}, {'twist_m_s': 0.5}])
+def test_a_robot_that_drives_gets_no_pose_however_slow_its_odometry(robot, wheels, moments_s,
+                                                                    speeds):
+    """By poses without a twist, or by a twist with poses that stand still."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s, **speeds)
+    with pytest.raises(HandOffError, match=r'^the robot moves at 0\.50 m/s'):
+        robot.hand_over()
+    assert not robot.localizer.poses
+
+
+@pytest.mark.parametrize('moments_s', [ONE_HZ, TEN_HZ])
+def test_a_robot_at_rest_gets_its_pose_however_slow_its_odometry(robot, wheels, moments_s):
+    """A source that sends only a twist looks the same at rest."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s)
+    assert robot.hand_over() < 1.5, 'two messages at 1 Hz are enough'
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize(('x_m', 'angle_rad', 'is_withheld'), [
+    (0.12, 0.0, True), (-0.12, 0.0, True), (0.0, 0.1, True), (0.08, 0.07, False)])
+def test_a_robot_that_has_moved_since_its_image_gets_no_pose(robot, wheels, x_m, angle_rad,
+                                                              is_withheld):
+    """It stopped half a second before the hand-over."""
+    robot.localizer.subscribe()
+    robot.meet()
+    for tick in range(11):
+        odometry = Odometry()
+        odometry.header.stamp = Time(sec=100 + tick // 10, nanosec=tick % 10 * 10**8)
+        share = min(1.0, tick / 5)
+        odometry.pose.pose.position.x = share * x_m
+        odometry.pose.pose.orientation.z = math.sin(share * angle_rad / 2)
+        odometry.pose.pose.orientation.w = math.cos(share * angle_rad / 2)
+        wheels.publish(odometry)
+    robot.wait(lambda: robot.odometry.recent(60.0, 0.0) == odometry, 'odometry')
+    if is_withheld:
+        with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+            robot.hand_over()
+        assert not robot.localizer.poses
+    else:
+        robot.hand_over()
+        robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize('speed_m_s', [0.0, 0.5])
+@pytest.mark.parametrize('moments_s', [(7.0, 7.0, 7.0), (0.0, 10.0)])
+def test_odometry_that_tells_no_speed_is_not_taken_for_rest(robot, wheels, moments_s, speed_m_s):
+    """Its stamps stand still, or its poses are too far apart; the twist is empty."""
+    robot.localizer.subscribe()
+    robot.meet()
+    tell(robot, wheels, moments_s, speed_m_s)
+    with pytest.raises(HandOffError, match=r'^/odom shows neither a twist nor poses that tell a '
+                       r'speed: the robot may be moving; stamp its poses'):
+        robot.hand_over()
+    assert not robot.localizer.poses
 
 
 @pytest.mark.clock

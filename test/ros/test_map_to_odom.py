@@ -7,11 +7,13 @@ import time
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom, transform_msg
 from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
@@ -66,6 +68,8 @@ class Robot:
         self.node, self.world = make_node(), make_node('world')
         self.transforms = CoordinateFrames(self.node)
         self.map_to_odom = MapToOdom(self.node, self.transforms)
+        self.odometry = OdometrySource(self.node)
+        self.odometry.on_restart(self.map_to_odom.forget)
         self.broadcaster = TransformBroadcaster(self.world)
         self.static_broadcaster = StaticTransformBroadcaster(self.world)
         self.heard = []
@@ -88,6 +92,14 @@ class Robot:
         """Broadcast where the robot was until that is known."""
         self.spin_until(lambda: self.place(seconds) == x_m, f'{x_m} m at {seconds} s',
                         lambda: self.broadcaster.sendTransform(moving(seconds, x_m)))
+
+
+    def tell_odometry(self, seconds, x_m):
+        """Take one message of odometry."""
+        odometry = Odometry(header=Header(frame_id='odom', stamp=stamp(seconds)),
+                            child_frame_id='base_link')
+        odometry.pose.pose.position.x = x_m
+        self.odometry.take(odometry)
 
 
 @pytest.fixture
@@ -129,6 +141,35 @@ def test_a_jump_ends_the_broadcast_until_the_next_pose(robot):
     assert not robot.heard
     robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom again')
+
+
+@pytest.mark.needs('tf2_ros')
+@pytest.mark.parametrize(('restart_s', 'x_m'), [(100.5, -100.0), (2.0, 1.0)])
+def test_odometry_that_restarts_ends_the_broadcast_until_the_next_pose(robot, restart_s, x_m):
+    """Its origin is reset, or a bag loops; there is no clock that jumps."""
+    robot.map_to_odom.open()
+    robot.tell(100.0, 1.0)
+    robot.tell_odometry(99.9, 1.0)
+    robot.tell_odometry(100.0, 1.0)
+    received_at = time.monotonic()
+    header = Header(frame_id='map', stamp=STAMP)
+    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    robot.spin_until(lambda: robot.heard, 'map -> odom')
+    robot.tell_odometry(restart_s, x_m)
+    # an image from before whose search ends after the restart
+    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    if restart_s > 100.0:  # one that arrives after the restart
+        robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, time.monotonic())
+    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
+    robot.heard.clear()
+    end = time.monotonic() + 0.5  # five periods
+    robot.spin_until(lambda: time.monotonic() > end, 'silence')
+    assert not robot.heard
+    robot.tell(restart_s, 2.0)
+    robot.map_to_odom.update(Header(frame_id='map', stamp=stamp(restart_s)), MAP_FROM_BASE, VALUES,
+                             time.monotonic())
+    robot.spin_until(lambda: robot.heard, 'map -> odom again')
+    assert robot.heard[-1].transform.translation.x == pytest.approx(3.0)
 
 
 @pytest.mark.needs('tf2_ros')

@@ -120,6 +120,49 @@ def test_places_in_two_odometry_frames_do_not_compare(robot, source, frames):
     assert place(robot, 9.95) is None
 
 
+@pytest.fixture
+def restarts(source):
+    """Keep the stamps of the restarts that are reported [ns]."""
+    stamps_ns = []
+    source.on_restart(stamps_ns.append)
+    return stamps_ns
+
+
+@pytest.mark.parametrize('frames', [{'frame': 'other'}, {'child_frame': 'camera'}])
+def test_other_frames_are_a_restart(source, restarts, frames):
+    talk(source, 9.9, 10.0)
+    talk(source, 10.1, 10.2, **frames)
+    assert restarts == [10_100_000_000]
+
+
+@pytest.mark.parametrize('back_s', [8.5, 2.0])
+def test_a_bag_that_loops_is_a_restart(source, restarts, back_s):
+    talk(source, 9.9, 10.0, back_s, back_s + 0.1)
+    assert restarts == [back_s * 1e9]
+
+
+def test_an_origin_that_is_reset_is_a_restart(source, restarts, capfd):
+    talk(source, 9.9, 10.0)
+    for moment, x_m in ((10.1, -100.0), (10.2, -99.9)):
+        reset = message(moment)
+        reset.pose.pose.position.x = x_m
+        source.take(reset)
+    assert restarts == [10_100_000_000]
+    assert '/odom restarted, for its time, place or frames jumped' in capfd.readouterr().err
+
+
+def test_odometry_that_goes_on_is_no_restart(source, restarts):
+    broken = message(10.15)
+    broken.pose.pose.orientation.w = float('nan')
+    talk(source, 9.9, 10.1, 10.0)  # one of them late
+    source.take(broken)
+    talk(source, 10.2)
+    assert not restarts
+    source.forget()
+    talk(source, 2.0)
+    assert not restarts, 'a jump of the clock is reported by TimeJumps'
+
+
 def test_an_invalid_message_changes_nothing(robot, source):
     talk(source, 9.9, 10.0)
     first = place(robot, 9.95)
@@ -154,8 +197,31 @@ def test_poses_give_the_speed_where_the_twist_is_empty(source):
     assert source.speeds_by_poses(1.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
 
 
+@pytest.mark.parametrize('moments', [
+    [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8], [7.0, 10.0]])
+def test_slow_odometry_gives_its_mean_speed(source, moments):
+    talk(source, *moments)
+    assert source.speeds_by_poses(0.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
+
+
+def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
+    assert source.moved_since(stamp(9.85)) is None
+    talk(source, *np.arange(9.5, 10.55, 0.1))
+    assert source.moved_since(stamp(9.75)) == (pytest.approx(0.075), pytest.approx(15.0))
+    assert source.moved_since(stamp(9.4)) is None and source.moved_since(stamp(10.6)) is None
+
+
+def test_no_speed_is_taken_across_a_restart(source):
+    talk(source, 9.0, 10.0)
+    restarted = message(11.0)
+    restarted.pose.pose.position.x = -100.0
+    source.take(restarted)
+    assert source.speeds_by_poses(0.0) is None
+
+
 @pytest.mark.clock
-@pytest.mark.parametrize('moments', [[], [10.0], [9.9, 10.0], [9.0, 10.0]])
+@pytest.mark.parametrize('moments', [
+    [], [10.0], [10.0, 10.0], [9.9, 10.0], [9.0, 9.9, 10.0], [6.9, 10.0]])
 def test_too_few_poses_give_no_speed(source, moments):
     talk(source, *moments)
     start = time.monotonic()

@@ -5,6 +5,7 @@
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ _PATIENCE_S = 0.2
 _NEARLY_NS = 2_000_000_000
 # Over a shorter time the noise of the poses would look like a speed.
 _MOMENT_NS = 300_000_000
+# Over a longer time the mean speed says little about now (a guess): slow sources send at 1 Hz.
+_LONG_NS = 3_000_000_000
 #: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
 #: taking a moving robot on a busy machine for one at rest.
 MOMENT_PATIENCE_S = 2.0
@@ -65,6 +68,7 @@ class OdometrySource:
         self._newest: Odometry | None = None
         self._newest_at = 0.0
         self._frames = ('', '')
+        self._on_restart: list[Callable[[int], None]] = []
         self._subscription: AdaptiveSubscription | None = None
 
     @property
@@ -76,6 +80,17 @@ class OdometrySource:
     def is_published(self) -> bool:
         """Return whether the topic has a publisher."""
         return bool(self._node.count_publishers(self.topic))
+
+    def on_restart(self, callback: Callable[[int], None]) -> None:
+        """Have each restart of odometry reported: its poses are not related to those before.
+
+        Parameters
+        ----------
+        callback : callable
+            Takes the stamp of the first message after the restart [ns]. Called in the thread that
+            takes odometry; it must not block. What this node itself forgets is not reported.
+        """
+        self._on_restart.append(callback)
 
     def open(self) -> None:
         """Subscribe."""
@@ -98,15 +113,23 @@ class OdometrySource:
     def take(self, msg: Odometry) -> None:
         """Take one message."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        at_ns = stamp_ns(msg.header.stamp)
         with self._heard:
+            run, had_poses = self._window.run, bool(len(self._window))
             self._newest, self._newest_at = msg, time.monotonic()
             frames = (msg.header.frame_id, msg.child_frame_id)
             if frames != self._frames:
                 self._window.clear()
                 self._frames = frames
-            self._window.add(stamp_ns(msg.header.stamp), np.array([p.x, p.y, p.z]),
-                             np.array([q.x, q.y, q.z, q.w]))
+            self._window.add(at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+            has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
+        if has_restarted:
+            self._node.get_logger().warning(
+                f'{self.topic} restarted, for its time, place or frames jumped: all poses from '
+                'before are forgotten', throttle_duration_sec=5.0)
+            for callback in self._on_restart:
+                callback(at_ns)
 
     def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
         """Return the newest message, or the next one if that arrives in time; else None.
@@ -131,8 +154,10 @@ class OdometrySource:
     def speeds_by_poses(self, patience_s: float) -> tuple[float, float] | None:
         """Return speed [m/s] and turn rate [rad/s] over the last 0.3 s of poses.
 
-        Many sources of poses leave the twist empty. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; None where it does not.
+        Many sources of poses leave the twist empty. Where the last two poses are further apart,
+        up to 3 s, it is the mean speed between them. Odometry that has just begun may take
+        `patience_s`, at most 2 s, to cover that time; None where it does not, or where the
+        stamps stand still.
         """
         with self._heard:
             self._heard.wait_for(lambda: self._last_moment() is not None,
@@ -140,19 +165,39 @@ class OdometrySource:
             moment = self._last_moment()
         if moment is None:
             return None
-        distance_m, angle_deg = pose_error(*moment)
-        seconds = _MOMENT_NS / NS_PER_S
+        before, now, seconds = moment
+        distance_m, angle_deg = pose_error(before, now)
         return distance_m / seconds, math.radians(angle_deg) / seconds
 
-    def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the robot's poses a moment ago and now; None where they are not known."""
+    def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+        """Return the robot's poses a moment ago and now, and the time between them [s].
+
+        None where the poses are not known.
+        """
         if self._newest is None:
             return None
         now_ns = stamp_ns(self._newest.header.stamp)
+        step_ns = self._window.since_previous_ns(now_ns)
+        moment_ns = step_ns if _MOMENT_NS < step_ns <= _LONG_NS else _MOMENT_NS
         try:
-            return self._window.pose_at(now_ns - _MOMENT_NS), self._window.pose_at(now_ns)
+            return (self._window.pose_at(now_ns - moment_ns), self._window.pose_at(now_ns),
+                    moment_ns / NS_PER_S)
         except NoOdometryError:
             return None
+
+    def moved_since(self, stamp: Time) -> tuple[float, float] | None:
+        """Return how far the robot is from where it was at an image [m], [degrees].
+
+        None where odometry does not cover that time.
+        """
+        with self._heard:
+            if self._newest is None:
+                return None
+            try:
+                return pose_error(self._window.pose_at(stamp_ns(stamp)),
+                                  self._window.pose_at(stamp_ns(self._newest.header.stamp)))
+            except NoOdometryError:
+                return None
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers about the time of an image, and so of the next.

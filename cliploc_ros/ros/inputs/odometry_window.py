@@ -73,6 +73,11 @@ class OdometryWindow:
         return bool(self._poses) and (self._poses[0].stamp_ns - slack_ns <= stamp_ns
                                       <= self._poses[-1].stamp_ns + slack_ns)
 
+    def since_previous_ns(self, stamp_ns: int) -> int:
+        """Return how long before an instant the newest pose before it is; 0 if there is none."""
+        row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        return stamp_ns - self._poses[row - 1].stamp_ns if row else 0
+
     def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
             ) -> bool:
         """Take in a pose; return whether it is valid.

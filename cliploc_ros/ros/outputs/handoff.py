@@ -10,6 +10,7 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time as Stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -28,6 +29,10 @@ from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
 # Odometry of a robot at rest may be this old (a guess): slow sources send at 1 Hz.
 _MAX_ODOM_AGE_S = 2.0
+# A robot that moved further since its image is not where the pose says (a guess). AMCL moves a
+# pose on by tf; robot_localization's set_pose does not.
+_MAX_MOVE_M = 0.1
+_MAX_MOVE_DEG = 5.0
 # How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
 # How long to wait for a subscriber of initialpose; discovery of a running one takes less.
@@ -106,7 +111,7 @@ class HandOff:
         Raises
         ------
         HandOffError
-            The robot moves or may do so; nothing was published.
+            The robot moves or may do so, or has moved since its image; nothing was published.
         NoLocalizerError
             Nobody subscribes `initialpose`; nothing was published.
         TimeJumpError
@@ -119,6 +124,7 @@ class HandOff:
         if values['require_localizer']:
             self._wait_for_localizer(deadline)
         self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
+        self._check_place(pose.header.stamp)
         if self._jumped_at >= received_at:
             raise TimeJumpError('time jumped back before the hand-over: the pose is from before')
         if self._stopped.is_set():
@@ -155,11 +161,24 @@ class HandOff:
         if by_poses is None and left_s < MOMENT_PATIENCE_S:
             raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
                                'left to see whether the robot moves: ask again')
+        by_twist = speeds(odometry)
+        if by_poses is None and by_twist == (0.0, 0.0):
+            raise HandOffError(f'{self._odometry.topic} shows neither a twist nor poses that tell '
+                               'a speed: the robot may be moving; stamp its poses, send at 1 Hz '
+                               'or more')
         # np.maximum passes NaN on, which no limit allows
-        speed_m_s, turn_rad_s = np.maximum(speeds(odometry), by_poses or (0.0, 0.0))
+        speed_m_s, turn_rad_s = np.maximum(by_twist, by_poses or (0.0, 0.0))
         if not (speed_m_s <= max_speed_m_s and turn_rad_s <= max_turn_rad_s):
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')
+
+    def _check_place(self, stamp: Stamp) -> None:
+        """Raise if odometry shows that the robot has moved since its image was taken."""
+        distance_m, angle_deg = self._odometry.moved_since(stamp) or (0.0, 0.0)
+        if distance_m > _MAX_MOVE_M or angle_deg > _MAX_MOVE_DEG:
+            raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
+                               f'degrees since its image (limits {_MAX_MOVE_M:g} and '
+                               f'{_MAX_MOVE_DEG:g}): ask again while it stands')
 
     def _settle(self, updates: int, deadline: float) -> None:
         """Have AMCL take in some scans though the robot rests, as far as time allows.

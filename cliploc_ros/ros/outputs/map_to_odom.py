@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 from std_msgs.msg import Header
 
-from cliploc_ros.ros.conversions import pose_to_msg
+from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 
 # Between broadcasts. Each is dated ahead to the next one, so that a lookup at now need not wait.
@@ -41,10 +41,11 @@ class MapToOdom:
         self._transforms = transforms
         self._broadcaster: Any = None
         self._timer: Timer | None = None
-        # Set in the worker's thread, dropped in the thread that takes /clock.
+        # Set in the worker's thread, dropped in the threads that take /clock and odometry.
         self._lock = threading.Lock()
         self._transform: TransformStamped | None = None
         self._jumped_at = -math.inf
+        self._began_ns = 0
 
     def open(self) -> None:
         """Broadcast from now on, as soon as there is a pose.
@@ -71,14 +72,24 @@ class MapToOdom:
         self._timer = None
         self.forget()
 
-    def forget(self) -> None:
-        """Drop the transform until the next accepted pose: time jumped."""
+    def forget(self, began_ns: int = 0) -> None:
+        """Drop the transform until the next accepted pose: time jumped, or odometry restarted.
+
+        Parameters
+        ----------
+        began_ns : int
+            The stamp of the first odometry after a restart [ns]. Images from before do not count,
+            even those that arrive later.
+        """
         with self._lock:
             self._transform, self._jumped_at = None, time.monotonic()
+            self._began_ns = began_ns
 
     def update(self, header: Header, map_from_base: NDArray[np.float64], values: Mapping[str, Any],
                received_at: float) -> None:
-        """Take in where the robot was; does nothing while closed, or if time has jumped since.
+        """Take in where the robot was; does nothing while closed.
+
+        Nor does it if time has jumped or odometry has restarted since.
 
         Parameters
         ----------
@@ -101,7 +112,8 @@ class MapToOdom:
                                                  header.stamp, values['tf_timeout_s'])
         transform = transform_msg(header, values['odom_frame'], map_from_base @ base_from_odom)
         with self._lock:
-            if received_at > self._jumped_at:
+            if (received_at > self._jumped_at
+                    and stamp_ns(header.stamp) >= self._began_ns):
                 self._transform = transform
 
     def _broadcast(self) -> None:
