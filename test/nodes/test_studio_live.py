@@ -180,6 +180,9 @@ def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relo
         assert isinstance(outcome[0], LiveError)
         assert text is None or text in str(outcome[0])
     own_relocalizer()
+    # DDS takes the killed one for alive for up to 20 s: a request may be for that one alone
+    wait_for(lambda: live.state.is_heard, 'the new one to report')
+    wait_for(lambda: live._node.count_publishers('/relocalizer/pose') == 1, 'the killed one to go')
     with in_a_thread(live.relocalize) as outcome:
         tester.feed_until(lambda: outcome, make_frame())
     assert str(outcome[0]).startswith('accepted')
