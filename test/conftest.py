@@ -107,7 +107,12 @@ def count(reporter, *outcomes: str) -> int:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Print measurements, the tests that did not run, and the counts for script/test."""
+    """Print first attempts that failed, measurements, what did not run, and the counts."""
+    reran = terminalreporter.stats.get('rerun', [])
+    if reran:
+        terminalreporter.section('attempts that failed, and ran again')
+    for report in reran:
+        terminalreporter.write_line(f'{report.nodeid}\n{report.longreprtext}\n')
     measured = [report for report in terminalreporter.stats.get('passed', [])
                 if report.when == 'call' and report.capstdout.strip()]
     if measured:
@@ -116,6 +121,8 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(report.nodeid)
         for line in report.capstdout.strip().splitlines():
             terminalreporter.write_line(f'    {line}')
+    for name in sorted({report.nodeid for report in reran}):
+        terminalreporter.write_line(f'ran again: {name}')
     for module, tests in sorted(config.stash[NOT_RUN].items()):
         terminalreporter.write_line(f'not run, {module} is not installed: {", ".join(tests)}')
     passed = count(terminalreporter, 'passed', 'xpassed')
