@@ -109,9 +109,10 @@ def build(options: argparse.Namespace) -> int:
     made = _build(options, detections, labeller) if old is None else _update(
         options, old, detections, labeller)
     write_map(options.out, made.landmark_map, made.comments, made.embeddings)
-    lines = made.lines
-    if old is None or options.out.resolve() != options.update.resolve():
-        lines += filter(None, [remove_layer(options.out)])
+    lines = list(made.lines)
+    is_same_map = old is not None and options.out.resolve() == options.update.resolve()
+    if not is_same_map and (note := remove_layer(options.out)):
+        lines.append(note)
     lines += write_layer(options, made.landmark_map)
     if options.report is not None:
         _write_report(options.report, made.report)

@@ -8,6 +8,7 @@ the map does not explain.
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.acceptance.confidence import MOST_CONFIDENCE
 from cliploc_ros.core.fit.covariance import share_within
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.localization import Recognized
@@ -123,14 +125,20 @@ def refusal_of(seen: Recognized, there: ObjectsThere, chance: float,
 
 def _inside(boxes: NDArray[np.float64], observation: Observation) -> NDArray[np.float64]:
     """Return boxes (n, 4) of the plane z = 1, cut at the border of the image."""
-    camera = observation.camera
+    low, high = _extent(observation.camera)
+    return np.clip(boxes, np.tile(low, 2), np.tile(high, 2))
+
+
+@lru_cache(maxsize=8)
+def _extent(camera: Camera) -> NDArray[np.float64]:
+    """Return the least and the greatest point (2, 2) of the plane z = 1 that an image shows."""
     steps = np.linspace(0.0, 1.0, _STEPS)
     grid = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1)
     points = camera.normalize_points(grid.reshape(-1, 2))
     points = points[np.isfinite(points).all(axis=1)]  # wide lenses show nothing in the corners
     if len(points) == 0:
-        return boxes
-    return np.clip(boxes, np.tile(points.min(axis=0), 2), np.tile(points.max(axis=0), 2))
+        return np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _overlaps(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A subscription that is as reliable as its publishers, and that outlives a fault of Fast DDS."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -58,7 +59,7 @@ class AdaptiveSubscription:
         # one would stay, too.
         self._overridden = node.has_parameter(
             f'qos_overrides.{self._topic}.subscription.reliability')
-        self._renewed_at = -_RENEWAL_PERIOD_S
+        self._renewed_at = -math.inf
         # Publishers come in one thread, destroy is called in another.
         self._lock = threading.RLock()
         self._subscription: Subscription | None = None
