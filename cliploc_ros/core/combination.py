@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.agreement import agreeing_poses
 from cliploc_ros.core.acceptance.confidence import MOST_CONFIDENCE
 from cliploc_ros.core.acceptance.recognition import (
     NO_OBJECTS,
@@ -27,6 +26,7 @@ from cliploc_ros.core.acceptance.recognition import (
 from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
@@ -203,4 +203,4 @@ def _contradiction(found: Relocalization, seen: Recognized) -> str:
 
 
 def _agree(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return bool(agreeing_poses(np.stack([one, other]))[0, 1])
+    return bool(SAME_ANSWER.agreeing(np.stack([one, other]))[0, 1])

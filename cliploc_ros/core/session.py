@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.geometry.tolerances import SAME_VIEW
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import localize_on_demand
@@ -22,10 +23,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.succession import Known, succeed
 from cliploc_ros.units import NS_PER_S
-
-# A camera that moved less sees the same again: its new frame replaces the one before.
-_MOVED_M = 0.05
-_MOVED_DEG = 3.0
 
 
 class KeptFrame(NamedTuple):
@@ -138,7 +135,7 @@ def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit:
 def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
     """Return how far a camera drove and turned, in the steps that make a frame a new one."""
     distance_m, angle_deg = pose_error(before, after)
-    return distance_m / _MOVED_M, angle_deg / _MOVED_DEG
+    return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg
 
 
 def _least_useful(anchors: Sequence[NDArray[np.float64]]) -> int:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT
 from cliploc_ros.core.acceptance.confidence import (
     DEFAULT,
@@ -22,6 +21,7 @@ from cliploc_ros.core.acceptance.confidence import (
     utilities,
 )
 from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import OptionsError
@@ -31,11 +31,11 @@ from cliploc_ros.evaluation.summary import wilson_interval
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 _PRECISION = 0.99
-_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained')
+_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'below')
 # Support must not count against a pose, whatever a small data set says. A larger map has more
 # wrong poses, a vertical leaves fewer.
-_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None),
-          (0, None), (None, 0))
+_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, 0),
+          (None, None), (0, None), (None, 0))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
@@ -168,7 +168,7 @@ def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
 def _log_odds(case: Case, lead: int, calibration: Calibration) -> tuple[float, float, float]:
     """Return the utilities of the leading place, of all hypotheses, and of none being right."""
     odds = utilities(case.supports, calibration) - case.handicaps
-    agreeing = agreeing_poses(case.poses)[lead]
+    agreeing = SAME_ANSWER.agreeing(case.poses)[lead]
     return (float(np.logaddexp.reduce(odds[agreeing])), float(np.logaddexp.reduce(odds)),
             none_right(case.setting, calibration))
 
@@ -184,7 +184,7 @@ class _Arrays(NamedTuple):
 
     Parameters
     ----------
-    supports : ndarray (n, h, 6)
+    supports : ndarray (n, h, 7)
     given : ndarray (n, h) of bool
         Which hypotheses exist.
     right : ndarray (n, h) of bool
@@ -221,7 +221,7 @@ def _arrays(cases: Sequence[Case]) -> _Arrays:
 
 def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
-    """Return the negative log likelihood and its derivatives (9,) by the coefficients."""
+    """Return the negative log likelihood and its derivatives (10,) by the coefficients."""
     supports, settings = data.supports / scale[:-3], data.settings / scale[-3:]
     utility = np.where(data.given, supports @ coefficients[:-3] - data.handicaps, -1e9)
     utility = np.column_stack([utility, settings @ coefficients[-3:]])

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
 from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
 from cliploc_ros.core.acceptance.confidence import Setting, confidences, utilities
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
@@ -31,6 +30,7 @@ from cliploc_ros.core.fit.finalists import (
 )
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.maps.joined_map import Place, place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -158,7 +158,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     """
     frames, best, pose = joined.frames, compared.finalists[0], compared.poses[0]
     coverage, its, likely = coverage_of(frames), compared.supports[0], compared.likely
-    elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
+    elsewhere = np.nonzero(~SAME_ANSWER.agreeing(compared.poses)[0])[0]
     rivals = likely[elsewhere]
     rival = elsewhere[np.argmax(rivals)] if len(elsewhere) else 0
     distinct, twin = _distinct(joined, compared)
@@ -188,13 +188,16 @@ def _distinct(joined: JoinedFrames, compared: Comparison) -> tuple[float, Place 
     """
     matched = np.array(sorted({one.landmark for found in compared.matches[0]
                                for one in found}), dtype=np.int64)
-    elsewhere = ~agreeing_poses(compared.poses)[0]
+    elsewhere = ~SAME_ANSWER.agreeing(compared.poses)[0]
     poses = find_twins(joined.landmark_map, compared.poses[0], matched, compared.poses[elsewhere])
     low, high = joined.options.height_range_m
     twins = [_fitted(joined, pose) for pose in poses if low <= pose[2, 3] <= high]
-    if not twins:
+    poses = np.array([compared.poses[0], *(one.map_from_camera for one in twins)])
+    # a twin that refinement moved back to the best pose is no other place
+    other = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
+    if len(other) == 0:
         return 1.0, None
-    poses = np.array([one.map_from_camera for one in twins])
+    twins, poses = [twins[row - 1] for row in other], poses[other]
     supports = _supports(joined, poses, [matches_of(joined.rig, one) for one in twins])
     chance, likeliest = chance_distinct(compared.supports[0], supports)
     return chance, place_of(joined.landmark_map, poses[likeliest])

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.agreement import agreeing_poses
 from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
@@ -56,7 +56,7 @@ class Calibration(NamedTuple):
 
     Parameters
     ----------
-    score, misfit, likeness, rarity, unlabelled, unexplained : float
+    score, misfit, likeness, rarity, unlabelled, unexplained, below : float
         Utility of a unit of each kind of support.
     none_right, map_size, vertical : float
         Utility of the case that no hypothesis is right: a constant, and a unit of each part of
@@ -72,6 +72,7 @@ class Calibration(NamedTuple):
     rarity: float
     unlabelled: float
     unexplained: float
+    below: float
     none_right: float
     map_size: float
     vertical: float
@@ -84,8 +85,8 @@ FITTED_ON = 'simulated rooms, offices, shops and bare rooms (24 of each)'
 #: Fitted with and without what else is known, and in maps whose objects have exchanged places; by
 #: labels and classes, and by classes alone.
 DEFAULT = Calibration(score=1.72, misfit=-0.274, likeness=0.465, rarity=0.347, unlabelled=0.756,
-                      unexplained=-0.797, none_right=0.92, map_size=1.44, vertical=-0.666,
-                      knee=2.0, slope=0.0)
+                      unexplained=-0.797, below=0.0, none_right=0.92, map_size=1.44,
+                      vertical=-0.666, knee=2.0, slope=0.0)
 
 
 def confidences(supports: Sequence[Support], poses: NDArray[np.float64], setting: Setting,
@@ -112,7 +113,7 @@ def confidences(supports: Sequence[Support], poses: NDArray[np.float64], setting
     none = none_right(setting, calibration)
     shares = np.exp(np.append(odds, none) - max(odds.max(), none))
     shares = shares[:-1] / shares.sum()
-    agreeing = agreeing_poses(poses)
+    agreeing = SAME_ANSWER.agreeing(poses)
     likely = np.clip(agreeing @ shares, 1.0 - MOST_CONFIDENCE, MOST_CONFIDENCE)
     log_odds = np.log(likely / (1.0 - likely))
     log_odds += calibration.slope * np.maximum(0.0, log_odds - calibration.knee)
@@ -130,6 +131,7 @@ def utilities(supports: Sequence[Support], calibration: Calibration = DEFAULT
         calibration.score * one.score + calibration.misfit * one.misfit
         + calibration.likeness * one.likeness + calibration.rarity * one.rarity
         + calibration.unlabelled * one.unlabelled + calibration.unexplained * one.unexplained
+        + calibration.below * one.below
         for one in supports])
 
 

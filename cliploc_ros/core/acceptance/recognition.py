@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.acceptance.confidence import MOST_CONFIDENCE
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.localization import Recognized
 from cliploc_ros.core.maps.landmark_map import LandmarkMap

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.agreement import agreeing_poses
+from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 
 # Hypotheses near each other share landmarks and errors, so the difference of their supports says
 # less than between places. Chosen on simulated worlds (seeds 0 to 39): 1 covers too little in
@@ -36,7 +36,7 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
     ndarray (6, 6)
         Of position [m] and rotation about the map's axes [rad].
     """
-    agreeing = agreeing_poses(poses)[0]
+    agreeing = SAME_ANSWER.agreeing(poses)[0]
     weights = np.exp(_SHARPNESS * (odds[agreeing] - odds[agreeing].max()))
     turns = Rotation.from_matrix(poses[agreeing, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
     steps = np.concatenate([poses[agreeing, :3, 3] - poses[0, :3, 3], turns], axis=1)
