@@ -29,7 +29,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.features import Features
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognition, RecognizedPlace
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -85,13 +85,12 @@ def join_keyframes(found: Relocalization, image: Image, landmark_map: LandmarkMa
     """
     guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
     seen = localizer.localize_features(image.features, image.camera, guesses, deadline)
-    if seen is None:
-        return found
-    there = objects_there(landmark_map, image.observation, seen.map_from_camera)
+    there = objects_there(landmark_map, image.observation, seen.places[0].map_from_camera
+                          ) if seen.places else None
     return replace(combine(found, seen, there, options), recognized=seen)
 
 
-def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere | None,
+def combine(found: Relocalization, seen: Recognition, there: ObjectsThere | None,
             options: RelocalizerOptions) -> Relocalization:
     """Return the answer of objects and keyframes together.
 
@@ -99,32 +98,32 @@ def combine(found: Relocalization, seen: Recognized | None, there: ObjectsThere 
     ----------
     found : Relocalization
         By objects.
-    seen : Recognized, optional
-        By keyframes; None: the objects' answer stands.
+    seen : Recognition
+        By keyframes; without places the objects' answer stands.
     there : ObjectsThere, optional
-        The objects around the pose of the keyframes.
+        The objects around the first place of the keyframes.
     options : RelocalizerOptions
     """
-    if seen is None or there is None:
+    if not seen.places or there is None:
         return found
-    chance = chance_recognized(seen, there)
+    first, chance = seen.places[0], chance_recognized(seen, there)
     agree = found.map_from_camera is not None and _agree(found.map_from_camera,
-                                                         seen.map_from_camera)
+                                                         first.map_from_camera)
     refusal = refusal_of(seen, there, chance, options)
     if agree:
-        return _both(found, seen, chance, refusal, options)
+        return _both(found, first, chance, refusal, options)
     if found.accepted and not _contradicts(seen, found, options):
         return found
     if found.accepted or (not refusal and found.confidence >= _CONTRADICTS):
-        refusal = _contradiction(found, seen)
+        refusal = _contradiction(found, first)
         found = replace(found, accepted=False, refusal_kind=RefusalKind.CONTRADICTION)
     reason = '; keyframes: '.join(filter(None, (found.reason, refusal))) if refusal else ''
     if refusal and found.confidence >= chance:  # of two refused poses, the likelier leads
         return replace(found, reason=reason)
-    return _with_pose(found, seen.map_from_camera, seen.covariance, chance, 'keyframes', reason)
+    return _with_pose(found, first.map_from_camera, first.covariance, chance, 'keyframes', reason)
 
 
-def _both(found: Relocalization, seen: Recognized, chance: float, refusal: str,
+def _both(found: Relocalization, seen: RecognizedPlace, chance: float, refusal: str,
           options: RelocalizerOptions) -> Relocalization:
     """Return the answer of two poses that agree.
 
@@ -181,7 +180,7 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
     return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance
 
 
-def _contradicts(seen: Recognized, found: Relocalization, options: RelocalizerOptions) -> bool:
+def _contradicts(seen: Recognition, found: Relocalization, options: RelocalizerOptions) -> bool:
     """Return whether keyframes contradict accepted objects elsewhere.
 
     Of two contradicting sources neither judges the other: the objects do not count here. Where
@@ -189,13 +188,13 @@ def _contradicts(seen: Recognized, found: Relocalization, options: RelocalizerOp
     decide.
     """
     assert found.map_from_camera is not None
-    if seen.rival_pose is not None and _agree(seen.rival_pose, found.map_from_camera):
+    if len(seen.places) > 1 and _agree(seen.places[1].map_from_camera, found.map_from_camera):
         return False
     alone = refusal_of(seen, NO_OBJECTS, chance_recognized(seen, NO_OBJECTS), options)
-    return not alone or seen.inliers >= _CONTRADICTING_INLIERS
+    return not alone or seen.places[0].inliers >= _CONTRADICTING_INLIERS
 
 
-def _contradiction(found: Relocalization, seen: Recognized) -> str:
+def _contradiction(found: Relocalization, seen: RecognizedPlace) -> str:
     assert found.map_from_camera is not None
     apart = np.linalg.norm(found.map_from_camera[:3, 3] - seen.map_from_camera[:3, 3])
     return (f'objects and keyframes contradict each other, their poses are {apart:.2f} m apart; '

@@ -11,7 +11,7 @@ from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition
 from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
@@ -74,7 +74,7 @@ class Relocalization:
         cliploc_ros.core.combination.
     refusal_kind : RefusalKind or None
         Kind of the refusal, which programs compare; None when accepted.
-    recognized : Recognized or None
+    recognized : Recognition or None
         What keyframes say, whatever the best pose comes from; None without keyframes.
     """
 
@@ -91,7 +91,7 @@ class Relocalization:
     stamp_ns: int = 0
     source: str = 'objects'
     refusal_kind: RefusalKind | None = None
-    recognized: Recognized | None = None
+    recognized: Recognition | None = None
 
     @property
     def solved(self) -> bool:

@@ -252,4 +252,5 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
         map='' if pose is None else place_of(landmark_map, pose).name,
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
-        keyframe_inliers=0 if found.recognized is None else int(found.recognized.inliers))
+        keyframe_inliers=0 if found.recognized is None or not found.recognized.places
+        else found.recognized.places[0].inliers)

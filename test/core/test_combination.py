@@ -14,7 +14,7 @@ from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.combination import combine, fuse
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
@@ -35,13 +35,15 @@ def by_objects(x, confidence, accepted):
                           covariance=ROUGH)
 
 
-def by_keyframes(x, inliers=200, rival=0, confirmed=0.8):
-    return Recognized(at(x), FINE, inliers, rival, None, confirmed, 0.85, (0,))
+def by_keyframes(x, inliers=200, rival=0, confirmed=0.8, rival_x=20.0):
+    places = (RecognizedPlace(at(x), FINE, inliers, confirmed, 0.85),
+              RecognizedPlace(at(rival_x), FINE, rival, confirmed, 0.85))
+    return Recognition(places[:2 if rival else 1])
 
 
 def test_without_a_layer_nothing_changes():
     found = by_objects(0.0, 0.995, True)
-    assert combine(found, None, None, OPTIONS) is found
+    assert combine(found, Recognition(), None, OPTIONS) is found
 
 
 def test_many_points_accept_what_objects_could_not():
@@ -104,9 +106,10 @@ def test_weak_features_accept_nothing(seen):
 def test_objects_stand_against_few_points_and_decide_between_two_equal_rooms():
     found = by_objects(5.0, 0.995, True)
     assert combine(found, by_keyframes(0.0, inliers=12), SOME, OPTIONS) is found
-    twin = by_keyframes(0.0, rival=190)._replace(rival_pose=at(5.1))
+    twin = by_keyframes(0.0, rival=190, rival_x=5.1)
     assert combine(found, twin, SOME, OPTIONS) is found
-    assert not combine(found, twin._replace(rival_pose=at(9.0)), SOME, OPTIONS).accepted
+    other = by_keyframes(0.0, rival=190, rival_x=9.0)
+    assert not combine(found, other, SOME, OPTIONS).accepted
 
 
 def test_accepted_objects_elsewhere_do_not_overrule_strong_features():

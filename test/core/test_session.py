@@ -13,7 +13,7 @@ from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.recognition import ObjectsThere
 from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -276,10 +276,11 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
 
     def join(found, metres):
-        seen = Recognized(make_transform(MAP_FROM_CAMERA[:3, :3], MAP_FROM_CAMERA[:3, 3]
+        seen = RecognizedPlace(make_transform(MAP_FROM_CAMERA[:3, :3], MAP_FROM_CAMERA[:3, 3]
                                          + np.array([metres, 0.0, 0.0])),
-                          fine, 200, 0, None, 0.8, 0.85, (0,))
-        return combine(found, seen, ObjectsThere(len(ROOM), 0), RELOCALIZER.options)
+                               fine, 200, 0.8, 0.85)
+        return combine(found, Recognition((seen,)), ObjectsThere(len(ROOM), 0),
+                       RELOCALIZER.options)
 
     objects = session.localize(frame(0), 0, 5, 5.0)
     first = join(objects, 0.01)

@@ -20,7 +20,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -81,24 +81,26 @@ def objects_there(landmark_map: LandmarkMap, observation: Observation,
     return ObjectsThere(explained, len(boxes) - explained)
 
 
-def chance_recognized(seen: Recognized, there: ObjectsThere) -> float:
-    """Return the probability that a pose of keyframes is within 1 m of the truth."""
-    inliers = max(1.0, seen.inliers - _RIVAL_COUNTS * seen.rival)
-    odds = (_NONE + _INLIERS * math.log(inliers) + _CONFIRMED * seen.confirmed
+def chance_recognized(seen: Recognition, there: ObjectsThere) -> float:
+    """Return the probability that the first place of keyframes is within 1 m of the truth."""
+    first = seen.places[0]
+    inliers = max(1.0, first.inliers - _RIVAL_COUNTS * seen.rival)
+    odds = (_NONE + _INLIERS * math.log(inliers) + _CONFIRMED * first.confirmed
             + _EXPLAINED * there.explained + _UNEXPLAINED * there.unexplained)
     right = 1.0 / (1.0 + math.exp(-min(odds, 50.0)))
     if _inconsistent(seen, there):
         right = min(right, 0.5)
-    return min(MOST_CONFIDENCE, right) * share_within(RIGHT_M, seen.covariance)
+    return min(MOST_CONFIDENCE, right) * share_within(RIGHT_M, first.covariance)
 
 
-def _inconsistent(seen: Recognized, there: ObjectsThere) -> str:
+def _inconsistent(seen: Recognition, there: ObjectsThere) -> str:
     """Return what in the image contradicts a pose of keyframes; empty where nothing does."""
+    first = seen.places[0]
     if seen.rival >= _MOST_RIVAL:
-        return f'{seen.inliers} points agree, but {seen.rival} on another place'
-    least = _LEAST_OF_EXPECTED + _MORE_OF_EXPECTED * min(1.0, seen.inliers / _MANY_INLIERS)
-    if seen.confirmed < least * seen.expected:
-        return (f'{seen.inliers} points agree, but only in {seen.confirmed:.0%} of the image; '
+        return f'{first.inliers} points agree, but {seen.rival} on another place'
+    least = _LEAST_OF_EXPECTED + _MORE_OF_EXPECTED * min(1.0, first.inliers / _MANY_INLIERS)
+    if first.confirmed < least * first.expected:
+        return (f'{first.inliers} points agree, but only in {first.confirmed:.0%} of the image; '
                 'has something been moved?')
     known = there.explained + there.unexplained
     if there.unexplained >= _MOST_UNEXPLAINED and there.explained < _LEAST_EXPLAINED * known:
@@ -106,20 +108,21 @@ def _inconsistent(seen: Recognized, there: ObjectsThere) -> str:
     return ''
 
 
-def refusal_of(seen: Recognized, there: ObjectsThere, chance: float,
+def refusal_of(seen: Recognition, there: ObjectsThere, chance: float,
                options: RelocalizerOptions) -> str:
     """Return why the pose of keyframes is refused; empty if it is accepted."""
-    if seen.inliers < _LEAST_INLIERS:
-        return f'{seen.inliers} points agree < {_LEAST_INLIERS}'
-    if seen.confirmed < _LEAST_CONFIRMED:
-        return (f'{seen.confirmed:.0%} of the image shows what it should < '
+    first = seen.places[0]
+    if first.inliers < _LEAST_INLIERS:
+        return f'{first.inliers} points agree < {_LEAST_INLIERS}'
+    if first.confirmed < _LEAST_CONFIRMED:
+        return (f'{first.confirmed:.0%} of the image shows what it should < '
                 f'{_LEAST_CONFIRMED:.0%}')
     if inconsistent := _inconsistent(seen, there):
         return inconsistent
     if chance < options.min_confidence:
         rival = f', {seen.rival} elsewhere' if seen.rival else ''
         return (f'confidence {math.floor(chance * 100) / 100:.2f} < {options.min_confidence:g}, '
-                f'{seen.inliers} points agree{rival}')
+                f'{first.inliers} points agree{rival}')
     return ''
 
 

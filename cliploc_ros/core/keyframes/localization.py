@@ -24,6 +24,8 @@ _SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
+#: Places of an image that do not agree with each other.
+MOST_PLACES = 3
 # Places differ by more than 1 m or 45 degrees, as poses that do not agree.
 _MOST_RANKED = 500
 _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
@@ -40,8 +42,8 @@ _LEAST_IN_CELL = 4
 _KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
-class Recognized(NamedTuple):
-    """A pose by keyframes, and what speaks for and against it.
+class RecognizedPlace(NamedTuple):
+    """A pose by keyframes, and the evidence for and against it.
 
     Parameters
     ----------
@@ -49,16 +51,14 @@ class Recognized(NamedTuple):
     covariance : ndarray (6, 6)
         In the order of core.fit.covariance.
     inliers : int
-        Number of points that agree.
-    rival : int
-        Number of points that agree with the best pose elsewhere, without those; 0 without one.
-        Those may be more: the pose whose points lie in more parts of the image comes first.
-    rival_pose : ndarray (4, 4) or None
-        That pose.
+        Number of features that agree, without those that agree with a place found before.
     confirmed : float
-        Share of the parts of the image that show what the keyframes have there: 0 to 1.
+        Share of the comparable cells of the image that show what the keyframes have there.
     expected : float
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    cells : tuple of int
+        Number of cells that confirm, and of those that are comparable: the keyframes expect points
+        there, and the image has features.
     keyframes : tuple of int
         Those that points agree with, the most points first.
     pixels : ndarray (k, 2)
@@ -70,13 +70,34 @@ class Recognized(NamedTuple):
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
     inliers: int
-    rival: int
-    rival_pose: NDArray[np.float64] | None
     confirmed: float
     expected: float
-    keyframes: tuple[int, ...]
+    cells: tuple[int, int] = (0, 0)
+    keyframes: tuple[int, ...] = ()
     pixels: NDArray[np.float64] = np.empty((0, 2))
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+
+
+class Recognition(NamedTuple):
+    """The places where keyframes recognize an image.
+
+    Parameters
+    ----------
+    places : tuple of RecognizedPlace
+        None agrees with another one. The one whose points lie in the most cells of the image is
+        first: a poster has many points, but shows only a part of its place.
+    is_complete : bool
+        Whether all keyframes were matched that should be. A search that the deadline cut has no
+        places: it may have missed their rivals.
+    """
+
+    places: tuple[RecognizedPlace, ...] = ()
+    is_complete: bool = True
+
+    @property
+    def rival(self) -> int:
+        """Return the number of inliers of the second place, which may be more; 0 without one."""
+        return self.places[1].inliers if len(self.places) > 1 else 0
 
 
 class _Matched(NamedTuple):
@@ -132,8 +153,8 @@ class KeyframeLocalizer:
 
     def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
                  guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                 ) -> Recognized | None:
-        """Find where an image was taken; None where no pose has enough points.
+                 ) -> Recognition:
+        """Find where an image was taken.
 
         Parameters
         ----------
@@ -143,20 +164,19 @@ class KeyframeLocalizer:
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
-            No further keyframe is matched then (monotonic clock) [s], and None is returned: a
-            pose elsewhere might not have been looked for.
+            No further keyframe is matched then (monotonic clock) [s].
         """
         return self.localize_features(query_features(image_rgb), camera, guesses, deadline)
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                          ) -> Recognized | None:
+                          ) -> Recognition:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features, bearings = _select(features, known), bearings[known]
         if len(features) < LEAST_INLIERS:
-            return None
+            return Recognition()
         descriptors = unit_rows(features.descriptors)
         look = _Look(features, bearings, camera)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
@@ -167,20 +187,18 @@ class KeyframeLocalizer:
             more = self._more(ranks, chosen, places)
             matched = matched.join(self._match(descriptors, more, deadline))
             places = _places(matched, look)
-        if not places or time.monotonic() > deadline:
-            return None
-        return self._recognized(places, look)
+        if time.monotonic() > deadline:
+            return Recognition(is_complete=False)
+        return Recognition(tuple(self._recognized(one, look) for one in places))
 
-    def _recognized(self, places: Sequence['_Place'], look: '_Look') -> Recognized:
-        """Return the first place, with what speaks for and against it."""
-        best, rival = places[0], places[1] if len(places) > 1 else None
-        counts = np.bincount(best.inliers.keyframes, minlength=len(self.layer))
+    def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
+        """Return a place with the evidence for and against it."""
+        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
-        return Recognized(
-            best.map_from_camera, best.covariance + self._shared(best.map_from_camera, counts),
-            best.agreed, rival.agreed if rival else 0, rival.map_from_camera if rival else None,
-            *self._confirmed(best, look, used), tuple(used.tolist()),
-            look.features.pixels[best.inliers.features], best.inliers.rows)
+        return RecognizedPlace(
+            place.map_from_camera, place.covariance + self._shared(place.map_from_camera, counts),
+            place.agreed, *self._confirmed(place, look, used), tuple(used.tolist()),
+            look.features.pixels[place.inliers.features], place.inliers.rows)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""
@@ -220,12 +238,12 @@ class KeyframeLocalizer:
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float]:
-        """Return the share of cells with inliers, of those where keyframes expect some.
+                   ) -> tuple[float, float, tuple[int, int]]:
+        """Return which cells have inliers, of those where keyframes expect some.
 
-        A cell without features, such as one that something covers, says nothing. The second
-        value is the share that is expected of so many inliers, whose density varies much from
-        cell to cell (a geometric distribution).
+        A cell without features, such as one that something covers, says nothing. The values are
+        the share, the one that is expected of so many inliers, whose density varies much from
+        cell to cell (a geometric distribution), and the numbers of cells.
         """
         expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
         for keyframe in used[:_SIMILAR].tolist():
@@ -234,10 +252,11 @@ class KeyframeLocalizer:
             expected = np.maximum(expected, _count(pixels, look.camera))
         seen = _count(look.features.pixels, look.camera)
         comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
-        if not comparable.any():
-            return 0.0, 0.0
-        density = place.agreed / comparable.sum()
-        return (float((place.cells[comparable] > 0).mean()), float(density / (1.0 + density)))
+        count = int(comparable.sum())
+        if not count:
+            return 0.0, 0.0, (0, 0)
+        confirmed = int(np.count_nonzero(place.cells[comparable]))
+        return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""
@@ -253,21 +272,22 @@ class KeyframeLocalizer:
 
 
 def _places(matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the pose that most matches agree with, and the best one elsewhere if there is one.
+    """Return the pose that most matches agree with, and the best ones elsewhere.
 
-    The one whose points lie in more parts of the image comes first: a poster has many points, but
-    shows only a part of its place.
+    The one whose points lie in the most parts of the image comes first: a poster has many points,
+    but shows only a part of its place.
     """
-    first = _place(matched, look)
-    if first is None:
-        return []
-    taken = agreeing(matched.points, look.bearings[matched.features],
-                     invert_transform(first.map_from_camera), _RIVAL_TOLERANCE)
-    second = _place(matched.select(np.setdiff1d(np.arange(len(matched.features)), taken)), look)
-    if second is None or second.agreed < LEAST_INLIERS or _same_place(
-            first.map_from_camera, second.map_from_camera):
-        return [first]
-    return sorted([first, second], key=lambda one: -np.count_nonzero(one.cells))
+    places: list[_Place] = []
+    for _ in range(MOST_PLACES):
+        place = _place(matched, look)
+        if place is None:
+            break
+        if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
+            places.append(place)
+        taken = agreeing(matched.points, look.bearings[matched.features],
+                         invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
+        matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
+    return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
 
 
 def _place(matched: _Matched, look: _Look) -> _Place | None:
@@ -276,6 +296,8 @@ def _place(matched: _Matched, look: _Look) -> _Place | None:
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
+    if len(features) < LEAST_INLIERS:
+        return None
     return _Place(found.map_from_camera, found.covariance, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
 

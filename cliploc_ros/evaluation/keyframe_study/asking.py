@@ -15,7 +15,7 @@ from cliploc_ros.core.combination import combine
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognition
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -94,8 +94,8 @@ class Place:
         seen = self.keyframes.localize(query.image_rgb, query.camera,
                                        [one.map_from_camera for one in found.hypotheses
                                         ][:MOST_GUESSES])
-        there = ObjectsThere(0, 0) if seen is None else objects_there(
-            self.landmark_map, observation, seen.map_from_camera)
+        there = objects_there(self.landmark_map, observation, seen.places[0].map_from_camera
+                              ) if seen.places else ObjectsThere(0, 0)
         both = combine(found, seen, there, OPTIONS)
         matched = time.process_time()
         alone = combine(_NOTHING, seen, ObjectsThere(0, 0), OPTIONS)
@@ -123,12 +123,13 @@ def _error(pose: NDArray[np.float64] | None, truth: NDArray[np.float64] | None) 
     return np.inf if pose is None or truth is None else pose_error(pose, truth)[0]
 
 
-def _evidence(seen: Recognized | None, there: ObjectsThere, found: Relocalization,
+def _evidence(seen: Recognition, there: ObjectsThere, found: Relocalization,
               truth: NDArray[np.float64] | None) -> dict[str, float]:
-    if seen is None:
+    if not seen.places:
         return {}
-    return {'error_m': _error(seen.map_from_camera, truth), 'inliers': seen.inliers,
-            'rival': seen.rival, 'confirmed': seen.confirmed, 'expected': seen.expected,
+    first = seen.places[0]
+    return {'error_m': _error(first.map_from_camera, truth), 'inliers': first.inliers,
+            'rival': seen.rival, 'confirmed': first.confirmed, 'expected': first.expected,
             'explained': there.explained, 'unexplained': there.unexplained,
             'chance': chance_recognized(seen, there),
             'objects_confidence': found.confidence}
