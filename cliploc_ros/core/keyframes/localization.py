@@ -280,7 +280,7 @@ def _places(matched: _Matched, look: _Look) -> list[_Place]:
     places: list[_Place] = []
     for _ in range(MOST_PLACES):
         place = _place(matched, look)
-        if place is None:
+        if place is None or (places and place.agreed < LEAST_INLIERS):
             break
         if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
             places.append(place)
@@ -296,8 +296,6 @@ def _place(matched: _Matched, look: _Look) -> _Place | None:
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
-    if len(features) < LEAST_INLIERS:
-        return None
     return _Place(found.map_from_camera, found.covariance, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
 
