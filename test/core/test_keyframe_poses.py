@@ -89,24 +89,13 @@ def test_of_equal_rooms_each_is_a_place_of_its_own():
     pose, points, bearings = look(rng, 40)
     features = Features(bearings * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
                         np.zeros((40, DIMENSIONS), np.uint8), np.ones(40, np.float32))
-    rooms = [points + (x, 0.0, 0.0) for x in (0.0, 10.0, 20.0)]
+    rooms = [points + np.array([x, 0.0, 0.0]) for x in (0.0, 10.0, 20.0)]
     matched = localization._Matched(np.tile(np.arange(40), 3), np.concatenate(rooms),
                                     np.repeat([0, 1, 2], 40), np.arange(120))
     found = localization._places(matched, localization._Look(features, bearings, CAMERA))
     assert sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found])) == [
         0.0, 10.0, 20.0]
     assert [one.agreed for one in found] == [40, 40, 40]
-
-
-def test_points_that_few_features_share_are_no_place():
-    """Several keyframes have the same point, each with an error of its own."""
-    rng = np.random.default_rng(10)
-    _, points, bearings = look(rng, 5)
-    features = Features(bearings * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
-                        np.zeros((5, DIMENSIONS), np.uint8), np.ones(5, np.float32))
-    matched = localization._Matched(np.tile(np.arange(5), 4), np.tile(points, (4, 1)),
-                                    np.repeat([0, 1, 2, 3], 5), np.arange(20))
-    assert not localization._places(matched, localization._Look(features, bearings, CAMERA))
 
 
 def test_rays_of_equal_features_meet_in_their_point():

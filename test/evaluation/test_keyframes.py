@@ -140,6 +140,19 @@ def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
     assert with_guess.places[0].inliers >= without.places[0].inliers
 
 
+def test_a_layer_covers_what_its_keyframes_saw_and_nothing_else(layer, queries):
+    localizer, frame = KeyframeLocalizer(layer), queries[0]
+    assert localizer.coverage(frame.map_from_camera, frame.camera) > 0.6
+    away, behind = frame.map_from_camera.copy(), frame.map_from_camera.copy()
+    away[2, 3] += 5.0
+    behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    for pose in (away, behind):
+        assert localizer.coverage(pose, frame.camera) == 0.0
+    edge = frame.map_from_camera.copy()
+    edge[:3, 3] += 1.5 * edge[:3, 0]
+    assert 0.0 < localizer.coverage(edge, frame.camera) < 0.6
+
+
 def test_the_office_is_triangulated_without_depth(office, room):
     layer = build_layer(office.select(range(0, 17, 2)), room, EVERY)
     assert (np.diff(layer.offsets) > 100).all()

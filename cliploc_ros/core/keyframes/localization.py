@@ -191,6 +191,15 @@ class KeyframeLocalizer:
             return Recognition(is_complete=False)
         return Recognition(tuple(self._recognized(one, look) for one in places))
 
+    def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
+        """Return the share of an image for which the layer knows what a pose (4, 4) sees.
+
+        It counts the cells of the image in which keyframes near the pose expect points. Where it
+        is 0, no keyframe is near: that an image is not recognized says nothing about this place.
+        """
+        near = _keyframes_near(self.layer.map_from_camera, map_from_camera)
+        return float(self._expects(near, map_from_camera, camera).mean())
+
     def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
         """Return a place with the evidence for and against it."""
         counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
@@ -245,18 +254,21 @@ class KeyframeLocalizer:
         the share, the one that is expected of so many inliers, whose density varies much from
         cell to cell (a geometric distribution), and the numbers of cells.
         """
-        expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
-        for keyframe in used[:_SIMILAR].tolist():
-            pixels = _project(self.layer.points_in_map(keyframe), place.map_from_camera,
-                              look.camera)
-            expected = np.maximum(expected, _count(pixels, look.camera))
         seen = _count(look.features.pixels, look.camera)
-        comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
+        comparable = (seen >= _LEAST_IN_CELL) & self._expects(used, place.map_from_camera,
+                                                              look.camera)
         count = int(comparable.sum())
         if not count:
             return 0.0, 0.0, (0, 0)
         confirmed = int(np.count_nonzero(place.cells[comparable]))
         return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
+
+    def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
+                 ) -> NDArray[np.bool_]:
+        """Return in which cells of an image the first of some keyframes expect points."""
+        counts = [_count(_project(self.layer.points_in_map(one), pose, camera), camera)
+                  for one in keyframes[:_SIMILAR].tolist()]
+        return np.max(counts, axis=0, initial=0) >= _LEAST_IN_CELL
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""
@@ -280,7 +292,7 @@ def _places(matched: _Matched, look: _Look) -> list[_Place]:
     places: list[_Place] = []
     for _ in range(MOST_PLACES):
         place = _place(matched, look)
-        if place is None:
+        if place is None or (places and place.agreed < LEAST_INLIERS):
             break
         if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
             places.append(place)
@@ -296,8 +308,6 @@ def _place(matched: _Matched, look: _Look) -> _Place | None:
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
-    if len(features) < LEAST_INLIERS:
-        return None
     return _Place(found.map_from_camera, found.covariance, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
 
