@@ -19,6 +19,7 @@ from cliploc_ros.core.acceptance.attitude import tilt_handicaps
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
+    chance_genuine,
     confidences,
     none_right,
     points_utility,
@@ -28,7 +29,7 @@ from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
-from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive
+from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
@@ -43,7 +44,11 @@ from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
+    RecognizedPlace,
+    Recognition,
+)
 from cliploc_ros.core.maps.joined_map import Place, place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -52,6 +57,8 @@ from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
 
 _NONE = np.empty(0, dtype=np.int64)
+# The most poses of objects that propose keyframes.
+_MOST_GUESSES = 3
 
 
 class JoinedFrames(NamedTuple):
@@ -99,6 +106,8 @@ class Candidate(NamedTuple):
         Inliers in each frame.
     support : Support
         By objects.
+    is_upright : bool
+        Whether it uses the known vertical, or agrees with it.
     handicap : float
         Log odds that its attitude takes from it.
     odds : float
@@ -111,6 +120,7 @@ class Candidate(NamedTuple):
     pose: NDArray[np.float64]
     matches: list[tuple[Match, ...]]
     support: Support
+    is_upright: bool
     handicap: float
     odds: float
     recognized: RecognizedPlace | None = None
@@ -126,11 +136,14 @@ class Comparison(NamedTuple):
     poses : ndarray (m, 4, 4)
     likely : ndarray (m,)
         Probability of each, shared by those that agree.
+    recognition : Recognition
+        What keyframes say.
     """
 
     candidates: list[Candidate]
     poses: NDArray[np.float64]
     likely: NDArray[np.float64]
+    recognition: Recognition
 
     @property
     def leading(self) -> NDArray[np.bool_]:
@@ -151,8 +164,8 @@ class Comparison(NamedTuple):
 
 
 def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDArray[np.bool_],
-            places: Sequence[RecognizedPlace] = ()) -> Comparison:
-    """Return the candidates compared.
+            recognizer: ImageRecognizer | None = None) -> Comparison:
+    """Return the candidates compared; none where neither source has any.
 
     Poses that ignore the known vertical come last. Without refinement the greatest score is
     first, as in the paper.
@@ -164,43 +177,56 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
         Of the search of objects.
     is_upright : ndarray (m,) of bool
         Which of them use the known vertical.
-    places : sequence of RecognizedPlace
-        Where keyframes recognize the last frame.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes, for the image of the last frame.
     """
-    low, high = joined.options.height_range_m
-    places = [one for one in places if low <= one.map_from_camera[2, 3] <= high]
-    upright = [*is_upright.tolist(), *(_keeps_vertical(joined, one) for one in places)]
-    every = _candidates(joined, [*finalists, *(_unrefined(one.map_from_camera)
-                                               for one in places)],
-                        upright, [None] * len(finalists) + [*places])
-    order = list(range(len(every)))
+    candidates = _candidates(joined, finalists, is_upright.tolist())
     if joined.options.refine:
-        likeliest = sorted(order, key=lambda row: -every[row].odds)
-        order = [row for known in (True, False) for row in first_of_each_place(
-            [row for row in likeliest if upright[row] == known and row < len(finalists)],
-            finalists, MAX_DISTINCT)]
-        order += range(len(finalists), len(every))
-        order.sort(key=lambda row: (not upright[row], -every[row].odds))
-    candidates = [every[row] for row in order]
+        order = sorted(range(len(candidates)), key=lambda row: -candidates[row].odds)
+        candidates = [candidates[row] for known in (True, False) for row in first_of_each_place(
+            [row for row in order if candidates[row].is_upright == known], finalists,
+            MAX_DISTINCT)]
+    seen = Recognition()
+    if recognizer is not None:
+        seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]])
+        candidates = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
+                      for one in candidates] + _proposed(joined, seen)
+        candidates.sort(key=lambda one: (not one.is_upright, -one.odds))
     poses = np.array([one.pose for one in candidates]).reshape(-1, 4, 4)
     return Comparison(candidates, poses, confidences(
-        np.array([one.odds for one in candidates]), poses, none_right(joined.setting)))
+        np.array([one.odds for one in candidates]), poses, none_right(joined.setting)), seen)
 
 
-def _candidates(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool],
-                recognized: Sequence[RecognizedPlace | None]) -> list[Candidate]:
+def _candidates(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
+                ) -> list[Candidate]:
+    """Return poses as candidates, with their odds by objects."""
     poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
     matches = [matches_of(joined.rig, one) for one in finalists]
     supports = supports_of(joined, poses, matches)
     handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
         if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
-    by_objects, none = utilities(supports), none_right(joined.setting)
-    return [Candidate(one, pose, found, its, float(handicap),
-                      (utility if place is None else none + points_utility(place, its)) - handicap,
-                      place)
-            for one, pose, found, its, handicap, utility, place in zip(
-                finalists, poses, matches, supports, handicaps, by_objects.tolist(), recognized,
-                strict=True)]
+    return list(map(Candidate, finalists, poses, matches, supports, upright, handicaps.tolist(),
+                    (utilities(supports) - handicaps).tolist()))
+
+
+def _proposed(joined: JoinedFrames, seen: Recognition) -> list[Candidate]:
+    """Return the places that keyframes recognize, as candidates, with their odds by points."""
+    low, high = joined.options.height_range_m
+    places = [one for one in seen.places if low <= one.map_from_camera[2, 3] <= high]
+    none = none_right(joined.setting)
+    return [one._replace(recognized=place, odds=none - one.handicap
+                         + points_utility(place, one.support))
+            for one, place in zip(_candidates(
+                joined, [_unrefined(one.map_from_camera) for one in places],
+                [_keeps_vertical(joined, one) for one in places]), places, strict=True)]
+
+
+def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecognizer) -> float:
+    """Return what it says against a pose (4, 4) that keyframes near it do not recognize it."""
+    if not seen.is_complete or any(SAME_ANSWER.agree(pose, one.map_from_camera)
+                                   for one in seen.places):
+        return 0.0
+    return CALIBRATION.keyframes.missed * recognizer.coverage(pose)
 
 
 def _keeps_vertical(joined: JoinedFrames, place: RecognizedPlace) -> bool:
@@ -263,33 +289,38 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     recognizer : ImageRecognizer, optional
         Of the keyframes, where there are some.
     """
-    candidates, likely, leading = compared.candidates, compared.likely, compared.leading
-    by_objects, by_keyframes = compared.by_objects, compared.by_keyframes
-    best = by_objects or candidates[0]
-    rival = max(np.nonzero(~leading)[0], key=lambda row: likely[row], default=None)
-    coverage = coverage_of(joined.frames)
+    best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
+    coverage, last = coverage_of(joined.frames), joined.frames[-1].observation
     distinct, twin = _distinct(joined, compared, recognizer)
-    pose = compared.poses[0]
+    recognized = place and place.recognized
     return Evidence(
-        best.support.inliers, likely[0], _by_points(joined, compared),
-        rival=0.0 if rival is None else min(likely[rival], 1.0 - likely[0]),
-        distinct=distinct, place=place_of(joined.landmark_map, pose).position,
-        twin=twin and twin.position,
+        best.support.inliers, float(compared.likely[0]), _by_points(joined, compared),
+        _rival(joined, compared), distinct,
+        place_of(joined.landmark_map, compared.poses[0]).position, twin and twin.position,
+        twin.name if twin else '',
         # the covariance of a minimal sample is too rough to decide
-        near=1.0 if by_keyframes is None and best.finalist.information is None else share_within(
-            RIGHT_M, covariance),
-        deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
-        coverage=coverage,
-        tried=sum(one.known_tried for one in joined.frames),
-        meetings=math.inf if is_exhaustive(coverage, joined.options) or by_objects is None
+        1.0 if place is None and best.finalist.information is None
+        else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
+        math.sqrt(np.trace(covariance[:3, :3])), coverage,
+        sum(one.known_tried for one in joined.frames),
+        math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        unexplained=best.support.unexplained,
-        earlier=looks.confidences_in(joined.frames[-1].observation, pose),
-        rival_map='' if rival is None else place_of(joined.landmark_map,
-                                                    compared.poses[rival]).name,
-        twin_map=twin.name if twin else '',
-        rival_by='' if rival is None else candidates[rival].source,
-        recognized=by_keyframes and by_keyframes.recognized)
+        best.support.unexplained, chance_genuine(recognized) if recognized else 1.0, recognized,
+        looks.confidences_in(last, compared.poses[0]),
+        0 if last.compared is None else len(last.detections) - len(last.compared))
+
+
+def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
+    """Return the likeliest pose that does not agree with the leading one."""
+    others = np.nonzero(~compared.leading)[0]
+    if len(others) == 0:
+        return None
+    row = others[np.argmax(compared.likely[others])]
+    place = place_of(joined.landmark_map, compared.poses[row])
+    by_keyframes = compared.candidates[row].recognized is not None
+    return Rival(min(float(compared.likely[row]), 1.0 - float(compared.likely[0])),
+                 place.position, place.name,
+                 compared.by_objects is None if not by_keyframes else compared.by_keyframes is None)
 
 
 def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
@@ -301,8 +332,7 @@ def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
             if one.recognized is not None or not near]
     found = confidences(np.array([compared.candidates[row].odds for row in rows]),
                         compared.poses[rows], none_right(joined.setting))
-    return float(found[[compared.candidates[row] is compared.by_keyframes
-                        for row in rows].index(True)])
+    return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
 
 
 def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecognizer | None
@@ -312,12 +342,11 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     Next to it is where the camera would be at the likeliest of these places. Keyframes tell a
     twin apart as far as they cover it.
     """
-    best, low_high = compared.candidates[0], joined.options.height_range_m
+    best, (low, high) = compared.candidates[0], joined.options.height_range_m
     matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
                        dtype=np.int64)
     found = find_twins(joined.landmark_map, best.pose, matched,
                        compared.poses[~compared.leading])
-    low, high = low_high
     twins = [_fitted(joined, pose) for pose in found if low <= pose[2, 3] <= high]
     poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
     # a twin that refinement moved back to the leading pose is no other place
@@ -326,12 +355,26 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         return 1.0, None
     supports = supports_of(joined, poses[others],
                            [matches_of(joined.rig, twins[row - 1]) for row in others])
-    recognized = compared.by_keyframes and compared.by_keyframes.recognized
-    leads = np.zeros(len(others)) if recognizer is None or recognized is None else np.array(
-        [recognizer.coverage(pose) for pose in poses[others]]) * max(
-            0.0, points_utility(recognized, best.support))
-    chance, likeliest = chance_distinct(best.support, supports, leads)
+    chance, likeliest = chance_distinct(best.support, supports, _leads_of_points(
+        compared, poses[others], recognizer))
     return chance, place_of(joined.landmark_map, poses[others][likeliest])
+
+
+def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
+                     recognizer: ImageRecognizer | None) -> NDArray[np.float64]:
+    """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
+
+    They say nothing about a twin that they do not cover.
+    """
+    leading = compared.by_keyframes
+    if recognizer is None or leading is None or leading.recognized is None:
+        return np.zeros(len(twins))
+    covered = np.array([recognizer.coverage(pose) for pose in [leading.pose, *twins]])
+    own = max(0.0, points_utility(leading.recognized, leading.support))
+    theirs = np.array([max([0.0] + [
+        points_utility(one.recognized, one.support) for one in compared.candidates
+        if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)]) for pose in twins])
+    return np.maximum(0.0, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)) * own - theirs)
 
 
 def _fitted(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Finalist:

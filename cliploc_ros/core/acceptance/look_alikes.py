@@ -17,8 +17,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.support import Support
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER, SAME_MOVE
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -29,10 +30,8 @@ from cliploc_ros.core.maps.landmark_map import LandmarkMap
 _PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
 # Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
 _LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
-# Moves that lay a place within this of where another one does are the same.
-_SAME_M, _SAME_COSINE = 1.0, np.cos(np.radians(30.0))
-# The camera of a twin is elsewhere: as far away, or turned as far, as poses that do not agree.
-_ELSEWHERE_COSINE = np.cos(np.radians(45.0))
+_SAME_TURN = np.cos(np.radians(SAME_MOVE.angle_deg))
+_OWN_TURN = np.cos(np.radians(SAME_ANSWER.angle_deg))
 # Both places are upright: one is moved onto the other by a turn about the vertical.
 _MOST_TILT = np.cos(np.radians(20.0))
 # How near a landmark must lie to one of its class, each time after the move is fitted [m].
@@ -42,8 +41,6 @@ _NEAR_M = (0.6, 0.45, 0.3)
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
 # The most twins of a pose, and poses of the search whose places are compared.
 _TWINS, _OTHERS = 3, 5
-# Log odds of a unit of likeness, and of an object that was matched by class alone.
-_LIKENESS, _UNLABELLED = 0.44, 0.5
 
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
@@ -79,7 +76,8 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     return moves[_distinct(moves, map_from_camera[:3, 3], _TWINS)] @ map_from_camera
 
 
-def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]:
+def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.float64]
+                    ) -> tuple[float, int]:
     """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
     Parameters
@@ -87,7 +85,9 @@ def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]
     its : Support
         Of the pose.
     twins : sequence of Support
-        Of the poses at places that look like its own, one at least.
+        Of the m poses at places that look like its own, one at least.
+    leads : ndarray (m,)
+        Log odds by which keyframes prefer the pose to each.
 
     Returns
     -------
@@ -95,8 +95,9 @@ def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]
     likeliest : int
         The twin that is likeliest.
     """
-    leads = np.array([_LIKENESS * (its.likeness - one.likeness)
-                      + _UNLABELLED * (its.unlabelled - one.unlabelled) for one in twins])
+    terms = CALIBRATION.places
+    leads = leads + [terms.likeness * (its.likeness - one.likeness)
+                     + terms.unlabelled * (its.unlabelled - one.unlabelled) for one in twins]
     return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
             int(np.argmin(leads)))
 
@@ -149,8 +150,8 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
     """Return which moves (m, m) take a point to the same place by the same turn."""
     ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
     cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
-    return np.asarray((np.linalg.norm(ends[:, None] - ends, axis=2) < _SAME_M)
-                      & (cosines > _SAME_COSINE))
+    near = np.linalg.norm(ends[:, None] - ends, axis=2) < SAME_MOVE.distance_m
+    return np.asarray(near & (cosines > _SAME_TURN))
 
 
 def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
@@ -177,7 +178,7 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
             moves = _fitted(centers, landmark_map.centers[others], found)
     steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
     elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
-                 | (moves[:, 0, 0] < _ELSEWHERE_COSINE))
+                 | (moves[:, 0, 0] < _OWN_TURN))
     return moves[elsewhere], found[elsewhere]
 
 

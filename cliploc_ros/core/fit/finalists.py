@@ -19,7 +19,6 @@ from cliploc_ros.core.fit.covariance import (
 )
 from cliploc_ros.core.fit.refined_covariance import (
     POSE_UNKNOWN,
-    PoseCovariance,
     refined_covariance,
 )
 from cliploc_ros.core.fit.refinement import refine_rig
@@ -219,7 +218,7 @@ def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> i
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                   matches: Sequence[Sequence[Match]],
-                  shared: NDArray[np.float64] | None = None) -> PoseCovariance:
+                  shared: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
@@ -242,7 +241,7 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
     covariance = (_sample_covariance(frames, cameras, pose,
                                      _scatter(frames, cameras, pose, matches))
                   + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
-    return PoseCovariance(covariance, covariance)
+    return covariance
 
 
 def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,

@@ -33,7 +33,7 @@ class Tolerance(NamedTuple):
 
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
         """Return a tolerance that allows so much more."""
-        return Tolerance(self.distance_m + distance_m, self.angle_deg + angle_deg)
+        return Tolerance(self.distance_m + distance_m, min(180.0, self.angle_deg + angle_deg))
 
 
 #: Two poses are the same answer to where the camera is; a right pose is so near to the truth.

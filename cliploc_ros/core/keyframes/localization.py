@@ -3,7 +3,7 @@
 """Localize an image among keyframes: find similar ones, match them, solve for the pose."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -281,6 +281,43 @@ class KeyframeLocalizer:
         position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
         rotation = _KEYFRAME_RAD**2 + (_PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
+
+
+class ImageRecognizer:
+    """The keyframe search of one image, which several searches of its objects ask.
+
+    Parameters
+    ----------
+    keyframes : KeyframeLocalizer
+    features : Features or callable
+        Of the image; a callable is called when they are needed first.
+    camera : Camera
+    deadline : float
+        See KeyframeLocalizer.localize.
+    """
+
+    def __init__(self, keyframes: KeyframeLocalizer, features: Features | Callable[[], Features],
+                 camera: Camera, deadline: float = np.inf) -> None:
+        self._keyframes = keyframes
+        self._features = features
+        self._camera = camera
+        self._deadline = deadline
+        self._known: tuple[set[int], Recognition] | None = None
+
+    def recognize(self, guesses: Sequence[NDArray[np.float64]]) -> Recognition:
+        """Find where the image was taken; again only where guesses propose other keyframes."""
+        near = {row for guess in guesses for row in _keyframes_near(
+            self._keyframes.layer.map_from_camera, guess)[:_PROPOSED].tolist()}
+        if self._known is None or not near <= self._known[0]:
+            if callable(self._features):
+                self._features = self._features()
+            self._known = near, self._keyframes.localize_features(
+                self._features, self._camera, guesses, self._deadline)
+        return self._known[1]
+
+    def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
+        """Return KeyframeLocalizer.coverage for the camera of the image."""
+        return self._keyframes.coverage(map_from_camera, self._camera)
 
 
 def _places(matched: _Matched, look: _Look) -> list[_Place]:
