@@ -34,6 +34,7 @@ from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
+from cliploc_ros.core.search.frame_search import prior_of
 
 # Objects whose pose elsewhere is so likely contradict the features.
 _CONTRADICTS = 0.5
@@ -84,7 +85,8 @@ def join_keyframes(found: Relocalization, image: Image, landmark_map: LandmarkMa
         When no further keyframe is matched (monotonic clock) [s].
     """
     guesses = [one.map_from_camera for one in found.hypotheses][:_MOST_GUESSES]
-    seen = localizer.localize_features(image.features, image.camera, guesses, deadline)
+    seen = localizer.localize_features(image.features, image.camera, guesses, deadline,
+                                       prior_of(image.observation, options))
     there = objects_there(landmark_map, image.observation, seen.places[0].map_from_camera
                           ) if seen.places else None
     return replace(combine(found, seen, there, options), recognized=seen)

@@ -39,6 +39,9 @@ _LEAST_CONFIRMED, _LEAST_INLIERS = 0.3, 20
 # they lie on a poster: from a few inliers up to many.
 _MOST_RIVAL = 20
 _LEAST_OF_EXPECTED, _MORE_OF_EXPECTED, _MANY_INLIERS = 0.6, 0.32, 300
+# So does a pose that is so many standard deviations off the known vertical. A guess: one right
+# pose of 270,000 is, if the vertical is right.
+_MOST_TILT_ERROR = 5.0
 # Detected objects of the map's classes contradict a pose that explains so few of them.
 _MOST_UNEXPLAINED, _LEAST_EXPLAINED = 4, 0.25
 # A detection is explained by a landmark of its class whose outline overlaps it so much.
@@ -102,6 +105,9 @@ def _inconsistent(seen: Recognition, there: ObjectsThere) -> str:
     if first.confirmed < least * first.expected:
         return (f'{first.inliers} points agree, but only in {first.confirmed:.0%} of the image; '
                 'has something been moved?')
+    if first.tilt_error > _MOST_TILT_ERROR:
+        return (f'the pose is {first.tilt_error:.1f} standard deviations off against the known '
+                f'vertical > {_MOST_TILT_ERROR:g}; is the camera mount right?')
     known = there.explained + there.unexplained
     if there.unexplained >= _MOST_UNEXPLAINED and there.explained < _LEAST_EXPLAINED * known:
         return f'{there.unexplained} of {known} objects are not where the pose expects them'
