@@ -6,14 +6,16 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.recognition import ObjectsThere
-from cliploc_ros.core.combination import combine
+from cliploc_ros.core.combination import Image, combine, join_keyframes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
@@ -151,6 +153,30 @@ def test_a_layer_covers_what_its_keyframes_saw_and_nothing_else(layer, queries):
     edge = frame.map_from_camera.copy()
     edge[:3, 3] += 1.5 * edge[:3, 0]
     assert 0.0 < localizer.coverage(edge, frame.camera) < 0.6
+
+
+@pytest.mark.parametrize(('wrong', 'reason'), [
+    ('', ''), ('height', 'no objects'), ('vertical', 'against the known vertical'),
+    ('tilt', 'no objects')])
+def test_height_and_vertical_restrict_keyframes_as_they_restrict_objects(
+        layer, queries, room, wrong, reason):
+    nothing = Detections(np.empty((0, 4)), (), np.empty(0))
+    for frame in queries:
+        up, height = frame.map_from_camera[2, :3], frame.map_from_camera[2, 3]
+        if wrong == 'vertical':  # 10 degrees off
+            level = np.cross(up, np.roll(up, 1))
+            up = Rotation.from_rotvec(np.radians(10.0) * level / np.linalg.norm(level)).apply(up)
+        shift = 0.5 if wrong == 'height' else 0.0
+        options = RelocalizerOptions(
+            matching='class', height_range_m=(height - 0.1 + shift, height + 0.1 + shift),
+            max_tilt_deg=1.0 if wrong == 'tilt' else 180.0)
+        observation = Observation(frame.camera, nothing,
+                                  up_in_camera=None if wrong == 'tilt' else up)
+        found = join_keyframes(
+            NOWHERE, Image(localization.query_features(frame.image_rgb), frame.camera,
+                           observation), room, KeyframeLocalizer(layer), options)
+        assert found.accepted == (not wrong), found.reason
+        assert reason in found.reason
 
 
 def test_the_office_is_triangulated_without_depth(office, room):

@@ -16,6 +16,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
+from cliploc_ros.core.search.prior import Prior
 
 # Features of a query; keyframes that are matched: the most similar ones, then the most similar
 # ones elsewhere, so that a place that looks alike is found, and those where objects propose.
@@ -34,6 +35,7 @@ _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
 NEAR_M, NEAR_DEG = 2.0, 40.0
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
+_NOTHING_KNOWN = Prior()
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
@@ -59,6 +61,9 @@ class RecognizedPlace(NamedTuple):
     cells : tuple of int
         Number of cells that confirm, and of those that are comparable: the keyframes expect points
         there, and the image has features.
+    tilt_error : float
+        Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
+        place: the vertical may be wrong, as with a wrong camera mount.
     keyframes : tuple of int
         Those that points agree with, the most points first.
     pixels : ndarray (k, 2)
@@ -73,6 +78,7 @@ class RecognizedPlace(NamedTuple):
     confirmed: float
     expected: float
     cells: tuple[int, int] = (0, 0)
+    tilt_error: float = 0.0
     keyframes: tuple[int, ...] = ()
     pixels: NDArray[np.float64] = np.empty((0, 2))
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
@@ -122,11 +128,12 @@ def query_features(image_rgb: NDArray[np.uint8]) -> Features:
 
 
 class _Look(NamedTuple):
-    """An image: its features, their bearings (n, 2), the camera."""
+    """An image: its features, their bearings (n, 2), the camera and what is known of it."""
 
     features: Features
     bearings: NDArray[np.float64]
     camera: Camera
+    prior: Prior = _NOTHING_KNOWN
 
 
 class _Place(NamedTuple):
@@ -152,8 +159,8 @@ class KeyframeLocalizer:
         layer.prepare()
 
     def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
-                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                 ) -> Recognition:
+                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
+                 prior: Prior = _NOTHING_KNOWN) -> Recognition:
         """Find where an image was taken.
 
         Parameters
@@ -165,12 +172,14 @@ class KeyframeLocalizer:
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
             No further keyframe is matched then (monotonic clock) [s].
+        prior : Prior, optional
+            Poses that its height range or max_tilt excludes are no places.
         """
-        return self.localize_features(query_features(image_rgb), camera, guesses, deadline)
+        return self.localize_features(query_features(image_rgb), camera, guesses, deadline, prior)
 
     def localize_features(self, features: Features, camera: Camera,
-                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                          ) -> Recognition:
+                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
+                          prior: Prior = _NOTHING_KNOWN) -> Recognition:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
@@ -178,7 +187,7 @@ class KeyframeLocalizer:
         if len(features) < LEAST_INLIERS:
             return Recognition()
         descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings, camera)
+        look = _Look(features, bearings, camera, prior)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
@@ -204,9 +213,10 @@ class KeyframeLocalizer:
         """Return a place with the evidence for and against it."""
         counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
+        covariance = place.covariance + self._shared(place.map_from_camera, counts)
         return RecognizedPlace(
-            place.map_from_camera, place.covariance + self._shared(place.map_from_camera, counts),
-            place.agreed, *self._confirmed(place, look, used), tuple(used.tolist()),
+            place.map_from_camera, covariance, place.agreed, *self._confirmed(place, look, used),
+            look.prior.tilt_error(place.map_from_camera, covariance), tuple(used.tolist()),
             look.features.pixels[place.inliers.features], place.inliers.rows)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
@@ -327,12 +337,15 @@ def _places(matched: _Matched, look: _Look) -> list[_Place]:
     but shows only a part of its place.
     """
     places: list[_Place] = []
-    for _ in range(MOST_PLACES):
+    found = 0
+    while found < MOST_PLACES:
         place = _place(matched, look)
         if place is None or (places and place.agreed < LEAST_INLIERS):
             break
-        if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
-            places.append(place)
+        if look.prior.allows(place.map_from_camera):
+            found += 1
+            if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
+                places.append(place)
         taken = agreeing(matched.points, look.bearings[matched.features],
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
