@@ -152,7 +152,7 @@ class Relocalizer:
             evidence=evidence, covariance=covariance, tried=_tried(frames),
             best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
-            recognition=compared.recognition)
+            source=compared.source, recognition=compared.recognition)
 
 
 def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence

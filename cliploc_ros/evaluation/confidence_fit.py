@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Objects
 from cliploc_ros.core.acceptance.confidence import (
-    DEFAULT,
-    Calibration,
     Setting,
     confidences,
     none_right,
@@ -31,11 +29,11 @@ from cliploc_ros.evaluation.summary import wilson_interval
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 _PRECISION = 0.99
-_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'below')
+_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained')
 # Support must not count against a pose, whatever a small data set says. A larger map has more
 # wrong poses, a vertical leaves fewer.
-_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, 0),
-          (None, None), (0, None), (None, 0))
+_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None),
+          (0, None), (None, 0))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
@@ -64,7 +62,7 @@ class Case:
     is_elsewhere : bool
         Whether the map shows another place, so that every pose is wrong.
     certainty : float
-        See Evidence.
+        That nothing besides the poses found makes the best one wrong, see Evidence.
     """
 
     place: str
@@ -86,16 +84,18 @@ def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: st
     return Case(place, tuple(one.support for one in found.hypotheses), poses,
                 (errors < RIGHT_M) & (not is_elsewhere),
                 np.array([one.handicap for one in found.hypotheses]), setting, weight,
-                is_elsewhere, 1.0 if found.evidence is None else found.evidence.certainty)
+                is_elsewhere, 1.0 if found.evidence is None
+                else found.evidence.certainty * found.evidence.found)
 
 
-def outcomes(cases: Sequence[Case], calibration: Calibration = DEFAULT) -> Judged:
+def outcomes(cases: Sequence[Case], calibration: Calibration = CALIBRATION) -> Judged:
     """Return the confidence (n,) in the likeliest pose of each case, and whether it is right."""
     likely, right = [], []
     for case in cases:
         lead = _lead(case, calibration)
-        likely.append(case.certainty * confidences(case.supports, case.poses, case.setting,
-                                                   calibration, case.handicaps)[lead])
+        likely.append(case.certainty * confidences(
+            utilities(case.supports, calibration) - case.handicaps, case.poses,
+            none_right(case.setting, calibration), calibration)[lead])
         right.append(case.right[lead])
     return np.array(likely), np.array(right, dtype=bool)
 
@@ -104,7 +104,7 @@ def _lead(case: Case, calibration: Calibration) -> int:
     """Return which hypothesis leads; one that contradicts a known vertical never does."""
     odds = utilities(case.supports, calibration) - case.handicaps
     if case.setting.vertical > 0.0:
-        odds = np.where(case.handicaps < WRONG_MOUNT, odds, -np.inf)
+        odds = np.where(case.handicaps < CALIBRATION.attitude.wrong_mount, odds, -np.inf)
     return int(np.argmax(odds))
 
 
@@ -131,13 +131,15 @@ def fit(cases: Sequence[Case]) -> Calibration:
     data = _arrays(cases)
     scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
     bounds = list(_SIGNS)
-    start = np.append(np.zeros(len(_FIELDS)), [1.0, DEFAULT.map_size, DEFAULT.vertical])
+    installed = CALIBRATION.objects
+    start = np.append(np.zeros(len(_FIELDS)), [1.0, installed.map_size, installed.vertical])
     for column in (1, 2):  # size of the map, vertical
         if np.ptp(data.settings[:, column]) == 0.0:
             row = len(_FIELDS) + column
             bounds[row] = (start[row], start[row])
     solved = minimize(_loss, start, (data, scale), jac=True, method='L-BFGS-B', bounds=bounds)
-    return _levelled(cases, Calibration(*map(float, [*solved.x / scale, 0.0, 0.0])))
+    return _levelled(cases, CALIBRATION._replace(
+        objects=Objects(*map(float, [*solved.x / scale, 0.0, 0.0]))))
 
 
 def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
@@ -161,8 +163,9 @@ def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
                  for knee in _KNEES]
     best = int(np.argmin([one.fun for one in solutions]))
     shift, slope = solutions[best].x
-    return raw._replace(none_right=raw.none_right + float(shift), knee=_KNEES[best],
-                        slope=float(np.clip(slope, 0.0, _MOST_SLOPE)))
+    return raw._replace(objects=raw.objects._replace(
+        none_right=raw.objects.none_right + float(shift), knee=_KNEES[best],
+        slope=float(np.clip(slope, 0.0, _MOST_SLOPE))))
 
 
 def _log_odds(case: Case, lead: int, calibration: Calibration) -> tuple[float, float, float]:
@@ -184,7 +187,7 @@ class _Arrays(NamedTuple):
 
     Parameters
     ----------
-    supports : ndarray (n, h, 7)
+    supports : ndarray (n, h, 6)
     given : ndarray (n, h) of bool
         Which hypotheses exist.
     right : ndarray (n, h) of bool
@@ -221,7 +224,7 @@ def _arrays(cases: Sequence[Case]) -> _Arrays:
 
 def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
-    """Return the negative log likelihood and its derivatives (10,) by the coefficients."""
+    """Return the negative log likelihood and its derivatives (9,) by the coefficients."""
     supports, settings = data.supports / scale[:-3], data.settings / scale[-3:]
     utility = np.where(data.given, supports @ coefficients[:-3] - data.handicaps, -1e9)
     utility = np.column_stack([utility, settings @ coefficients[-3:]])
@@ -265,9 +268,9 @@ def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[
 
 
 def paste(calibration: Calibration) -> str:
-    """Return the coefficients as source code."""
-    return ('\nfitted on all of them, for cliploc_ros/core/acceptance/confidence.py:\n'
-            + ', '.join(f'{name}={value:.3g}' for name, value in calibration._asdict().items()))
+    """Return the coefficients for the installed file."""
+    return '\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
+        f'{name}: {value:.3g}' for name, value in calibration.objects._asdict().items())
 
 
 def draw_judged(folder: Path, title: str, judged: Mapping[str, Judged]) -> None:

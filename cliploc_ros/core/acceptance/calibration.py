@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers that decide whether a pose is accepted: calibration.yaml, one named tuple a section."""
+"""The numbers that decide whether a pose is accepted: calibration.yaml, a tuple a section."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +19,6 @@ class Objects(NamedTuple):
     rarity: float
     unlabelled: float
     unexplained: float
-    below: float
     none_right: float
     map_size: float
     vertical: float
@@ -53,6 +52,7 @@ class Attitude(NamedTuple):
     """What an attitude says against a pose."""
 
     wrong_mount: float
+    not_mirrored: float
     vertical_sigmas: float
 
 

@@ -9,121 +9,51 @@ leads, and the evidence for it is all that decides whether it is accepted.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.attitude import tilt_handicaps
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.candidates import (
+    Candidate,
+    JoinedFrames,
+    candidates_of,
+    refined,
+    supports_of,
+    unrefined,
+)
 from cliploc_ros.core.acceptance.confidence import (
-    Setting,
     chance_genuine,
     confidences,
     none_right,
     points_utility,
-    utilities,
 )
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
 from cliploc_ros.core.acceptance.spread import spread
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
-    Match,
     covariance_of,
     first_of_each_place,
     matches_of,
     meetings_of,
 )
 from cliploc_ros.core.fit.fusion import fuse
-from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import Rig
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
-from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.localization import (
     ImageRecognizer,
-    RecognizedPlace,
     Recognition,
 )
 from cliploc_ros.core.maps.joined_map import Place, place_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of
+from cliploc_ros.core.search.frame_search import coverage_of, prior_of
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
-
-_NONE = np.empty(0, dtype=np.int64)
 # The most poses of objects that propose keyframes.
 _MOST_GUESSES = 3
-
-
-class JoinedFrames(NamedTuple):
-    """What poses are compared on: searched frames of one camera, in a map.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-    frames : sequence of F SearchedFrame
-    rig : Rig
-        The same frames.
-    cameras : ndarray (F, 4, 4)
-        Each camera from the last.
-    """
-
-    landmark_map: LandmarkMap
-    options: RelocalizerOptions
-    frames: Sequence[SearchedFrame]
-    rig: Rig
-    cameras: NDArray[np.float64]
-
-    @property
-    def knows_vertical(self) -> bool:
-        """Return whether the vertical of any frame is known."""
-        return bool(self.rig.verticals[:, 6].any())
-
-    @property
-    def setting(self) -> Setting:
-        """Return what the chance of a wrong pose depends on, besides the supports."""
-        return Setting(len(self.landmark_map),
-                       self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
-
-
-class Candidate(NamedTuple):
-    """A pose that may be right, and what supports it.
-
-    Parameters
-    ----------
-    finalist : Finalist
-        Of the search of objects, or the pose of keyframes as one.
-    pose : ndarray (4, 4)
-        map_from_camera.
-    matches : list of F tuple of Match
-        Inliers in each frame.
-    support : Support
-        By objects.
-    is_upright : bool
-        Whether it uses the known vertical, or agrees with it.
-    handicap : float
-        Log odds that its attitude takes from it.
-    odds : float
-        Logarithm of its odds, up to a constant that all candidates share.
-    recognized : RecognizedPlace or None
-        What keyframes show there, where they propose the pose.
-    """
-
-    finalist: Finalist
-    pose: NDArray[np.float64]
-    matches: list[tuple[Match, ...]]
-    support: Support
-    is_upright: bool
-    handicap: float
-    odds: float
-    recognized: RecognizedPlace | None = None
 
 
 class Comparison(NamedTuple):
@@ -136,19 +66,26 @@ class Comparison(NamedTuple):
     poses : ndarray (m, 4, 4)
     likely : ndarray (m,)
         Probability of each, shared by those that agree.
-    recognition : Recognition
+    recognition : Recognition or None
         What keyframes say.
     """
 
     candidates: list[Candidate]
     poses: NDArray[np.float64]
     likely: NDArray[np.float64]
-    recognition: Recognition
+    recognition: Recognition | None
 
     @property
     def leading(self) -> NDArray[np.bool_]:
         """Return which candidates (m,) agree with the leading one."""
         return SAME_ANSWER.agreeing(self.poses)[0]
+
+    @property
+    def source(self) -> str:
+        """Return what proposes the leading place: 'objects', 'keyframes' or 'both'."""
+        if self.by_objects is None:
+            return 'keyframes'
+        return 'objects' if self.by_keyframes is None else 'both'
 
     @property
     def by_objects(self) -> Candidate | None:
@@ -180,15 +117,16 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
     recognizer : ImageRecognizer, optional
         Of the keyframes, for the image of the last frame.
     """
-    candidates = _candidates(joined, finalists, is_upright.tolist())
+    candidates = candidates_of(joined, finalists, is_upright.tolist())
     if joined.options.refine:
         order = sorted(range(len(candidates)), key=lambda row: -candidates[row].odds)
         candidates = [candidates[row] for known in (True, False) for row in first_of_each_place(
             [row for row in order if candidates[row].is_upright == known], finalists,
             MAX_DISTINCT)]
-    seen = Recognition()
+    seen = None
     if recognizer is not None:
-        seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]])
+        seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]],
+                                    prior_of(joined.frames[-1].observation, joined.options))
         candidates = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
                       for one in candidates] + _proposed(joined, seen)
         candidates.sort(key=lambda one: (not one.is_upright, -one.odds))
@@ -197,28 +135,14 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
         np.array([one.odds for one in candidates]), poses, none_right(joined.setting)), seen)
 
 
-def _candidates(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
-                ) -> list[Candidate]:
-    """Return poses as candidates, with their odds by objects."""
-    poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
-    matches = [matches_of(joined.rig, one) for one in finalists]
-    supports = supports_of(joined, poses, matches)
-    handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
-        if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
-    return list(map(Candidate, finalists, poses, matches, supports, upright, handicaps.tolist(),
-                    (utilities(supports) - handicaps).tolist()))
-
-
 def _proposed(joined: JoinedFrames, seen: Recognition) -> list[Candidate]:
     """Return the places that keyframes recognize, as candidates, with their odds by points."""
-    low, high = joined.options.height_range_m
-    places = [one for one in seen.places if low <= one.map_from_camera[2, 3] <= high]
-    none = none_right(joined.setting)
+    none, most = none_right(joined.setting), CALIBRATION.attitude.vertical_sigmas
     return [one._replace(recognized=place, odds=none - one.handicap
                          + points_utility(place, one.support))
-            for one, place in zip(_candidates(
-                joined, [_unrefined(one.map_from_camera) for one in places],
-                [_keeps_vertical(joined, one) for one in places]), places, strict=True)]
+            for one, place in zip(candidates_of(
+                joined, [unrefined(one.map_from_camera) for one in seen.places],
+                [one.tilt_error <= most for one in seen.places]), seen.places, strict=True)]
 
 
 def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecognizer) -> float:
@@ -227,23 +151,6 @@ def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecog
                                    for one in seen.places):
         return 0.0
     return CALIBRATION.keyframes.missed * recognizer.coverage(pose)
-
-
-def _keeps_vertical(joined: JoinedFrames, place: RecognizedPlace) -> bool:
-    """Return whether a pose of keyframes agrees with the vertical of the last frame."""
-    up_in_camera, up_in_map, deviation = np.split(joined.rig.verticals[-1], [3, 6])
-    if not deviation[0]:
-        return True
-    cosine = up_in_camera @ place.map_from_camera[:3, :3].T @ up_in_map
-    own = math.sqrt(np.trace(place.covariance[3:, 3:]) / 3.0)
-    return math.acos(min(cosine, 1.0)) <= CALIBRATION.attitude.vertical_sigmas * math.hypot(
-        deviation[0], own)
-
-
-def _unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
-    """Return a pose (4, 4) of another source like those that a search met."""
-    pose = invert_transform(map_from_camera)
-    return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
 
 
 def pose_of(joined: JoinedFrames, compared: Comparison
@@ -305,9 +212,23 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         sum(one.known_tried for one in joined.frames),
         math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        best.support.unexplained, chance_genuine(recognized) if recognized else 1.0, recognized,
+        best.support.unexplained, chance_genuine(recognized) if recognized else 1.0,
+        _not_mirrored(joined, compared), recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
+
+
+def _not_mirrored(joined: JoinedFrames, compared: Comparison) -> float:
+    """Return the probability that the image is no mirror image.
+
+    Features of a mirror image match nothing, so keyframes exclude it. A pose that is refused
+    anyway is not worth the time.
+    """
+    if (compared.by_keyframes is not None or not joined.options.refine
+            or compared.likely[0] < joined.options.min_confidence
+            or compared.candidates[0].support.inliers < joined.options.min_inliers):
+        return 1.0
+    return chance_not_mirrored(joined, compared.candidates[0])
 
 
 def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
@@ -317,10 +238,10 @@ def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
         return None
     row = others[np.argmax(compared.likely[others])]
     place = place_of(joined.landmark_map, compared.poses[row])
-    by_keyframes = compared.candidates[row].recognized is not None
+    same_source = compared.by_objects if compared.candidates[row].recognized is None \
+        else compared.by_keyframes
     return Rival(min(float(compared.likely[row]), 1.0 - float(compared.likely[0])),
-                 place.position, place.name,
-                 compared.by_objects is None if not by_keyframes else compared.by_keyframes is None)
+                 place.position, place.name, same_source is None)
 
 
 def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
@@ -347,7 +268,7 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
                        dtype=np.int64)
     found = find_twins(joined.landmark_map, best.pose, matched,
                        compared.poses[~compared.leading])
-    twins = [_fitted(joined, pose) for pose in found if low <= pose[2, 3] <= high]
+    twins = [refined(joined, unrefined(pose)) for pose in found if low <= pose[2, 3] <= high]
     poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
     # a twin that refinement moved back to the leading pose is no other place
     others = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
@@ -377,23 +298,3 @@ def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
     return np.maximum(0.0, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)) * own - theirs)
 
 
-def _fitted(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Finalist:
-    """Return a pose (4, 4) that no search met, refined like those that it met."""
-    start = _unrefined(map_from_camera)
-    if not joined.options.refine:
-        return start
-    return start._replace(**refine_rig(joined.rig, start.rotation, start.translation)._asdict())
-
-
-def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
-                matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
-    """Return the support of each pose (m, 4, 4), from its matches in each frame."""
-    used = [one.observation if joined.options.needs_similarities
-            else replace(one.observation, similarities=None) for one in joined.frames]
-    compared = [ComparedFrame(
-        one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        seen.similarities, one.scene, seen.similarity_rows)
-        for one, seen in zip(joined.frames, used, strict=True)]
-    last_from_cameras = np.linalg.inv(joined.cameras)
-    return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)
-            for pose, found in zip(poses, matches, strict=True)]

@@ -4,8 +4,8 @@
 
 Every retry is another chance of a false accept. Odometry carries the pose of each look to the
 newest frame, and drifts on the way. The looks of a standing robot show the same, so their
-confidences must not multiply. Their mean needs no independence. Where looks are exchangeable, their
-mean ever reaches a limit with a probability of at most the expected confidence of one look,
+confidences must not multiply. Their mean needs no independence. Where looks are exchangeable,
+their mean ever reaches a limit with a probability of at most the expected confidence of one look,
 divided by the limit, however often the robot looks (Ramdas and Manole, "Randomized and
 exchangeable improvements of Markov's, Chebyshev's and Chernoff's inequalities", 2023). So with a
 limit of .5, a robot that is nowhere in the map ever accepts a pose with at most twice the mean

@@ -51,10 +51,6 @@ class Support:
         Number of the objects that were matched by class alone.
     unexplained : float
         Number of other detected objects of the map's classes, which no landmark explains.
-    below : float
-        How far the camera looks up at the objects: the mean sine of the angle, 0 where it looks
-        down. What stands on tables and shelves is hidden from below. The mirror image of objects
-        on a table is what a camera under it would see.
     """
 
     inliers: int = 0
@@ -64,7 +60,6 @@ class Support:
     rarity: float = 0.0
     unlabelled: float = 0.0
     unexplained: float = 0.0
-    below: float = 0.0
 
 
 class ComparedFrame(NamedTuple):
@@ -117,11 +112,11 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                 rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
     if not rows:
         return Support()
-    *total, below = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
+    total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
     views_of_each = sum(map(len, rows.values())) / len(rows)
     unexplained = sum(_unexplained(landmark_map, frame, found)
                       for frame, found in zip(frames, matches, strict=True)) / views_of_each
-    return Support(len(rows), *map(float, [*total, unexplained, below / len(rows)]))
+    return Support(len(rows), *map(float, [*total, unexplained]))
 
 
 def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Sequence[Match]) -> int:
@@ -138,7 +133,7 @@ def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Seque
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                    map_from_camera: NDArray[np.float64], matches: Sequence[Match]
                    ) -> NDArray[np.float64]:
-    """Return what each match (m, 6) adds to a support."""
+    """Return what each match (m, 5) adds to a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     classes = landmark_map.classes.classes_of(frame.class_ids)
@@ -147,13 +142,11 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     if frame.similarities is not None and compared.any():
         likenesses[compared] = _likenesses(frame.similarities, rows[compared],
                                            landmarks[compared])
-    offsets = landmark_map.centers[landmarks] - map_from_camera[:3, 3]
     return np.column_stack([
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
                  landmark_map.position_sigmas[landmarks]), likenesses,
-        _rarities(landmark_map, landmarks, classes[detections]), ~compared,
-        np.maximum(0.0, offsets[:, 2]) / np.linalg.norm(offsets, axis=1)])
+        _rarities(landmark_map, landmarks, classes[detections]), ~compared])
 
 
 def _rarities(landmark_map: LandmarkMap, landmarks: NDArray[np.int64],

@@ -77,6 +77,8 @@ class Evidence:
         Number of other detected objects of the map's classes.
     genuine : float
         Probability that the place is there, not a picture of it, see chance_genuine.
+    not_mirrored : float
+        Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror.
     recognized : RecognizedPlace or None
         What keyframes show at the pose.
     earlier : tuple of float
@@ -100,6 +102,7 @@ class Evidence:
     meetings: float = math.inf
     unexplained: float = 0.0
     genuine: float = 1.0
+    not_mirrored: float = 1.0
     recognized: RecognizedPlace | None = None
     earlier: tuple[float, ...] = ()
     crops_left: int = 0
@@ -117,7 +120,7 @@ class Evidence:
     @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
-        return self.distinct * self.near * self.genuine
+        return self.distinct * self.near * self.genuine * self.not_mirrored
 
     @property
     def confidence(self) -> float:
@@ -193,7 +196,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     likely = max(evidence.likely, evidence.by_points)
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
-                   'genuine': evidence.genuine, 'found': found}.items(),
+                   'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
+                   'found': found}.items(),
                   key=lambda item: item[1])[0]
     if weakest == 'distinct' and evidence.twin is not None:
         second = evidence.twin_map and f' (the second in {evidence.twin_map})'
@@ -207,6 +211,10 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     if weakest == 'genuine' and evidence.recognized is not None:
         return Refusal(RefusalKind.CHANGED, f'{compared}{_points(evidence)}; is it a picture, or '
                                             'has the place changed? move, and ask again')
+    if weakest == 'mirror':
+        return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; as a mirror image, the image fits '
+                                              'another pose as well; turn the camera away from '
+                                              'mirrors, to more objects')
     if weakest == 'found':
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '

@@ -304,25 +304,36 @@ class ImageRecognizer:
     camera : Camera
     deadline : float
         See KeyframeLocalizer.localize.
+    begin_stage : callable
+        Takes the name of a stage that begins: 'keyframes', and 'search' after them.
     """
 
     def __init__(self, keyframes: KeyframeLocalizer, features: Features | Callable[[], Features],
-                 camera: Camera, deadline: float = np.inf) -> None:
+                 camera: Camera, deadline: float = np.inf,
+                 begin_stage: Callable[[str], None] = lambda stage: None) -> None:
         self._keyframes = keyframes
         self._features = features
         self._camera = camera
         self._deadline = deadline
+        self._begin_stage = begin_stage
         self._known: tuple[set[int], Recognition] | None = None
+        #: Time that it took so far [ms].
+        self.spent_ms = 0.0
 
-    def recognize(self, guesses: Sequence[NDArray[np.float64]]) -> Recognition:
+    def recognize(self, guesses: Sequence[NDArray[np.float64]], prior: Prior = _NOTHING_KNOWN
+                  ) -> Recognition:
         """Find where the image was taken; again only where guesses propose other keyframes."""
         near = {row for guess in guesses for row in _keyframes_near(
             self._keyframes.layer.map_from_camera, guess)[:_PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
+            self._begin_stage('keyframes')
+            begin = time.perf_counter()
             if callable(self._features):
                 self._features = self._features()
             self._known = near, self._keyframes.localize_features(
-                self._features, self._camera, guesses, self._deadline)
+                self._features, self._camera, guesses, self._deadline, prior)
+            self.spent_ms += 1e3 * (time.perf_counter() - begin)
+            self._begin_stage('search')
         return self._known[1]
 
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
