@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where objects and keyframes together are wrong: ``python -m studies.keyframes``.
+
+``collect`` makes maps and layers of a part of each site, changes queries, map or layer, and stores
+what objects and keyframes say about each query. A run that was stopped goes on. ``judge`` decides
+about the stored records as the package does now, and prints what each way accepts.
+"""
+
+import argparse
+import json
+import sys
+from itertools import product
+from pathlib import Path
+
+from tqdm import tqdm
+
+from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.output import make_folder, write_text
+from cliploc_ros.parallel import run_tasks
+from studies.keyframes.families import cases
+from studies.keyframes.judge import as_dicts, draw, make_judge, table
+from studies.keyframes.records import Collect
+from studies.keyframes.sites import read_places
+
+_FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
+
+
+def collect(options: argparse.Namespace) -> int:
+    """Collect the records of all places and cases."""
+    places = [one for site in options.sites
+              for one in read_places(site, options.model, options.blocks)]
+    if len({one.site for one in places}) < 2:
+        raise OptionsError('--sites: images of other sites are needed: give two or more')
+    chosen = [one for one in places if not options.places
+              or any(text in one.name for text in options.places)]
+    tasks = [(place.name, name) for place, name in product(chosen, _cases(options.families))]
+    work = Collect(options.out, tuple(places), options.queries, options.seed)
+    make_folder(options.out)
+    for _ in run_tasks(work, [(one.name, '') for one in chosen], workers=options.workers):
+        pass  # each place is built once, before several workers need it
+    with tqdm(total=len(tasks), unit='case', disable=None) as bar:
+        for _ in run_tasks(work, tasks, workers=options.workers):
+            bar.update()
+    return 0
+
+
+def judge(options: argparse.Namespace) -> int:
+    """Decide about all records, and print the tables."""
+    paths = sorted(options.out.glob('cases/*/*.pickle'))
+    if not paths:
+        raise OptionsError(f'{options.out}: no cases here; collect them first')
+    names = set(_cases(options.families))
+    found = [one for _, result in run_tasks(make_judge, paths, workers=options.workers)
+             for one in result or ()]
+    order = list(cases())
+    found = sorted((one for one in found if one.case in names and (
+        not options.places or any(text in one.place for text in options.places))),
+        key=lambda one: (order.index(one.case), one.place, one.number))
+    print('\n'.join(table(found, options.by)))
+    if options.json:
+        write_text(options.json, json.dumps(as_dicts(found), indent=0))
+    if options.figure:
+        draw(found, options.figure)
+    return 0
+
+
+def _cases(families: list[str]) -> list[str]:
+    unknown = [one for one in families if one not in _FAMILIES]
+    if unknown:
+        raise OptionsError(f"--families: '{unknown[0]}' is none of {', '.join(_FAMILIES)}")
+    return [name for name in cases() if not families or name.partition(':')[0] in families]
+
+
+def run(arguments: list[str]) -> int:
+    """Collect or judge."""
+    parser = argparse.ArgumentParser(prog='keyframes', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument('--out', type=Path, default=Path('keyframes'), metavar='DIR',
+                        help='where the records are (%(default)s)')
+    common.add_argument('--families', nargs='+', default=[], metavar='FAMILY',
+                        help=f'which cases: {", ".join(_FAMILIES)} (all)')
+    common.add_argument('--places', nargs='+', default=[], metavar='TEXT',
+                        help='only places whose names contain one of these')
+    common.add_argument('--workers', type=positive_int, default=1, metavar='N',
+                        help='processes (%(default)s)')
+    asks = commands.add_parser('collect', parents=[common], help='store what is found')
+    asks.set_defaults(command=collect)
+    asks.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
+                      help='RGB-D and TUM folders, the latter with the unit of their depth, and '
+                           'rooms of demo_world.make_keyframe_rooms')
+    asks.add_argument('--model', required=True, help='weights of YOLO for real images')
+    asks.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
+                      help='map and ask blocks of N images in turn, too')
+    asks.add_argument('--queries', type=positive_int, default=24, metavar='N',
+                      help='the most of each case but the plain one (%(default)s)')
+    asks.add_argument('--seed', type=int, default=0)
+    decides = commands.add_parser('judge', parents=[common], help='decide, and print tables')
+    decides.set_defaults(command=judge)
+    decides.add_argument('--by', nargs='*', default=['case'], metavar='FIELD',
+                         choices=['site', 'place', 'family', 'case'],
+                         help='what a line of the table is about (case)')
+    decides.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
+    decides.add_argument('--figure', type=Path, metavar='FILE.png',
+                         help='draw the reliability of the confidence')
+    options = parser.parse_args(arguments)
+    return int(options.command(options))
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    interrupt_on_sigterm()
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
