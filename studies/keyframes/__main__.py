@@ -35,7 +35,7 @@ def collect(options: argparse.Namespace) -> int:
         raise OptionsError('--sites: images of other sites are needed: give two or more')
     chosen = [one for one in places if not options.places
               or any(text in one.name for text in options.places)]
-    tasks = [(place.name, name) for place, name in product(chosen, _cases(options.families))]
+    tasks = [(place.name, name) for name, place in product(_cases(options.families), chosen)]
     work = Collect(options.out, tuple(places), options.queries, options.seed)
     make_folder(options.out)
     for _ in run_tasks(work, [(one.name, '') for one in chosen], workers=options.workers):

@@ -15,12 +15,11 @@ from cliploc_ros.core.acceptance.recognition import NO_OBJECTS, objects_there
 from cliploc_ros.core.combination import combine
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trust import draw_reliability, within_ellipsoid
-from studies.keyframes.records import Record, locate, read_case
+from studies.keyframes.records import Record, StoredCase, locate, read_case
 
 WAYS = ('objects', 'keyframes', 'both')
 LIMITS_M = (0.1, 0.25, 0.5, 1.0)
@@ -67,23 +66,23 @@ class Outcome:
         return self.case.partition(':')[0]
 
 
-def decide(landmark_map: LandmarkMap, record: Record, way: str) -> Relocalization:
+def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
     """Return the package's answer to a record by objects, by keyframes, or by both."""
-    found = _by_objects(landmark_map, record) if way != 'keyframes' else _NOTHING
+    found = _by_objects(case, record) if way != 'keyframes' else _NOTHING
     last = record.looks[-1]
     if way == 'objects' or last.seen is None:
         return found
-    there = objects_there(landmark_map, last.searched.observation, last.seen.map_from_camera) \
-        if way == 'both' else NO_OBJECTS
+    there = NO_OBJECTS if way == 'keyframes' else objects_there(
+        case.landmark_map, last.searched.observation, last.seen.map_from_camera)
     return combine(found, last.seen, there, record.options)
 
 
 @lru_cache(maxsize=1)
-def _by_objects(landmark_map: LandmarkMap, record: Record) -> Relocalization:
+def _by_objects(case: StoredCase, record: Record) -> Relocalization:
     """Return the answer at the last look of a robot that looked before, as a session gives it."""
     looks, found = Looks(), _NOTHING
     for count, look in enumerate(record.looks, start=1):
-        found = locate(landmark_map, record.options,
+        found = locate(case.landmark_map, record.options,
                        [one.searched for one in record.looks[:count]], looks)
         if found.map_from_camera is not None:
             looks = looks.with_look(look.searched.observation, found.map_from_camera,
@@ -96,17 +95,16 @@ def judge(path: Path) -> list[Outcome]:
     stored = read_case(path)
     return [] if stored is None else [
         _outcome(stored.place, stored.name, record, way,
-                 decide(stored.landmark_map, record, way))
+                 decide(stored, record, way))
         for record in stored.records for way in WAYS]
 
 
 def _outcome(place: str, case: str, record: Record, way: str, found: Relocalization) -> Outcome:
     pose, nees = found.map_from_camera, np.inf
-    errors: tuple[float, ...] = (np.inf,)
-    if pose is not None and record.truths:
-        errors = tuple(pose_error(pose, truth)[0] for truth in record.truths)
-        if found.covariance is not None:
-            nees = normalized_square(pose, found.covariance, record.truths[0])
+    errors = tuple(np.inf if pose is None else pose_error(pose, truth)[0]
+                   for truth in record.truths) or (np.inf,)
+    if pose is not None and found.covariance is not None and record.truths:
+        nees = normalized_square(pose, found.covariance, record.truths[0])
     return Outcome(place.partition('/')[0], place, case, record.number, way, errors,
                    found.accepted, float(found.confidence), float(nees),
                    '' if found.accepted else str(found.refusal_kind or way), found.reason,
@@ -140,7 +138,7 @@ def table(outcomes: Iterable[Outcome], by: Sequence[str]) -> list[str]:
 
 
 def _figures(outcomes: Sequence[Outcome], truth: int) -> str:
-    errors = np.array([(*one.errors_m, np.inf)[truth] for one in outcomes])
+    errors = np.array([one.errors_m[truth] for one in outcomes])
     accepted = np.array([one.accepted for one in outcomes])
     right = errors < WRONG_M
     nees = np.array([one.nees for one in outcomes])

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import make_transform
@@ -140,6 +139,7 @@ def _upright(raws: Raws) -> Raws:
     _, _, axes = np.linalg.svd(poses[:, :3, 0])
     up = -axes[2] * np.sign(axes[2] @ poses[:, :3, 1].mean(axis=0))
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
-    turned: NDArray[np.float64] = make_transform(turn.as_matrix(), np.zeros(3)) @ poses
-    return tuple(replace(raw, map_from_camera=pose)
-                 for raw, pose in zip(raws, turned, strict=True))
+    # made exactly rigid: text files round
+    rotations = (turn * Rotation.from_matrix(poses[:, :3, :3])).as_matrix()
+    return tuple(replace(raw, map_from_camera=make_transform(rotation, turn.apply(pose[:3, 3])))
+                 for raw, pose, rotation in zip(raws, poses, rotations, strict=True))
