@@ -17,10 +17,10 @@ from tqdm import tqdm
 
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.output import make_folder, write_text
+from cliploc_ros.evaluation.output import write_text
 from cliploc_ros.parallel import run_tasks
-from studies.keyframes.families import cases
-from studies.keyframes.judge import as_dicts, draw, make_judge, table
+from studies.keyframes.cases import cases
+from studies.keyframes.judge import draw, make_judge, table
 from studies.keyframes.records import Collect
 from studies.keyframes.sites import read_places
 
@@ -29,48 +29,36 @@ _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
 def collect(options: argparse.Namespace) -> int:
     """Collect the records of all places and cases."""
-    places = [one for site in options.sites
-              for one in read_places(site, options.model, options.blocks)]
+    places = tuple(one for site in options.sites
+                   for one in read_places(site, options.model, options.blocks))
     if len({one.site for one in places}) < 2:
         raise OptionsError('--sites: images of other sites are needed: give two or more')
-    chosen = [one for one in places if not options.places
-              or any(text in one.name for text in options.places)]
-    tasks = [(place.name, name) for name, place in product(_cases(options.families), chosen)]
-    work = Collect(options.out, tuple(places), options.queries, options.seed)
-    make_folder(options.out)
-    for _ in run_tasks(work, [(one.name, '') for one in chosen], workers=options.workers):
-        pass  # each place is built once, before several workers need it
-    with tqdm(total=len(tasks), unit='case', disable=None) as bar:
-        for _ in run_tasks(work, tasks, workers=options.workers):
-            bar.update()
+    chosen = [one for one in places if any(text in one.name for text in options.places)]
+    names = [name for name in cases() if name.partition(':')[0] in options.families]
+    work = Collect(options.out, places, options.queries)
+    for tasks in (product(chosen, ['']),  # built once, before several workers need it
+                  ((place, name) for name, place in product(names, chosen))):
+        for _ in tqdm(run_tasks(work, tasks, workers=options.workers), unit='case', disable=None):
+            pass
     return 0
 
 
 def judge(options: argparse.Namespace) -> int:
     """Decide about all records, and print the tables."""
     paths = sorted(options.out.glob('cases/*/*.pickle'))
-    if not paths:
-        raise OptionsError(f'{options.out}: no cases here; collect them first')
-    names = set(_cases(options.families))
     found = [one for _, result in run_tasks(make_judge, paths, workers=options.workers)
-             for one in result or ()]
+             for one in result or () if one.family in options.families
+             and any(text in one.place for text in options.places)]
+    if not found:
+        raise OptionsError(f'{options.out}: no such records here; collect them first')
     order = list(cases())
-    found = sorted((one for one in found if one.case in names and (
-        not options.places or any(text in one.place for text in options.places))),
-        key=lambda one: (order.index(one.case), one.place, one.number))
+    found.sort(key=lambda one: (order.index(one.case), one.place, one.number))
     print('\n'.join(table(found, options.by)))
     if options.json:
-        write_text(options.json, json.dumps(as_dicts(found), indent=0))
+        write_text(options.json, json.dumps([one._asdict() for one in found], indent=0))
     if options.figure:
         draw(found, options.figure)
     return 0
-
-
-def _cases(families: list[str]) -> list[str]:
-    unknown = [one for one in families if one not in _FAMILIES]
-    if unknown:
-        raise OptionsError(f"--families: '{unknown[0]}' is none of {', '.join(_FAMILIES)}")
-    return [name for name in cases() if not families or name.partition(':')[0] in families]
 
 
 def run(arguments: list[str]) -> int:
@@ -81,9 +69,9 @@ def run(arguments: list[str]) -> int:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--out', type=Path, default=Path('keyframes'), metavar='DIR',
                         help='where the records are (%(default)s)')
-    common.add_argument('--families', nargs='+', default=[], metavar='FAMILY',
-                        help=f'which cases: {", ".join(_FAMILIES)} (all)')
-    common.add_argument('--places', nargs='+', default=[], metavar='TEXT',
+    common.add_argument('--families', nargs='+', default=_FAMILIES, choices=_FAMILIES,
+                        metavar='FAMILY', help=f'which cases: {", ".join(_FAMILIES)} (all)')
+    common.add_argument('--places', nargs='+', default=[''], metavar='TEXT',
                         help='only places whose names contain one of these')
     common.add_argument('--workers', type=positive_int, default=1, metavar='N',
                         help='processes (%(default)s)')
@@ -97,10 +85,9 @@ def run(arguments: list[str]) -> int:
                       help='map and ask blocks of N images in turn, too')
     asks.add_argument('--queries', type=positive_int, default=24, metavar='N',
                       help='the most of each case but the plain one (%(default)s)')
-    asks.add_argument('--seed', type=int, default=0)
     decides = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     decides.set_defaults(command=judge)
-    decides.add_argument('--by', nargs='*', default=['case'], metavar='FIELD',
+    decides.add_argument('--by', nargs='+', default=['case'],
                          choices=['site', 'place', 'family', 'case'],
                          help='what a line of the table is about (case)')
     decides.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')

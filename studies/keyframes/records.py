@@ -5,20 +5,18 @@
 import hashlib
 import pickle
 import zlib
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.keyframes import features as feature_module
-from cliploc_ros.core.keyframes.features import Features, extract
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized
+from cliploc_ros.core.keyframes import features
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized, query_features
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -29,14 +27,14 @@ from cliploc_ros.evaluation.output import make_folder, write_file
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.networks import MAX_DETECTIONS
-from studies.keyframes.changes import World
-from studies.keyframes.families import Query, Scene, Shot, cases
-from studies.keyframes.sites import Place
+from studies.keyframes.cases import Case, Image, Query, Rng, World, cases, make_query
+from studies.keyframes.sites import Floats, Place
 
 #: By classes alone: CLIP's weights are no part of this study.
 OPTIONS = RelocalizerOptions(matching='class')
 _GUESSES = 3
-_ALL_ASKED = ('plain: one image',)
+# Of this case, all images are asked.
+_PLAIN = 'plain: one image'
 
 
 class Look(NamedTuple):
@@ -48,188 +46,123 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a verdict about one query needs.
-
-    Parameters
-    ----------
-    number : int
-        Of the query among those of its place.
-    looks : tuple of Look
-        The oldest first.
-    truths : tuple of ndarray (4, 4)
-        See Query.
-    options : RelocalizerOptions
-    """
+    """What a verdict about one query needs: its looks, the oldest first; truths as of Query."""
 
     number: int
     looks: tuple[Look, ...]
-    truths: tuple[NDArray[np.float64], ...]
+    truths: tuple[Floats, ...]
     options: RelocalizerOptions
 
 
 @dataclass(frozen=True, eq=False)
 class StoredCase:
-    """The records of a case at a place."""
+    """The records of a case at a place, and its changed map."""
 
     place: str
     name: str
     landmark_map: LandmarkMap
-    records: list[Record]
-    #: Where the last complete record ends in the file.
-    size: int = 0
+    records: tuple[Record, ...]
 
 
-def locate(landmark_map: LandmarkMap, options: RelocalizerOptions,
-           frames: Sequence[SearchedFrame], looks: Looks | None = None) -> Relocalization:
-    """Return what searched frames of one robot say by objects."""
-    return Relocalizer(landmark_map, options).locate(frames, looks=looks or Looks())
-
-
-def read_case(path: Path) -> StoredCase | None:
-    """Return the records of a file; None without one. What a stopped run left is dropped."""
-    if not path.exists():
-        return None
-    found: list[Any] = []
-    size = 0
-    with path.open('rb') as file, suppress(EOFError, pickle.UnpicklingError):
-        while True:
-            found.append(pickle.load(file))
-            size = file.tell()
-    if not found:
-        return None
-    place, name, landmark_map = found[0]
-    return StoredCase(place, name, landmark_map, found[1:], size)
+def by_objects(landmark_map: LandmarkMap, options: RelocalizerOptions,
+               frames: list[SearchedFrame]) -> Relocalization:
+    """Return the answer of objects at the last look of a robot that looked before, too."""
+    relocalizer, looks = Relocalizer(landmark_map, options), Looks()
+    for count in range(1, len(frames) + 1):
+        found = relocalizer.locate(frames[:count], looks=looks)
+        if found.map_from_camera is not None:
+            looks = looks.with_look(frames[count - 1].observation, found.map_from_camera,
+                                    found.confidence)
+    return found
 
 
 class Looker:
-    """Detector and features, each image once: what was seen lies in a folder."""
+    """Detector and features; what they say of each image is kept in a folder."""
 
     def __init__(self, folder: Path, model: str) -> None:
-        self._folder = folder
-        self._model = model
+        self._folder, self._model = folder, model
         self._detector: YoloDetector | None = None
-        self._code = hashlib.sha256(Path(feature_module.__file__).read_bytes()).hexdigest()[:8]
+        code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
+        self._name = f'{Path(model).stem}.{code}'
 
-    def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
-        """Return the boxes in an image; as an ObjectDetector."""
-        def look() -> tuple[Any, ...]:
-            self._detector = self._detector or YoloDetector(YoloOptions(self._model, conf=0.25))
-            found = self._detector.detect(image_rgb)
-            return found.bboxes_xyxy, found.class_ids, found.scores
-        return Detections(*self._kept(image_rgb, Path(self._model).stem, look))
-
-    def features(self, image_rgb: NDArray[np.uint8], most: int) -> Features:
-        """Return the features of an image."""
-        def look() -> tuple[Any, ...]:
-            found = extract(image_rgb, most)
-            return found.pixels, found.descriptors, found.strengths
-        return Features(*self._kept(image_rgb, f'{most}.{self._code}', look))
-
-    def _kept(self, image_rgb: NDArray[np.uint8], what: str, look: Callable[[], tuple[Any, ...]]
-              ) -> tuple[Any, ...]:
+    def look(self, image_rgb: Image) -> tuple[Detections, Features]:
+        """Return the boxes in an image, and its features."""
         digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
-        path = self._folder / digest[:2] / f'{digest}.{what}.pickle'
-        with suppress(OSError, EOFError, pickle.UnpicklingError):
-            return tuple(pickle.loads(path.read_bytes()))
-        found = look()
-        make_folder(path.parent)
-        write_file(path, lambda partial: partial.write_bytes(pickle.dumps(found)))
-        return found
+        path = self._folder / digest[:2] / f'{digest}.{self._name}.pickle'
+        if not path.exists():
+            self._detector = self._detector or YoloDetector(YoloOptions(self._model, conf=0.25))
+            found = vars(self._detector.detect(image_rgb)), vars(query_features(image_rgb))
+            make_folder(path.parent)
+            write_file(path, lambda partial: partial.write_bytes(pickle.dumps(found)))
+        boxes, local = pickle.loads(path.read_bytes())
+        return Detections(**boxes), Features(**local)
+
+    def detect(self, image_rgb: Image) -> Detections:
+        """Return the boxes in an image, as an ObjectDetector does."""
+        return self.look(image_rgb)[0]
 
 
 @dataclass(frozen=True)
 class Collect:
-    """Does a task, a case at a place; without a case, the place is built.
-
-    Parameters
-    ----------
-    out : Path
-    places : tuple of Place
-    queries : int
-        The most of each case but the plain one.
-    seed : int
-    """
+    """Makes what collects the records of a case at a place, or builds the place: without one."""
 
     out: Path
     places: tuple[Place, ...]
-    queries: int
-    seed: int
+    queries: int  # the most of each case but the plain one
 
-    def __call__(self) -> Callable[[tuple[str, str]], int]:
+    def __call__(self) -> Callable[[tuple[Place, str]], None]:
         """Return the function."""
         import torch
 
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
-        places = {one.name: one for one in self.places}
         lookers = {model: Looker(self.out / 'looks', model)
                    for model in {one.model for one in self.places}}
-        return lambda task: self._collect(places[task[0]], task[1],
-                                          lookers[places[task[0]].model])
+        return lambda task: self._collect(*task, lookers[task[0].model])
 
-    def case_file(self, place: str, case: str) -> Path:
-        """Return where the records of a case are."""
-        name = ''.join(char if char.isalnum() or char in '.-' else '_' for char in case)
-        return self.out / 'cases' / place.replace('/', '.') / f'{name}.pickle'
-
-    def _collect(self, place: Place, name: str, looker: Looker) -> int:
-        landmark_map, layer = place.build(self.out / 'places', looker)
+    def _collect(self, place: Place, name: str, looker: Looker) -> None:
+        world = World(*place.build(self.out / 'places', looker), np.zeros(3))
         if not name:
-            return 0
-        case = cases()[name]
-        key = [self.seed, zlib.crc32(f'{place.name} {name}'.encode())]
-        world = World(landmark_map, layer, np.zeros(3))
+            return
+        case, key = cases()[name], zlib.crc32(f'{place.name} {name}'.encode())
         if case.world is not None:
             world = case.world(world, np.random.default_rng(key))
+        folder = self.out / 'cases' / place.name.replace('/', '.')
+        path = folder / f'{name.replace(": ", ".").replace(" ", "_")}.pickle'
+        records = {one.number: one for one in pickle.loads(path.read_bytes()).records
+                   } if path.exists() else {}
         others = {one.site: one for one in self.places if one.site != place.site}
-        scene = Scene(place, world.shift_m, tuple(others.values()))
-        path = self.case_file(place.name, name)
-        stored = read_case(path)
-        make_folder(path.parent)
-        if stored is None:
-            path.write_bytes(pickle.dumps((place.name, name, world.landmark_map)))
-        else:
-            with path.open('r+b') as file:
-                file.truncate(stored.size)
-        done = {one.number: one for one in stored.records} if stored else {}
+        localizer = KeyframeLocalizer(world.layer)
         # more queries include those of a run with fewer
-        order = np.random.default_rng(self.seed).permutation(len(place.asked)).tolist()
-        numbers = sorted(order if name in _ALL_ASKED else order[:self.queries])
-        localizer = None
-        for number in numbers:
-            if number in done:
-                continue
-            query = case.query(scene, place.asked[number], np.random.default_rng([*key, number]))
-            if query is None:
-                continue
-            localizer = localizer or KeyframeLocalizer(world.layer)
-            record = _ask(number, query, world.landmark_map, localizer, looker)
-            with path.open('ab') as file:
-                file.write(pickle.dumps(record))
-            done[number] = record
-        return len(done)
+        order = np.random.default_rng(0).permutation(len(place.asked)).tolist()
+        for number in order if name == _PLAIN else order[:self.queries]:
+            rng = np.random.default_rng([key, number])
+            query = None if number in records else make_query(
+                case, place, [*others.values()], place.asked[number], world.shift_m, rng)
+            if query is not None:
+                records[number] = _ask(number, case, query, world.landmark_map, localizer, looker,
+                                       rng)
+        make_folder(folder)
+        stored = StoredCase(place.name, name, world.landmark_map, tuple(records.values()))
+        write_file(path, lambda partial: partial.write_bytes(pickle.dumps(stored)))
 
 
-def _ask(number: int, query: Query, landmark_map: LandmarkMap, localizer: KeyframeLocalizer,
-         looker: Looker) -> Record:
-    options = OPTIONS if query.height_range_m is None else replace(
-        OPTIONS, height_range_m=query.height_range_m)
+def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
+         localizer: KeyframeLocalizer, looker: Looker, rng: Rng) -> Record:
+    options = replace(OPTIONS, height_range_m=query.height_range_m)
     relocalizer = Relocalizer(landmark_map, options)
     looks: list[Look] = []
-    for row, shot in enumerate(query.shots):
-        searched = relocalizer.search(_observed(shot, row, landmark_map, looker))
-        found = locate(landmark_map, options, [*(one.searched for one in looks), searched])
-        guesses = [one.map_from_camera for one in found.hypotheses[:_GUESSES]]
+    for second, (image, camera, odom) in enumerate(query.shots):
+        boxes, local = looker.look(image)
+        boxes = boxes.usable(camera.width, camera.height, MAX_DETECTIONS)
+        if case.draws_classes:
+            drawn = rng.choice(landmark_map.class_ids, len(boxes)).tolist()
+            boxes = replace(boxes, class_ids=tuple(drawn))
+        searched = relocalizer.search(Observation(
+            camera, boxes, stamp_ns=second * 1_000_000_000, up_in_camera=query.up_in_camera,
+            odom_from_camera=odom))
+        found = by_objects(landmark_map, options, [*(one.searched for one in looks), searched])
         looks.append(Look(searched, localizer.localize_features(
-            looker.features(shot.image_rgb, shot.most_features), shot.camera, guesses)))
+            Features(*(column[:case.features] for column in vars(local).values())), camera,
+            [one.map_from_camera for one in found.hypotheses[:_GUESSES]])))
     return Record(number, tuple(looks), query.truths, options)
-
-
-def _observed(shot: Shot, row: int, landmark_map: LandmarkMap, looker: Looker) -> Observation:
-    camera = shot.camera
-    boxes = looker.detect(shot.image_rgb).usable(camera.width, camera.height, MAX_DETECTIONS)
-    if shot.classes is not None:
-        boxes = replace(boxes, class_ids=tuple(
-            map(str, shot.classes.choice(landmark_map.class_ids, len(boxes)))))
-    return Observation(camera, boxes, stamp_ns=row * 1_000_000_000,
-                       up_in_camera=shot.up_in_camera, odom_from_camera=shot.odom_from_camera)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import make_transform
@@ -17,6 +18,7 @@ from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
 from cliploc_ros.evaluation.output import make_folder, write_file
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.options import MappingOptions
@@ -25,54 +27,45 @@ from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.recording.networks import Look
 from cliploc_ros.recording.recorder import record_every_frame
 
-#: Weights of YOLO for rendered rooms.
-ROOM_MODEL = Path(__file__).parents[2] / 'cliploc_ros' / 'demo' / 'assets' / 'yolo.pt'
-_EVERY_IMAGE = LayerOptions(0.0, 0.0)
 # Of a rendered room: what is mapped, what is asked, and where second looks come from.
 _ROOM_WALKS = (('mapping', 'viewpoints', 'viewpoints_aside'),
                ('mapping', 'other_light', 'other_light_aside'),
                ('one_side', 'other_side', 'other_side'))
 
+Floats = NDArray[np.float64]
 Raws = tuple[RawFrame, ...]
 
 
 @dataclass(frozen=True)
 class Place:
-    """A part of a site that is mapped.
-
-    Parameters
-    ----------
-    site, name : str
-        The name is unique and begins with the site's.
-    model : str
-        Weights of YOLO.
-    mapped, asked, seconds : tuple of RawFrame
-        What map and layer are made of, the queries, and images for second looks of these.
-    map_file : Path, optional
-        None: the map is built of the mapped images.
-    """
+    """A part of a site that is mapped, and images of the rest: queries, and their second looks."""
 
     site: str
-    name: str
-    model: str
+    name: str  # begins with the site's
+    model: str  # weights of YOLO
     mapped: Raws
     asked: Raws
     seconds: Raws
-    map_file: Path | None = None
+    map_file: Path | None = None  # None: the map is built of the mapped images
 
     def build(self, folder: Path, detector: ObjectDetector) -> tuple[LandmarkMap, KeyframeLayer]:
         """Return map and layer; the first time, they are made and kept in a folder."""
         path = folder / f'{self.name.replace("/", ".")}.pickle'
         if not path.exists():
-            frames = _frames(self.mapped, self.name)
-            landmark_map = build_map(
-                record_every_frame(frames, Look(detector)).detections, MappingOptions()
-            ).landmark_map if self.map_file is None else LandmarkMap.from_file(self.map_file)
-            built = landmark_map, build_layer(frames, landmark_map, _EVERY_IMAGE)
+            frames = Frames(Path(self.name), len(self.mapped), lambda is_wanted: (
+                raw for raw in self.mapped
+                if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
+            if self.map_file is None:
+                boxes = record_every_frame(frames, Look(detector)).detections
+                landmark_map = build_map(boxes, MappingOptions()).landmark_map
+            else:
+                landmark_map = LandmarkMap.from_file(self.map_file)
+            layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
+            print(f'{self.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '
+                  f'{len(layer.points)} points', flush=True)
+            content = pickle.dumps((landmark_map, layer))
             make_folder(folder)
-            write_file(path, lambda partial: partial.write_bytes(pickle.dumps(built)))
-            print(f'{self.name}: {len(built[0])} landmarks, {len(built[1])} keyframes, '
-                  f'{len(built[1].points)} points', flush=True)
+            write_file(path, lambda partial: partial.write_bytes(content))
         landmark_map, layer = pickle.loads(path.read_bytes())
         return landmark_map, layer
 
@@ -94,25 +87,29 @@ def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place
     folder = Path(path)
     if (folder / 'mapping').is_dir():
         for walks in _ROOM_WALKS:
-            mapped, asked, seconds = (_walk(folder / walk) for walk in walks)
-            yield Place(folder.name, f'{folder.name}/{walks[1]}', str(ROOM_MODEL), mapped, asked,
-                        seconds, folder / 'map.yaml')
+            yield Place(folder.name, f'{folder.name}/{walks[1]}', str(ASSETS / 'yolo.pt'),
+                        _walk(folder / walks[0]), _walk(folder / walks[1]),
+                        _walk(folder / walks[2]), folder / 'map.yaml')
         return
-    map_file = folder / 'map.yaml'
-    raws = _walk(folder) if map_file.exists() else _upright(_posed(rgbd_frames(
+    map_file = folder / 'map.yaml' if (folder / 'map.yaml').exists() else None
+    raws = _walk(folder) if map_file else _upright(_posed(rgbd_frames(
         folder, FolderOptions(depth=DepthFormat(float(unit) if unit else None)))))
     rows = np.arange(len(raws))
-    half = len(raws) // 2
-    parts = {'interleaved': rows % 2 == 0, 'first half': rows < half,
-             'second half': rows >= half}
+    parts = {'interleaved': rows % 2 == 0, 'first half': rows < len(raws) // 2,
+             'second half': rows >= len(raws) // 2}
     for size in blocks:
         parts |= {f'blocks of {size}, {which}': rows // size % 2 == rest
                   for rest, which in enumerate(('even', 'odd'))}
     for part, is_mapped in parts.items():
-        mapped = tuple(raws[row] for row in rows[is_mapped])
-        asked = tuple(raws[row] for row in rows[~is_mapped])
-        yield Place(folder.name, f'{folder.name}/{part}', model, mapped, asked, asked,
-                    map_file if map_file.exists() else None)
+        mapped, asked = (tuple(raws[row] for row in rows[chosen])
+                         for chosen in (is_mapped, ~is_mapped))
+        yield Place(folder.name, f'{folder.name}/{part}', model, mapped, asked, asked, map_file)
+
+
+def pose_of(frame: RawFrame) -> Floats:
+    """Return map_from_camera (4, 4) of a frame that has one."""
+    assert frame.map_from_camera is not None
+    return frame.map_from_camera
 
 
 def _walk(folder: Path) -> Raws:
@@ -124,18 +121,13 @@ def _posed(frames: Frames) -> Raws:
     return tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
 
 
-def _frames(raws: Raws, name: str) -> Frames:
-    return Frames(Path(name), len(raws), lambda is_wanted: (
-        raw for raw in raws if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
-
-
 def _upright(raws: Raws) -> Raws:
     """Return images with their poses turned as a whole, until the z axis is up.
 
     People hold cameras level: the vertical is the direction that the x axes of all cameras have
     least of. The kitchen's own axes are those of its first camera.
     """
-    poses = np.array([raw.map_from_camera for raw in raws])
+    poses = np.array([pose_of(raw) for raw in raws])
     _, _, axes = np.linalg.svd(poses[:, :3, 0])
     up = -axes[2] * np.sign(axes[2] @ poses[:, :3, 1].mean(axis=0))
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
