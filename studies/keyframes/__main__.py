@@ -10,6 +10,7 @@ about the stored records as the package does now, and prints what each way accep
 import argparse
 import json
 import sys
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -21,21 +22,19 @@ from cliploc_ros.evaluation.output import write_text
 from cliploc_ros.parallel import run_tasks
 from studies.keyframes.cases import cases
 from studies.keyframes.judge import draw, make_judge, table
-from studies.keyframes.records import Collect
-from studies.keyframes.sites import read_places
+from studies.keyframes.records import make_collect, read_places
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
 
-def collect(options: argparse.Namespace) -> int:
-    """Collect the records of all places and cases."""
+def _collect(options: argparse.Namespace) -> int:
     places = tuple(one for site in options.sites
                    for one in read_places(site, options.model, options.blocks))
     if len({one.site for one in places}) < 2:
         raise OptionsError('--sites: images of other sites are needed: give two or more')
     chosen = [one for one in places if any(text in one.name for text in options.places)]
     names = [name for name in cases() if name.partition(':')[0] in options.families]
-    work = Collect(options.out, places, options.queries)
+    work = partial(make_collect, options.out, places, options.queries)
     for tasks in (product(chosen, ['']),  # built once, before several workers need it
                   ((place, name) for name, place in product(names, chosen))):
         for _ in tqdm(run_tasks(work, tasks, workers=options.workers), unit='case', disable=None):
@@ -43,8 +42,7 @@ def collect(options: argparse.Namespace) -> int:
     return 0
 
 
-def judge(options: argparse.Namespace) -> int:
-    """Decide about all records, and print the tables."""
+def _judge(options: argparse.Namespace) -> int:
     paths = sorted(options.out.glob('cases/*/*.pickle'))
     found = [one for _, result in run_tasks(make_judge, paths, workers=options.workers)
              for one in result or () if one.family in options.families
@@ -61,8 +59,8 @@ def judge(options: argparse.Namespace) -> int:
     return 0
 
 
-def run(arguments: list[str]) -> int:
-    """Collect or judge."""
+def main() -> int:
+    """Run from the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog='keyframes', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
@@ -75,32 +73,27 @@ def run(arguments: list[str]) -> int:
                         help='only places whose names contain one of these')
     common.add_argument('--workers', type=positive_int, default=1, metavar='N',
                         help='processes (%(default)s)')
-    asks = commands.add_parser('collect', parents=[common], help='store what is found')
-    asks.set_defaults(command=collect)
-    asks.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
-                      help='RGB-D and TUM folders, the latter with the unit of their depth, and '
-                           'rooms of demo_world.make_keyframe_rooms')
-    asks.add_argument('--model', required=True, help='weights of YOLO for real images')
-    asks.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
-                      help='map and ask blocks of N images in turn, too')
-    asks.add_argument('--queries', type=positive_int, default=24, metavar='N',
-                      help='the most of each case but the plain one (%(default)s)')
-    decides = commands.add_parser('judge', parents=[common], help='decide, and print tables')
-    decides.set_defaults(command=judge)
-    decides.add_argument('--by', nargs='+', default=['case'],
-                         choices=['site', 'place', 'family', 'case'],
-                         help='what a line of the table is about (case)')
-    decides.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
-    decides.add_argument('--figure', type=Path, metavar='FILE.png',
-                         help='draw the reliability of the confidence')
-    options = parser.parse_args(arguments)
-    return int(options.command(options))
-
-
-def main() -> int:
-    """Run from the command line; return the exit code."""
+    collects = commands.add_parser('collect', parents=[common], help='store what is found')
+    collects.set_defaults(command=_collect)
+    collects.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
+                          help='RGB-D and TUM folders, the latter with the unit of their depth, '
+                               'and rooms of demo_world.make_keyframe_rooms')
+    collects.add_argument('--model', required=True, help='weights of YOLO for real images')
+    collects.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
+                          help='map and ask blocks of N images in turn, too')
+    collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
+                          help='the most of each case but the plain one (%(default)s)')
+    judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
+    judges.set_defaults(command=_judge)
+    judges.add_argument('--by', nargs='+', default=['case'],
+                        choices=['site', 'place', 'family', 'case'],
+                        help='what a line of the table is about (case)')
+    judges.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
+    judges.add_argument('--figure', type=Path, metavar='FILE.png',
+                        help='draw the reliability of the confidence')
+    options = parser.parse_args()
     interrupt_on_sigterm()
-    return run_command(lambda: run(sys.argv[1:]))
+    return run_command(lambda: options.command(options))
 
 
 if __name__ == '__main__':

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -19,13 +20,26 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import RawFrame
-from studies.keyframes.sites import Floats, Place, Raws, pose_of
 
 Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 Rng = np.random.Generator
 # A picture shows a place that looks another way; a second look is about 20 cm from the first.
 _AWAY_COS = 0.5
 _SECOND_M, _SECOND_RANGE_M, _SECOND_DEG = 0.2, (0.1, 0.35), 25.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """A part of a site that is mapped, and images of the rest: queries, and their second looks."""
+
+    site: str
+    name: str  # begins with the site's
+    model: str  # weights of YOLO
+    mapped: tuple[RawFrame, ...]
+    asked: tuple[RawFrame, ...]
+    seconds: tuple[RawFrame, ...]
+    map_file: Path | None = None  # None: the map is built of the mapped images
 
 
 class World(NamedTuple):
@@ -206,6 +220,9 @@ def twin(share: float, removed: int, world: World, rng: Rng) -> World:
     poses, end = layer.map_from_camera[:count].copy(), layer.offsets[count]
     poses[:, :3, 3] += shift
     offsets = layer.offsets[-1] + layer.offsets[1:count + 1]
+    columns: dict[str, Any] = {name: np.concatenate([column, column[:end]])
+                               for name, column in vars(layer).items()
+                               if name in ('pixels', 'points', 'descriptors', 'words')}
     return World(
         LandmarkMap(
             landmarks.frame_id,
@@ -216,11 +233,7 @@ def twin(share: float, removed: int, world: World, rng: Rng) -> World:
             np.concatenate([landmarks.quats_xyzw, second.quats_xyzw]),
             landmarks.details + second.details),
         replace(layer, map_from_camera=np.concatenate([layer.map_from_camera, poses]),
-                offsets=np.concatenate([layer.offsets, offsets]),
-                pixels=np.concatenate([layer.pixels, layer.pixels[:end]]),
-                points=np.concatenate([layer.points, layer.points[:end]]),
-                descriptors=np.concatenate([layer.descriptors, layer.descriptors[:end]]),
-                words=np.concatenate([layer.words, layer.words[:end]])), shift)
+                offsets=np.concatenate([layer.offsets, offsets]), **columns), shift)
 
 
 def _level_direction(rng: Rng) -> Floats:
@@ -231,8 +244,8 @@ def _level_direction(rng: Rng) -> Floats:
 def cases() -> dict[str, Case]:
     """Return all cases by name, ``FAMILY: CASE``."""
     found = {'plain: one image': Case(), 'pair: two images': Case(looks=2)}
-    found |= {f'{"mirror" if name == "mirrored" else "image"}: {name}': Case(name)
-              for name in IMAGE_CHANGES}
+    found |= {f'image: {name}': Case(name) for name in IMAGE_CHANGES}
+    found['mirror: image'] = found.pop('image: mirrored')
     found['mirror: landmarks'] = Case(world=mirrored_map)
     for looks, strange, kind, share in product((1, 2), (False, True), ('crop', 'shrunk', 'warped'),
                                                (15, 30, 60)):
@@ -265,7 +278,7 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     source, source_camera = _elsewhere(place, frame, rng).color()
     if case.is_strange:
         place, frame = other, strange
-    frames = (frame, *_second_look(frame, place.seconds))[:case.looks]
+    frames = [frame, *_second_look(frame, place.seconds)][:case.looks]
     if len(frames) < case.looks:
         return None
     poses = [pose_of(one) for one in frames]
@@ -291,6 +304,12 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
         (height + 1.0, height + 3.0) if case.prior == 'height' else (-np.inf, np.inf))
 
 
+def pose_of(frame: RawFrame) -> Floats:
+    """Return map_from_camera (4, 4) of a frame that has one."""
+    assert frame.map_from_camera is not None
+    return frame.map_from_camera
+
+
 def _elsewhere(place: Place, frame: RawFrame, rng: Rng) -> RawFrame:
     """Return a mapped image that looks another way, by more than 60 degrees or else the most."""
     cosines = np.array([pose_of(one)[:3, 2] for one in place.mapped]) @ pose_of(frame)[:3, 2]
@@ -298,12 +317,12 @@ def _elsewhere(place: Place, frame: RawFrame, rng: Rng) -> RawFrame:
     return place.mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
 
 
-def _second_look(frame: RawFrame, others: Raws) -> Raws:
+def _second_look(frame: RawFrame, others: Sequence[RawFrame]) -> list[RawFrame]:
     """Return the image whose distance is nearest to 20 cm; none where all look another way."""
     found = [(abs(distance - _SECOND_M), row) for row, other in enumerate(others)
              for distance, angle in [pose_error(pose_of(frame), pose_of(other))]
              if _SECOND_RANGE_M[0] <= distance <= _SECOND_RANGE_M[1] and angle < _SECOND_DEG]
-    return (others[min(found)[1]],) if found else ()
+    return [others[min(found)[1]]] if found else []
 
 
 def _odometry(poses: Sequence[Floats], rng: Rng) -> list[Floats]:

@@ -64,7 +64,7 @@ def _by_objects(case: StoredCase, record: Record) -> Relocalization:
 def make_judge() -> Callable[[Path], list[Outcome]]:
     """Return what judges the records of a file."""
     def judge(path: Path) -> list[Outcome]:
-        case = pickle.loads(path.read_bytes())
+        case: StoredCase = pickle.loads(path.read_bytes())
         return [_outcome(case, record, way, decide(case, record, way))
                 for record in case.records for way in WAYS]
     return judge

@@ -19,9 +19,8 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.evaluation.keyframe_study.baseline import Baseline
-from cliploc_ros.evaluation.keyframe_study.changes import IMAGE_CHANGES, put_poster, twin_layer
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from studies.keyframes.cases import IMAGE_CHANGES, World, hang, make_picture, twin
 
 EVERY = LayerOptions(0.0, 0.0)
 OPTIONS = RelocalizerOptions(matching='class')
@@ -73,11 +72,11 @@ def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
         assert np.sqrt(np.trace(found.covariance[:3, :3])) < 0.1
 
 
-@pytest.mark.parametrize('name', IMAGE_CHANGES)
-def test_changed_images_are_found_or_refused(layer, queries, name):
-    localizer, rng = KeyframeLocalizer(layer), np.random.default_rng(0)
-    frame = queries[0]
-    found = answer(localizer, IMAGE_CHANGES[name](frame.image_rgb, rng), frame.camera)
+@pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])
+def test_changed_images_are_found(layer, queries, name):
+    localizer, frame = KeyframeLocalizer(layer), queries[0]
+    image = IMAGE_CHANGES[name](frame.image_rgb, frame.image_rgb, np.random.default_rng(0))
+    found = answer(localizer, np.clip(image, 0, 255).astype(np.uint8), frame.camera)
     assert found.map_from_camera is not None
     assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.25
 
@@ -88,10 +87,15 @@ def test_another_room_is_refused(layer, office):
         assert not answer(localizer, frame.image_rgb, frame.camera).accepted
 
 
-def test_a_second_room_that_looks_the_same_is_refused(layer, queries):
-    localizer = KeyframeLocalizer(twin_layer(layer))
+@pytest.fixture
+def twins(layer, room):
+    world = World(room, layer, np.zeros(3))
+    return KeyframeLocalizer(twin(1.0, 0, world, np.random.default_rng(0)).layer)
+
+
+def test_a_second_room_that_looks_the_same_is_refused(twins, queries):
     for frame in queries[:3]:
-        seen = localizer.localize(frame.image_rgb, frame.camera)
+        seen = twins.localize(frame.image_rgb, frame.camera)
         assert seen.rival > 0.5 * seen.inliers
         assert not combine(NOWHERE, seen, ObjectsThere(0, 0), OPTIONS).accepted
 
@@ -99,15 +103,17 @@ def test_a_second_room_that_looks_the_same_is_refused(layer, queries):
 def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
     elsewhere = next(kitchen.select([27]).read())  # mapped
     frame = queries[0]
-    image = put_poster(frame.image_rgb, elsewhere.image_rgb, 0.3)
+    picture = make_picture('crop', 0.3, frame.camera, elsewhere.image_rgb, frame.camera,
+                           np.random.default_rng(0))
+    image = hang(frame.image_rgb, picture, frame.camera, np.eye(4))
     found = answer(KeyframeLocalizer(layer), image, frame.camera)
     assert not found.accepted or pose_error(found.map_from_camera,
                                             frame.map_from_camera)[0] < 1.0
 
 
-def test_a_search_that_time_cuts_short_gives_no_pose(layer, queries):
+def test_a_search_that_time_cuts_short_gives_no_pose(twins, queries):
     """It might have missed the same room elsewhere."""
-    localizer, frame = KeyframeLocalizer(twin_layer(layer)), queries[0]
+    localizer, frame = twins, queries[0]
     features = localization.query_features(frame.image_rgb)
     found = []
     for wait_s in np.linspace(0.0, 0.2, 21):
@@ -147,11 +153,3 @@ def test_the_office_is_triangulated_without_depth(office, room):
         found = answer(localizer, frame.image_rgb, frame.camera)
         assert found.accepted, found.reason
         assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.05
-
-
-def test_the_baseline_finds_the_kitchen(kitchen, queries):
-    baseline = Baseline(list(kitchen.select(range(0, 6, 3)).read()))
-    frame = queries[0]
-    pose = baseline.localize(frame.image_rgb, frame.camera)
-    assert pose_error(pose, frame.map_from_camera)[0] < 0.1
-    assert baseline.localize(np.zeros_like(frame.image_rgb), frame.camera) is None
