@@ -65,6 +65,14 @@ def test_the_camera_is_where_its_mount_has_it(robot, source):
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
 
 
+def test_it_knows_the_way_driven_until_the_image(robot, source):
+    talk(source, *np.arange(9.0, 12.05, 0.1))
+    assert place(robot, 9.0).way_m == 0.0
+    assert place(robot, 11.05).way_m == pytest.approx(0.2, abs=0.03)
+    talk(source, 12.1, child_frame='camera')
+    assert place(robot, 12.1).way_m == 0.0, 'another run'
+
+
 def test_odometry_of_the_camera_needs_no_mount(robot, source):
     talk(source, 10.0, child_frame='camera')
     np.testing.assert_allclose(place(robot, 10.0).odom_from_camera, odom_from_base(10.0),

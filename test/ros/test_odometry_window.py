@@ -133,3 +133,25 @@ def test_it_tells_what_it_may_know_of():
                                     (8.0, False, False)):
         assert window.spans(round(moment * S), S) == spans
         assert window.is_ahead(round(moment * S)) == is_ahead
+
+
+def test_the_way_is_what_was_driven_not_how_far_it_led():
+    window = OdometryWindow(10.0)
+    for tick in range(400):  # 40 s there and back, by 2 m at .1 m/s
+        x_m = 0.01 * (200 - abs(tick - 200))
+        window.add(tick * S // 10, np.array([x_m, 0.0, 0.0]), UPRIGHT)
+    assert window.way_at(39 * S) == pytest.approx(3.9, abs=0.05)
+    assert window.way_at(35 * S) == pytest.approx(3.5, abs=0.05)
+    window.add(39 * S + S // 20, np.array([0.1, 0.0, 0.0]), UPRIGHT)  # late
+    assert window.way_at(39 * S + S // 20) == window.way_at(39 * S)
+    window.clear()
+    window.add(50 * S, np.zeros(3), UPRIGHT)
+    assert window.way_at(50 * S) == 0.0, 'each run begins with none'
+
+
+def test_a_robot_that_stands_drives_no_way():
+    """Visual odometry trembles by millimetres."""
+    window, rng = OdometryWindow(10.0), np.random.default_rng(0)
+    for tick in range(3000):
+        window.add(tick * S // 50, rng.normal(0.0, 0.002, 3), UPRIGHT)
+    assert window.way_at(60 * S) < 0.2

@@ -46,11 +46,14 @@ class BodyPose(NamedTuple):
         The coordinate frame that odometry tracks (child_frame_id).
     run : int
         Poses of one run share their odometry frame; those of different runs do not compare.
+    way_m : float
+        Driven since the run began [m].
     """
 
     odom_from_body: NDArray[np.float64]
     body_frame: str
     run: int
+    way_m: float
 
 
 class OdometrySource:
@@ -224,6 +227,7 @@ class OdometrySource:
                 self._heard.wait_for(lambda: not self._window.is_ahead(at_ns), _PATIENCE_S)
             odom_from_body = self._window.pose_at(at_ns)
             run, body_frame = self._window.run, self._frames[1]
+            way_m = self._window.way_at(at_ns)
         if not body_frame:
             raise NoOdometryError(f'{self.topic} has no child_frame_id')
-        return BodyPose(odom_from_body, body_frame, run)
+        return BodyPose(odom_from_body, body_frame, run, way_m)

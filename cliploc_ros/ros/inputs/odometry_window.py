@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The last seconds of odometry: the robot's pose when an image was taken."""
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ _MAX_SPEED_M_S = 20.0
 _SLACK_M = 0.1
 _MAX_TURN_RAD_S = 10.0
 _SLACK_RAD = 0.1
+# A robot that stands seems to move by less: its way counts in longer steps.
+_STEP_M = 0.02
 
 
 class NoOdometryError(CliplocError):
@@ -35,6 +37,7 @@ class _Pose(NamedTuple):
     stamp_ns: int
     position: NDArray[np.float64]
     quat_xyzw: NDArray[np.float64]
+    way_m: float
 
 
 class OdometryWindow:
@@ -52,6 +55,8 @@ class OdometryWindow:
         self._length_ns = round(length_s * NS_PER_S)
         self._max_poses = max_poses
         self._poses: list[_Pose] = []
+        # The way until the last step ended, and where.
+        self._way_m, self._step_end = 0.0, np.zeros(3)
         #: The number of the present run of odometry: poses of two runs are not related.
         self.run = 0
 
@@ -62,6 +67,7 @@ class OdometryWindow:
     def clear(self) -> None:
         """Forget all poses, and begin another run."""
         self._poses.clear()
+        self._way_m = 0.0
         self.run += 1
 
     def is_ahead(self, stamp_ns: int) -> bool:
@@ -97,11 +103,13 @@ class OdometryWindow:
         if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE \
                 or np.abs(position).max() > _FARTHEST_M:
             return False
-        pose = _Pose(stamp_ns, np.asarray(position, dtype=np.float64), quat_xyzw / length)
+        pose = _Pose(stamp_ns, np.asarray(position, dtype=np.float64), quat_xyzw / length, 0.0)
         poses = self._poses
         if poses and (stamp_ns < poses[-1].stamp_ns - _MAX_LATE_NS or _jumps(poses, pose)):
             self.clear()
         row = bisect_left(poses, stamp_ns, key=lambda one: one.stamp_ns)
+        pose = pose._replace(way_m=self._way_to(pose.position) if row == len(poses)
+                             else poses[max(row - 1, 0)].way_m)
         if row < len(poses) and poses[row].stamp_ns == stamp_ns:
             poses[row] = pose
         else:
@@ -110,6 +118,14 @@ class OdometryWindow:
         first = bisect_left(poses, oldest, key=lambda one: one.stamp_ns)
         del poses[:max(first, len(poses) - self._max_poses)]
         return True
+
+    def way_at(self, stamp_ns: int) -> float:
+        """Return the way driven since this run began until an instant [m], to a few centimetres.
+
+        Its length, however near to its beginning it leads.
+        """
+        row = bisect_right(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        return self._poses[row - 1].way_m if row else 0.0
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64]:
         """Return odom_from_robot (4, 4) at an instant, between two messages by interpolation.
@@ -139,6 +155,15 @@ class OdometryWindow:
         turns = Slerp([0.0, 1.0], Rotation.from_quat([before.quat_xyzw, after.quat_xyzw]))
         return make_transform(turns(share).as_matrix(),
                               before.position + share * (after.position - before.position))
+
+    def _way_to(self, position: NDArray[np.float64]) -> float:
+        """Return the way until the newest pose."""
+        if not self._poses:
+            self._step_end = position
+        step_m = float(np.linalg.norm(position - self._step_end))
+        if step_m > _STEP_M:
+            self._way_m, self._step_end = self._way_m + step_m, position
+        return self._way_m
 
 
 def _jumps(poses: list[_Pose], pose: _Pose) -> bool:
