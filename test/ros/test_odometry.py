@@ -159,6 +159,17 @@ def test_an_origin_that_is_reset_is_a_restart(source, restarts, capfd):
     assert '/odom restarted, for its time, place or frames jumped' in capfd.readouterr().err
 
 
+def test_a_driver_that_begins_anew_after_a_silence_is_a_restart(robot, source, restarts):
+    talk(source, *np.arange(9.5, 10.05, 0.1))
+    run = place(robot, 10.0).run
+    for moment in (13.0, 13.1):
+        anew = message(moment)
+        anew.pose.pose.position.y = 0.6  # 1.4 m away, and turned
+        source.take(anew)
+    assert restarts == [13_000_000_000]
+    assert place(robot, 13.05).run != run
+
+
 def test_odometry_that_goes_on_is_no_restart(source, restarts):
     broken = message(10.15)
     broken.pose.pose.orientation.w = float('nan')

@@ -115,6 +115,50 @@ def test_odometry_that_was_reset_joins_nothing_across_it():
         window.pose_at(round(50.5 * S))
 
 
+def talk(window, seconds, x_m=0.0, degrees=0.0):
+    """Take a pose; return whether it begins another run."""
+    run = window.run
+    window.add(round(seconds * S), np.array([x_m, 0.0, 0.0]), turned(degrees))
+    return window.run != run
+
+
+@pytest.mark.parametrize('period_s', [0.02, 0.1, 1.0])
+@pytest.mark.parametrize(('x_m', 'degrees', 'restarts'), [
+    (0.0, 0.0, False), (0.08, 4.0, False), (1.0, 0.0, True), (-0.2, 0.0, True), (0.0, 8.0, True)])
+@pytest.mark.parametrize('silence_s', [3.5, 60.0])
+def test_a_robot_that_stood_before_a_silence_is_where_it_was(period_s, silence_s, x_m, degrees,
+                                                             restarts):
+    """Or its driver has begun at another origin, within a distance that it could have driven."""
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, period_s):
+        assert not talk(window, moment)
+    assert talk(window, 5.0 + silence_s, x_m, degrees) == restarts
+
+
+@pytest.mark.parametrize(('x_m', 'degrees', 'restarts'), [
+    (3.5, 30.0, False), (2.6, 0.0, False), (3.2, 15.0, False), (0.0, 0.0, True), (5.0, 30.0, True),
+    (3.5, 80.0, True)])
+def test_a_robot_that_drove_before_a_silence_goes_on_or_stops(x_m, degrees, restarts):
+    """At .5 m/s and 15 degrees/s for 2 s. Its driver begins at (0, 0), where it did not drive."""
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, 0.1):
+        assert not talk(window, moment, 0.5 * moment, 15.0 * (moment - 5.0))
+    assert talk(window, 7.0, x_m, degrees) == restarts
+
+
+def test_nobody_knows_where_a_robot_went_in_a_long_silence():
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, 0.1):
+        assert not talk(window, moment, 0.5 * moment)
+    assert talk(window, 9.0, 4.5)
+
+
+def test_a_slow_source_that_misses_two_messages_goes_on():
+    window = OdometryWindow(30.0)
+    for moment in (0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 9.0):
+        assert not talk(window, moment, 0.3 * moment)
+
+
 def test_odometry_that_was_reset_where_it_began_is_told_by_its_heading():
     window = OdometryWindow(10.0)
     drive(window, (50.0, 53.0), speed_m_s=0.0)

@@ -17,7 +17,12 @@ from rclpy.node import Node
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError, OdometryWindow
+from cliploc_ros.ros.inputs.odometry_window import (
+    LONG_NS,
+    MOMENT_NS,
+    NoOdometryError,
+    OdometryWindow,
+)
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.units import NS_PER_S
 
@@ -27,10 +32,6 @@ _LENGTH_S = 30.0
 _PATIENCE_S = 0.2
 # Odometry that ends or begins this close to an image may cover the next image.
 _NEARLY_NS = 2_000_000_000
-# Over a shorter time the noise of the poses would look like a speed.
-_MOMENT_NS = 300_000_000
-# Over a longer time the mean speed says little about now (a guess): slow sources send at 1 Hz.
-_LONG_NS = 3_000_000_000
 #: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
 #: taking a moving robot on a busy machine for one at rest.
 MOMENT_PATIENCE_S = 2.0
@@ -181,7 +182,7 @@ class OdometrySource:
             return None
         now_ns = stamp_ns(self._newest.header.stamp)
         step_ns = self._window.since_previous_ns(now_ns)
-        moment_ns = step_ns if _MOMENT_NS < step_ns <= _LONG_NS else _MOMENT_NS
+        moment_ns = step_ns if MOMENT_NS < step_ns <= LONG_NS else MOMENT_NS
         try:
             return (self._window.pose_at(now_ns - moment_ns), self._window.pose_at(now_ns),
                     moment_ns / NS_PER_S)

@@ -3,12 +3,14 @@
 """The last seconds of odometry: the robot's pose when an image was taken."""
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from cliploc_ros.core.geometry.tolerances import SAME_SPOT
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.units import NS_PER_S
@@ -25,6 +27,13 @@ _MAX_SPEED_M_S = 20.0
 _SLACK_M = 0.1
 _MAX_TURN_RAD_S = 10.0
 _SLACK_RAD = 0.1
+# Odometry is silent after this many of its usual periods, or of a slow source's where it has just
+# begun (guesses).
+_MOST_PERIODS, _SLOW_NS = 3.0, NS_PER_S
+#: Over a shorter time the noise of the poses would look like a speed.
+MOMENT_NS = 300_000_000
+#: Over a longer time a speed says little (a guess): slow sources send at 1 Hz.
+LONG_NS = 3 * NS_PER_S
 # A robot that stands seems to move by less: its way counts in longer steps.
 _STEP_M = 0.02
 
@@ -89,7 +98,7 @@ class OdometryWindow:
         """Take in a pose; return whether it is valid.
 
         If time or place jumps, all former poses are forgotten: the clock was set back, or
-        odometry was reset.
+        odometry was reset, which a silence may hide.
 
         Parameters
         ----------
@@ -166,13 +175,47 @@ class OdometryWindow:
         return self._way_m
 
 
-def _jumps(poses: list[_Pose], pose: _Pose) -> bool:
+def _jumps(poses: Sequence[_Pose], pose: _Pose) -> bool:
     """Return whether a robot cannot have moved from the newest pose to this one."""
     newest = poses[-1]
-    if pose.stamp_ns <= newest.stamp_ns:
+    gap_ns = pose.stamp_ns - newest.stamp_ns
+    if gap_ns <= 0:
         return False
-    seconds = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
-    distance = float(np.linalg.norm(pose.position - newest.position))
-    turned = 2.0 * np.arccos(min(1.0, abs(float(newest.quat_xyzw @ pose.quat_xyzw))))
-    return bool(distance > _MAX_SPEED_M_S * seconds + _SLACK_M
-                or turned > _MAX_TURN_RAD_S * seconds + _SLACK_RAD)
+    if _is_silence(poses, gap_ns):
+        return not _goes_on(poses, pose)
+    seconds = gap_ns / NS_PER_S
+    distance_m = float(np.linalg.norm(pose.position - newest.position))
+    return (distance_m > _MAX_SPEED_M_S * seconds + _SLACK_M
+            or _turn_rad(newest, pose) > _MAX_TURN_RAD_S * seconds + _SLACK_RAD)
+
+
+def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
+    """Return whether the next pose comes later than some lost messages explain."""
+    if gap_ns <= _MAX_GAP_NS:
+        return False
+    period_ns = float(np.median(np.diff([one.stamp_ns for one in poses]))) \
+        if len(poses) > 1 else _SLOW_NS
+    return gap_ns > _MOST_PERIODS * period_ns
+
+
+def _goes_on(poses: Sequence[_Pose], pose: _Pose) -> bool:
+    """Return whether a pose after a silence is where the robot was, or on its way from there.
+
+    Its driver may have begun anew at another origin, which a robot could have reached by driving.
+    So it may have gone on as before or stopped, nothing else; after a long silence, it has to
+    stand where it was.
+    """
+    newest = poses[-1]
+    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
+    before = poses[max(row - 1, 0)]
+    gap_ns, moment_ns = pose.stamp_ns - newest.stamp_ns, newest.stamp_ns - before.stamp_ns
+    times = gap_ns / moment_ns if moment_ns and gap_ns <= LONG_NS else 0.0
+    half_way = times / 2 * (newest.position - before.position)
+    off_m = float(np.linalg.norm(pose.position - newest.position - half_way))
+    most_rad = times * _turn_rad(before, newest) + np.radians(SAME_SPOT.angle_deg)
+    return (off_m <= float(np.linalg.norm(half_way)) + SAME_SPOT.distance_m
+            and _turn_rad(newest, pose) <= most_rad)
+
+
+def _turn_rad(one: _Pose, other: _Pose) -> float:
+    return float(2.0 * np.arccos(min(1.0, abs(float(one.quat_xyzw @ other.quat_xyzw)))))
