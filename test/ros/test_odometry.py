@@ -224,10 +224,12 @@ def test_slow_odometry_gives_its_mean_speed(source, moments):
 
 
 def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
-    assert source.moved_since(stamp(9.85)) is None
+    assert source.moved_since(stamp(9.85), 0.0) is None
     talk(source, *np.arange(9.5, 10.55, 0.1))
-    assert source.moved_since(stamp(9.75)) == (pytest.approx(0.075), pytest.approx(15.0))
-    assert source.moved_since(stamp(9.4)) is None and source.moved_since(stamp(10.6)) is None
+    assert source.moved_since(stamp(9.75), 0.0) == (pytest.approx(0.08), pytest.approx(16.0))
+    assert source.moved_since(stamp(10.5), 0.0) == (0.0, 0.0)
+    assert source.moved_since(stamp(9.4), 0.0) is None
+    assert source.moved_since(stamp(10.6), 0.0) is None
 
 
 def test_no_speed_is_taken_across_a_restart(source):

@@ -189,19 +189,16 @@ class OdometrySource:
         except NoOdometryError:
             return None
 
-    def moved_since(self, stamp: Time) -> tuple[float, float] | None:
-        """Return how far the robot is from where it was at an image [m], [degrees].
+    def moved_since(self, stamp: Time, patience_s: float) -> tuple[float, float] | None:
+        """Return how far the robot is from where it was at an image, at most [m], [degrees].
 
-        None where odometry does not cover that time.
+        Waits for the message that follows the image. None where odometry does not cover that
+        time, or has a gap of more than 3 s there.
         """
+        at_ns = stamp_ns(stamp)
         with self._heard:
-            if self._newest is None:
-                return None
-            try:
-                return pose_error(self._window.pose_at(stamp_ns(stamp)),
-                                  self._window.pose_at(stamp_ns(self._newest.header.stamp)))
-            except NoOdometryError:
-                return None
+            self._heard.wait_for(lambda: self._window.spans(at_ns, 0), patience_s)
+            return self._window.moved_since(at_ns)
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers about the time of an image, and so of the next.

@@ -128,6 +128,22 @@ class OdometryWindow:
         del poses[:max(first, len(poses) - self._max_poses)]
         return True
 
+    def moved_since(self, stamp_ns: int) -> tuple[float, float] | None:
+        """Return how far the newest pose is from the two about an instant, at most [m], [degrees].
+
+        None where the instant is outside of all poses, or in a gap of more than 3 s.
+        """
+        if not self.spans(stamp_ns, 0):
+            return None
+        row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        after, newest = self._poses[row], self._poses[-1]
+        before = after if after.stamp_ns == stamp_ns else self._poses[row - 1]
+        if after.stamp_ns - before.stamp_ns > LONG_NS:
+            return None
+        return (max(float(np.linalg.norm(newest.position - one.position))
+                    for one in (before, after)),
+                float(np.degrees(max(_turn_rad(newest, one) for one in (before, after)))))
+
     def way_at(self, stamp_ns: int) -> float:
         """Return the way driven since this run began until an instant [m], to a few centimetres.
 
