@@ -176,7 +176,8 @@ class Localizer:
         observation = Observation(
             camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
             up_in_camera=state.up_in_camera,
-            odom_from_camera=None if place is None else place.odom_from_camera)
+            odom_from_camera=None if place is None else place.odom_from_camera,
+            odom_way_m=0.0 if place is None else place.way_m)
         options = relocalizer_options(values)
         session = self._session_for(options)
         times.begin('search')
