@@ -18,9 +18,11 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
 from cliploc_ros.core.search.prior import Prior
 
-# Features of a query; keyframes that are matched: the most similar ones, then the most similar
-# ones elsewhere, so that a place that looks alike is found, and those where objects propose.
-_QUERY_FEATURES = 2000
+# Most features of a query, and its longest side. At the size of keyframes, features take twice the
+# time at equal success.
+_QUERY_FEATURES, _QUERY_PX = 2000, 400
+# Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
+# a place that looks alike is found, and those where objects propose.
 _SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
@@ -33,6 +35,8 @@ _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
 NEAR_M, NEAR_DEG = 2.0, 40.0
+# Samples of three points that are tried: for the first place, and for each one elsewhere.
+_ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
 _NOTHING_KNOWN = Prior()
@@ -124,7 +128,7 @@ class _Matched(NamedTuple):
 
 def query_features(image_rgb: NDArray[np.uint8]) -> Features:
     """Return the features of an image (h, w, 3) that is to be localized."""
-    return extract(image_rgb, _QUERY_FEATURES)
+    return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
 
 
 class _Look(NamedTuple):
@@ -191,11 +195,12 @@ class KeyframeLocalizer:
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
-        places = _places(matched, look)
-        if not places or places[0].agreed < _ENOUGH_INLIERS:
-            more = self._more(ranks, chosen, places)
+        first = _place(matched, look)
+        if first is None or first.agreed < _ENOUGH_INLIERS:
+            more = self._more(ranks, chosen, first)
             matched = matched.join(self._match(descriptors, more, deadline))
-            places = _places(matched, look)
+            first = _place(matched, look)
+        places = _places(first, matched, look)
         if time.monotonic() > deadline:
             return Recognition(is_complete=False)
         return Recognition(tuple(self._recognized(one, look) for one in places))
@@ -231,11 +236,11 @@ class KeyframeLocalizer:
             chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
         return chosen
 
-    def _more(self, ranks: Sequence[int], chosen: Sequence[int], places: Sequence['_Place']
+    def _more(self, ranks: Sequence[int], chosen: Sequence[int], first: '_Place | None'
               ) -> list[int]:
         """Return more keyframes: those near the pose so far, and the next similar ones."""
-        near = _keyframes_near(self.layer.map_from_camera, places[0].map_from_camera
-                               )[:_MORE].tolist() if places else []
+        near = _keyframes_near(self.layer.map_from_camera, first.map_from_camera
+                               )[:_MORE].tolist() if first else []
         return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                 if one not in chosen]
 
@@ -293,30 +298,29 @@ class KeyframeLocalizer:
         return np.diag(np.repeat([position, rotation], 3))
 
 
-def _places(matched: _Matched, look: _Look) -> list[_Place]:
+def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
     """Return the pose that most matches agree with, and the best ones elsewhere.
 
     The one whose points lie in the most parts of the image comes first: a poster has many points,
     but shows only a part of its place.
     """
-    places: list[_Place] = []
-    found = 0
-    while found < MOST_PLACES:
-        place = _place(matched, look)
-        if place is None or (places and place.agreed < LEAST_INLIERS):
-            break
+    place, found, places = first, 0, list[_Place]()
+    while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.prior.allows(place.map_from_camera):
             found += 1
             if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
                 places.append(place)
+        if found == MOST_PLACES:
+            break
         taken = agreeing(matched.points, look.bearings[matched.features],
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
+        place = _place(matched, look, _RIVAL_ITERATIONS)
     return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
 
 
-def _place(matched: _Matched, look: _Look) -> _Place | None:
-    found = find_pose(matched.points, look.bearings[matched.features], look.camera)
+def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Place | None:
+    found = find_pose(matched.points, look.bearings[matched.features], iterations)
     if found is None:
         return None
     inliers = matched.select(found.inliers)
