@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.index.similarities import Similarities
-from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

@@ -23,7 +23,7 @@ from cliploc_ros.core.fit.finalists import find_with_rivals
 from cliploc_ros.core.fit.rig import cameras_from_last, make_rig
 from cliploc_ros.core.geometry.tolerances import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
-from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

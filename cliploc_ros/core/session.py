@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.tolerances import SAME_VIEW
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import localize_on_demand
 from cliploc_ros.core.relocalization import Relocalization
@@ -104,7 +104,7 @@ class Session:
         elif found.map_from_camera is not None:
             self._looks = self._looks.with_look(Look(
                 replace(observation, similarities=None, compared=None), found.map_from_camera,
-                found.confidence))
+                found.confidence, found.recognized))
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

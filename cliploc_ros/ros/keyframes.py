@@ -16,10 +16,10 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import (
-    ImageRecognizer,
     KeyframeLocalizer,
     query_features,
 )
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_urls import path_of

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.tolerances import SAME_LOOK
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.localization import RecognizedPlace
 from cliploc_ros.core.observation import Observation
 
 
@@ -35,11 +36,14 @@ class Look(NamedTuple):
     map_from_camera : ndarray (4, 4)
     confidence : float
         From the frames of this look alone.
+    recognized : RecognizedPlace or None
+        What keyframes recognize.
     """
 
     observation: Observation
     map_from_camera: NDArray[np.float64]
     confidence: float
+    recognized: RecognizedPlace | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 """Localize an image among keyframes: find similar ones, match them, solve for the pose."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -18,10 +18,12 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
 from cliploc_ros.core.search.prior import Prior
 
-# Features of a query; keyframes that are matched: the most similar ones, then the most similar
-# ones elsewhere, so that a place that looks alike is found, and those where objects propose.
-_QUERY_FEATURES = 2000
-_SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
+# Most features of a query, and its longest side. At the size of keyframes, features take twice the
+# time at equal success.
+_QUERY_FEATURES, _QUERY_PX = 2000, 400
+# Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
+# a place that looks alike is found, and those where objects propose.
+_SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
@@ -33,9 +35,12 @@ _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
 NEAR_M, NEAR_DEG = 2.0, 40.0
+# Samples of three points that are tried: for the first place, and for each one elsewhere.
+_ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
-_NOTHING_KNOWN = Prior()
+#: Nothing is known of the camera.
+NOTHING_KNOWN = Prior()
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
@@ -124,7 +129,7 @@ class _Matched(NamedTuple):
 
 def query_features(image_rgb: NDArray[np.uint8]) -> Features:
     """Return the features of an image (h, w, 3) that is to be localized."""
-    return extract(image_rgb, _QUERY_FEATURES)
+    return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
 
 
 class _Look(NamedTuple):
@@ -133,7 +138,7 @@ class _Look(NamedTuple):
     features: Features
     bearings: NDArray[np.float64]
     camera: Camera
-    prior: Prior = _NOTHING_KNOWN
+    prior: Prior = NOTHING_KNOWN
 
 
 class _Place(NamedTuple):
@@ -160,7 +165,7 @@ class KeyframeLocalizer:
 
     def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
                  guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                 prior: Prior = _NOTHING_KNOWN) -> Recognition:
+                 prior: Prior = NOTHING_KNOWN) -> Recognition:
         """Find where an image was taken.
 
         Parameters
@@ -179,7 +184,7 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          prior: Prior = _NOTHING_KNOWN) -> Recognition:
+                          prior: Prior = NOTHING_KNOWN) -> Recognition:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
@@ -191,11 +196,12 @@ class KeyframeLocalizer:
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
-        places = _places(matched, look)
-        if not places or places[0].agreed < _ENOUGH_INLIERS:
-            more = self._more(ranks, chosen, places)
+        first = _place(matched, look)
+        if first is None or first.agreed < _ENOUGH_INLIERS:
+            more = self._more(ranks, chosen, first)
             matched = matched.join(self._match(descriptors, more, deadline))
-            places = _places(matched, look)
+            first = _place(matched, look)
+        places = _places(first, matched, look)
         if time.monotonic() > deadline:
             return Recognition(is_complete=False)
         return Recognition(tuple(self._recognized(one, look) for one in places))
@@ -206,7 +212,7 @@ class KeyframeLocalizer:
         It counts the cells of the image in which keyframes near the pose expect points. Where it
         is 0, no keyframe is near: that an image is not recognized says nothing about this place.
         """
-        near = _keyframes_near(self.layer.map_from_camera, map_from_camera)
+        near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
     def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
@@ -227,15 +233,15 @@ class KeyframeLocalizer:
                   if not any(_same_place(poses[one], poses[other]) for other in chosen))
         chosen += islice(others, _ELSEWHERE)
         for guess in guesses:
-            near = _keyframes_near(poses, guess)
-            chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
+            near = keyframes_near(poses, guess)
+            chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
         return chosen
 
-    def _more(self, ranks: Sequence[int], chosen: Sequence[int], places: Sequence['_Place']
+    def _more(self, ranks: Sequence[int], chosen: Sequence[int], first: '_Place | None'
               ) -> list[int]:
         """Return more keyframes: those near the pose so far, and the next similar ones."""
-        near = _keyframes_near(self.layer.map_from_camera, places[0].map_from_camera
-                               )[:_MORE].tolist() if places else []
+        near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
+                               )[:_MORE].tolist() if first else []
         return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                 if one not in chosen]
 
@@ -293,78 +299,29 @@ class KeyframeLocalizer:
         return np.diag(np.repeat([position, rotation], 3))
 
 
-class ImageRecognizer:
-    """The keyframe search of one image, which several searches of its objects ask.
-
-    Parameters
-    ----------
-    keyframes : KeyframeLocalizer
-    features : Features or callable
-        Of the image; a callable is called when they are needed first.
-    camera : Camera
-    deadline : float
-        See KeyframeLocalizer.localize.
-    begin_stage : callable
-        Takes the name of a stage that begins: 'keyframes', and 'search' after them.
-    """
-
-    def __init__(self, keyframes: KeyframeLocalizer, features: Features | Callable[[], Features],
-                 camera: Camera, deadline: float = np.inf,
-                 begin_stage: Callable[[str], None] = lambda stage: None) -> None:
-        self._keyframes = keyframes
-        self._features = features
-        self._camera = camera
-        self._deadline = deadline
-        self._begin_stage = begin_stage
-        self._known: tuple[set[int], Recognition] | None = None
-        #: Time that it took so far [ms].
-        self.spent_ms = 0.0
-
-    def recognize(self, guesses: Sequence[NDArray[np.float64]], prior: Prior = _NOTHING_KNOWN
-                  ) -> Recognition:
-        """Find where the image was taken; again only where guesses propose other keyframes."""
-        near = {row for guess in guesses for row in _keyframes_near(
-            self._keyframes.layer.map_from_camera, guess)[:_PROPOSED].tolist()}
-        if self._known is None or not near <= self._known[0]:
-            self._begin_stage('keyframes')
-            begin = time.perf_counter()
-            if callable(self._features):
-                self._features = self._features()
-            self._known = near, self._keyframes.localize_features(
-                self._features, self._camera, guesses, self._deadline, prior)
-            self.spent_ms += 1e3 * (time.perf_counter() - begin)
-            self._begin_stage('search')
-        return self._known[1]
-
-    def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
-        """Return KeyframeLocalizer.coverage for the camera of the image."""
-        return self._keyframes.coverage(map_from_camera, self._camera)
-
-
-def _places(matched: _Matched, look: _Look) -> list[_Place]:
+def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
     """Return the pose that most matches agree with, and the best ones elsewhere.
 
     The one whose points lie in the most parts of the image comes first: a poster has many points,
     but shows only a part of its place.
     """
-    places: list[_Place] = []
-    found = 0
-    while found < MOST_PLACES:
-        place = _place(matched, look)
-        if place is None or (places and place.agreed < LEAST_INLIERS):
-            break
+    place, found, places = first, 0, list[_Place]()
+    while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.prior.allows(place.map_from_camera):
             found += 1
             if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
                 places.append(place)
+        if found == MOST_PLACES:
+            break
         taken = agreeing(matched.points, look.bearings[matched.features],
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
+        place = _place(matched, look, _RIVAL_ITERATIONS)
     return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
 
 
-def _place(matched: _Matched, look: _Look) -> _Place | None:
-    found = find_pose(matched.points, look.bearings[matched.features], look.camera)
+def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Place | None:
+    found = find_pose(matched.points, look.bearings[matched.features], iterations)
     if found is None:
         return None
     inliers = matched.select(found.inliers)
@@ -383,7 +340,7 @@ def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < _SAME_M and cosine > _SAME_COS)
 
 
-def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the keyframes that see what a pose sees, the most similar views first."""
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 
 #: Fewer inliers determine no pose: three fix it, the others agree with it.
 LEAST_INLIERS = 8
 # An inlier's reprojection is no further off, as an angle: 3 px at f = 525 px.
 _MOST_ERROR = 3.0 / 525.0
-_ITERATIONS, _SURE = 1000, 0.9999
-_STEPS = 10
+_SURE = 0.9999
+# A pose of three points is rough: so many times the error makes an inlier at first.
+_START_TOLERANCE = 2.0
+# Least squares end after so many steps, or after one that is small [m and rad].
+_STEPS, _SMALL_STEP = 10, 1e-5
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
 # Of a normal distribution: standard deviation divided by the median of absolute values.
@@ -41,12 +43,12 @@ class PointPose(NamedTuple):
     covariance: NDArray[np.float64]
 
 
-def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera: Camera
+def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000
               ) -> PointPose | None:
     """Return the pose that most points agree with; None where there is none.
 
-    MAGSAC++ of OpenCV finds it (Barath et al., "MAGSAC++, a fast, reliable and accurate robust
-    estimator", 2020), and robust least squares refines it on the inliers.
+    MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
+    optimization, MAGSAC++ and PoseLib took longer at equal success.
 
     Parameters
     ----------
@@ -54,18 +56,18 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera
         In the map [m].
     bearings : ndarray (n, 2)
         Where the image shows them, on the plane z = 1.
-    camera : Camera
-        Its focal length gives the tolerance in pixels.
+    iterations : int
+        Most samples of three points.
     """
     if len(points) < LEAST_INLIERS:
         return None
-    matrix = np.diag([camera.fx, camera.fy, 1.0])
+    options = cv2.UsacParams()
+    options.score, options.loMethod = cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_NULL
+    options.maxIterations, options.confidence, options.threshold = iterations, _SURE, _MOST_ERROR
     middle = points.mean(axis=0)  # OpenCV computes with floats: keep numbers small
     try:
-        found, vector, translation, _ = cv2.solvePnPRansac(
-            points - middle, bearings * (camera.fx, camera.fy), matrix, None,
-            iterationsCount=_ITERATIONS, reprojectionError=_MOST_ERROR * camera.fx,
-            confidence=_SURE, flags=cv2.USAC_MAGSAC)
+        found, _, vector, translation, _ = cv2.solvePnPRansac(
+            points - middle, bearings, np.eye(3), None, params=options)
     except cv2.error:  # degenerate points
         return None
     if not found or not (np.isfinite(vector).all() and np.isfinite(translation).all()):
@@ -78,7 +80,7 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera
 def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
            camera_from_map: NDArray[np.float64]) -> PointPose | None:
     """Return a pose after least squares with Cauchy's weights; None with too few inliers."""
-    inliers = agreeing(points, bearings, camera_from_map)
+    inliers = agreeing(points, bearings, camera_from_map, _START_TOLERANCE)
     for _ in range(2):
         if len(inliers) < LEAST_INLIERS:
             return None
@@ -129,7 +131,7 @@ def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64],
         step = -np.linalg.lstsq(information, gradient, rcond=None)[0]
         turn = Rotation.from_rotvec(step[3:]).as_matrix()
         camera_from_map = make_transform(turn, step[:3]) @ camera_from_map
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < _SMALL_STEP:
             break
     return camera_from_map, information
 
