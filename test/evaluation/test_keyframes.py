@@ -4,12 +4,14 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.recognition import ObjectsThere
 from cliploc_ros.core.combination import Image, combine, join_keyframes
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
@@ -177,6 +179,32 @@ def test_height_and_vertical_restrict_keyframes_as_they_restrict_objects(
                            observation), room, KeyframeLocalizer(layer), options)
         assert found.accepted == (not wrong), found.reason
         assert reason in found.reason
+
+
+@pytest.mark.parametrize('times', [0.5, 0.8, 1.0, 1.25, 2.0])
+def test_a_wrong_focal_length_shows_in_each_place(layer, queries, times):
+    localizer, errors = KeyframeLocalizer(layer), []
+    for frame in queries:
+        own = frame.camera
+        camera = Camera(own.width, own.height, times * own.fx, times * own.fy, own.cx, own.cy)
+        for place in localizer.localize(frame.image_rgb, camera).places[:1]:
+            errors.append(abs(np.log(place.focal_ratio)) / place.focal_deviation)
+            if errors[-1] > 3.0:
+                assert abs(place.focal_ratio * times - 1.0) < 0.1
+                assert place.focal_inliers > place.inliers
+    assert (np.median(errors) > 4.0) == (times != 1.0)
+    assert times != 1.0 or max(errors) < 3.0
+
+
+def test_a_smaller_picture_of_the_place_shows_by_its_focal_length(layer, kitchen, queries):
+    """As on a poster or a screen."""
+    mapped = next(kitchen.select([27]).read()).image_rgb
+    image = np.full_like(mapped, 128)
+    image[100:388, 150:534] = cv2.resize(mapped, None, fx=0.6, fy=0.6)
+    place = KeyframeLocalizer(layer).localize(image, queries[0].camera).places[0]
+    assert place.inliers > 20
+    assert abs(place.focal_ratio / 0.6 - 1.0) < 0.1
+    assert abs(np.log(place.focal_ratio)) > 3.0 * place.focal_deviation
 
 
 def test_the_office_is_triangulated_without_depth(office, room):
