@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import (
     DIMENSIONS,
@@ -17,7 +17,7 @@ from cliploc_ros.core.keyframes.features import (
     match,
     unit_rows,
 )
-from cliploc_ros.core.keyframes.point_pose import find_pose
+from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
@@ -54,6 +54,26 @@ def test_covariances_of_noisy_features_are_honest():
         squares.append(normalized_square(found.map_from_camera, found.covariance, pose))
     # six degrees of freedom; the deviation of this mean is .45
     assert 4.0 < np.mean(squares) < 8.0
+
+
+@pytest.mark.parametrize('ratio', [0.5, 0.8, 0.95, 1.0, 1.05, 1.25, 2.0])
+def test_points_tell_the_focal_length_also_where_few_agree_with_the_given_one(ratio):
+    rng = np.random.default_rng(12)
+    _, points, bearings = look(rng, 400, noise_px=1.0)
+    bearings[::4] = rng.permutation(bearings[::4])
+    start = invert_transform(find_pose(points, bearings * ratio).map_from_camera)
+    found, deviation, inliers = free_focal(points, bearings * ratio, start)
+    assert abs(np.log(found / ratio)) < 2.0 * deviation < 0.03
+    assert len(inliers) > 250
+
+
+def test_a_plane_that_fills_little_of_the_image_tells_no_focal_length():
+    rng = np.random.default_rng(13)
+    bearings = rng.uniform(-0.1, 0.1, (100, 2))
+    points = 2.0 * np.column_stack([bearings, np.ones(100)])
+    bearings += rng.normal(0.0, 1.0 / CAMERA.fx, bearings.shape)
+    found = free_focal(points, bearings, np.eye(4))
+    assert found is None or found[1] > 0.5
 
 
 def test_few_points_and_points_that_agree_on_nothing_give_no_pose():

@@ -15,7 +15,12 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
+from cliploc_ros.core.keyframes.point_pose import (
+    LEAST_INLIERS,
+    agreeing,
+    find_pose,
+    free_focal,
+)
 from cliploc_ros.core.search.prior import Prior
 
 # Most features of a query, and its longest side. At the size of keyframes, features take twice the
@@ -66,6 +71,12 @@ class RecognizedPlace(NamedTuple):
     cells : tuple of int
         Number of cells that confirm, and of those that are comparable: the keyframes expect points
         there, and the image has features.
+    focal_ratio, focal_deviation : float
+        The focal length that the points suggest as a multiple of the camera's, and its relative
+        standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
+        wrong intrinsics, and a picture of the place of another size, suggest another one.
+    focal_inliers : int
+        Number of features that agree under that focal length.
     tilt_error : float
         Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
         place: the vertical may be wrong, as with a wrong camera mount.
@@ -83,6 +94,9 @@ class RecognizedPlace(NamedTuple):
     confirmed: float
     expected: float
     cells: tuple[int, int] = (0, 0)
+    focal_ratio: float = 1.0
+    focal_deviation: float = np.inf
+    focal_inliers: int = 0
     tilt_error: float = 0.0
     keyframes: tuple[int, ...] = ()
     pixels: NDArray[np.float64] = np.empty((0, 2))
@@ -142,10 +156,11 @@ class _Look(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A pose, the matches that agree, the number of their features, and that in each cell."""
+    """A pose, the matches it was found among and those that agree, their features and cells."""
 
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    among: _Matched
     inliers: _Matched
     agreed: int
     cells: NDArray[np.int64]
@@ -222,8 +237,8 @@ class KeyframeLocalizer:
         covariance = place.covariance + self._shared(place.map_from_camera, counts)
         return RecognizedPlace(
             place.map_from_camera, covariance, place.agreed, *self._confirmed(place, look, used),
-            look.prior.tilt_error(place.map_from_camera, covariance), tuple(used.tolist()),
-            look.features.pixels[place.inliers.features], place.inliers.rows)
+            *_focal(place, look, used), look.prior.tilt_error(place.map_from_camera, covariance),
+            tuple(used.tolist()), look.features.pixels[place.inliers.features], place.inliers.rows)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""
@@ -326,8 +341,18 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Pl
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
-    return _Place(found.map_from_camera, found.covariance, inliers, len(features),
+    return _Place(found.map_from_camera, found.covariance, matched, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
+
+
+def _focal(place: _Place, look: _Look, used: NDArray[np.int64]) -> tuple[float, float, int]:
+    """Return the ratio of focal lengths, its deviation, and how many features agree with it."""
+    among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
+    found = free_focal(among.points, look.bearings[among.features],
+                       invert_transform(place.map_from_camera))
+    if found is None:
+        return 1.0, np.inf, 0
+    return *found[:2], len(np.unique(among.features[found[2]]))
 
 
 def _select(features: Features, rows: NDArray[np.bool_]) -> Features:
