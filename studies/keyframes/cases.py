@@ -275,15 +275,14 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     """
     other = others[int(rng.integers(len(others)))]
     strange = other.asked[int(rng.integers(len(other.asked)))]
-    source, source_camera = _elsewhere(place, frame, rng).color()
+    source = _elsewhere(place, frame, rng)
     if case.is_strange:
         place, frame = other, strange
     frames = [frame, *_second_look(frame, place.seconds)][:case.looks]
     if len(frames) < case.looks:
         return None
     poses = [pose_of(one) for one in frames]
-    picture = case.picture and make_picture(*case.picture, frame.color()[1], source,
-                                            source_camera, rng)
+    picture = case.picture and make_picture(*case.picture, frame.color()[1], *source.color(), rng)
     shots: list[tuple[Image, Camera, Floats | None]] = []
     for one, pose, odom in zip(frames, poses, _odometry(poses, rng), strict=True):
         image, camera = one.color()

@@ -129,22 +129,25 @@ class Looker:
     def __init__(self, folder: Path, model: str) -> None:
         self._folder, self._model = folder, model
         self._detector: YoloDetector | None = None
-        code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
-        self._name = f'{Path(model).stem}.{code}'
-
-    def look(self, image_rgb: Image) -> tuple[Detections, Features]:
-        """Return the boxes in an image, and its features."""
-        digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
-        path = self._folder / digest[:2] / f'{digest}.{self._name}.pickle'
-        if not path.exists():
-            self._detector = self._detector or YoloDetector(YoloOptions(self._model, conf=0.25))
-            _keep(path, (vars(self._detector.detect(image_rgb)), vars(query_features(image_rgb))))
-        boxes, local = pickle.loads(path.read_bytes())
-        return Detections(**boxes), Features(**local)
+        self._code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
 
     def detect(self, image_rgb: Image) -> Detections:
         """Return the boxes in an image, as an ObjectDetector does."""
-        return self.look(image_rgb)[0]
+        def find() -> Detections:
+            self._detector = self._detector or YoloDetector(YoloOptions(self._model, conf=0.25))
+            return self._detector.detect(image_rgb)
+        return Detections(*self._kept(image_rgb, Path(self._model).stem, find))
+
+    def features(self, image_rgb: Image) -> Features:
+        """Return the features of an image."""
+        return Features(*self._kept(image_rgb, self._code, lambda: query_features(image_rgb)))
+
+    def _kept(self, image_rgb: Image, what: str, find: Callable[[], Any]) -> tuple[Any, ...]:
+        digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
+        path = self._folder / digest[:2] / f'{digest}.{what}.pickle'
+        if not path.exists():
+            _keep(path, tuple(vars(find()).values()))
+        return tuple(pickle.loads(path.read_bytes()))
 
 
 def make_collect(out: Path, places: Sequence[Place], queries: int
@@ -218,8 +221,7 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
     options = RelocalizerOptions(matching='class', height_range_m=query.height_range_m)
     relocalizer, looks = Relocalizer(landmark_map, options), list[Seen]()
     for second, (image, camera, odom) in enumerate(query.shots):
-        boxes, local = looker.look(image)
-        boxes = boxes.usable(camera.width, camera.height, MAX_DETECTIONS)
+        boxes = looker.detect(image).usable(camera.width, camera.height, MAX_DETECTIONS)
         if case.draws_classes:
             drawn = rng.choice(landmark_map.class_ids, len(boxes)).tolist()
             boxes = replace(boxes, class_ids=tuple(drawn))
@@ -227,7 +229,8 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
             camera, boxes, stamp_ns=second * 1_000_000_000, up_in_camera=query.up_in_camera,
             odom_from_camera=odom))
         recognizer = ImageRecognizer(localizer, Features(
-            *(column[:case.features] for column in vars(local).values())), camera)
+            *(column[:case.features] for column in vars(looker.features(image)).values())),
+            camera)
         found = relocalizer.locate([*(one.searched for one in looks), searched],
                                    recognizer=recognizer)
         looks.append(Seen(searched, found.recognition or Recognition()))
