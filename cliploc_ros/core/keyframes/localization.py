@@ -49,6 +49,8 @@ NOTHING_KNOWN = Prior()
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
+# Of what lies across an image, the part that counts: a few wrong matches lie anywhere [%].
+_MOST = (5.0, 95.0)
 # Errors that all points of a keyframe share: of its pose, and of its points, which matter the
 # more the further the image is from the keyframe. Chosen on the kitchen, see the study.
 _KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.45), 0.04
@@ -68,6 +70,10 @@ class RecognizedPlace(NamedTuple):
         Share of the comparable cells of the image that show what the keyframes have there.
     expected : float
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    extent : float
+        How far the inliers reach across the image, as a share of what is comparable: 0 to 1, in
+        width or in height, whichever is more. Those in a picture of the place end with it, those
+        beside something that covers the place do not.
     cells : tuple of int
         Number of cells that confirm, and of those that are comparable: the keyframes expect points
         there, and the image has features.
@@ -93,6 +99,7 @@ class RecognizedPlace(NamedTuple):
     inliers: int
     confirmed: float
     expected: float
+    extent: float = 1.0
     cells: tuple[int, int] = (0, 0)
     focal_ratio: float = 1.0
     focal_deviation: float = np.inf
@@ -278,21 +285,27 @@ class KeyframeLocalizer:
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float, tuple[int, int]]:
-        """Return which cells have inliers, of those where keyframes expect some.
+                   ) -> tuple[float, float, float, tuple[int, int]]:
+        """Return which part of the image has inliers, of that where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The values are
-        the share, the one that is expected of so many inliers, whose density varies much from
-        cell to cell (a geometric distribution), and the numbers of cells.
+        the share of cells, the one that is expected of so many inliers, whose density varies much
+        from cell to cell (a geometric distribution), the extent, and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_IN_CELL) & self._expects(used, place.map_from_camera,
                                                               look.camera)
         count = int(comparable.sum())
         if not count:
-            return 0.0, 0.0, (0, 0)
+            return 0.0, 0.0, 0.0, (0, 0)
         confirmed = int(np.count_nonzero(place.cells[comparable]))
-        return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
+        pixels = look.features.pixels
+        reached = np.ptp(np.percentile(pixels[place.inliers.features], _MOST, axis=0), axis=0)
+        there = pixels[comparable[_cells_of(pixels, look.camera)]]
+        extent = float(np.max(reached / np.maximum(
+            np.ptp(np.percentile(there, _MOST, axis=0), axis=0), 1.0)))
+        return (confirmed / count, place.agreed / (count + place.agreed), min(1.0, extent),
+                (confirmed, count))
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
@@ -386,9 +399,14 @@ def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Cam
 
 def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
     """Return how many pixels (m, 2) lie in each cell of the image."""
-    columns, rows = _CELLS
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    place = (pixels[inside] * (columns / camera.width, rows / camera.height)).astype(np.int64)
-    place = np.minimum(place, (columns - 1, rows - 1))
-    return np.bincount(place[:, 1] * columns + place[:, 0], minlength=columns * rows)
+    return np.bincount(_cells_of(pixels[inside], camera), minlength=_CELLS[0] * _CELLS[1])
+
+
+def _cells_of(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
+    """Return the number of the cell of each pixel (m, 2) in the image."""
+    last = np.array(_CELLS) - 1
+    place = (pixels * np.array(_CELLS) / (camera.width, camera.height)).astype(np.int64)
+    columns, rows = np.clip(place, 0, last).T
+    return np.asarray(rows * _CELLS[0] + columns)
