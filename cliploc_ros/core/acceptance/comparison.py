@@ -27,6 +27,7 @@ from cliploc_ros.core.acceptance.confidence import (
     chance_genuine,
     confidences,
     none_right,
+    objects_utility,
     points_utility,
 )
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
@@ -128,21 +129,32 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
         seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]],
                                     prior_of(joined.frames[-1].observation, joined.options))
         candidates = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
-                      for one in candidates] + _proposed(joined, seen)
+                      for one in candidates]
+        candidates += _proposed(joined, seen, candidates)
         candidates.sort(key=lambda one: (not one.is_upright, -one.odds))
     poses = np.array([one.pose for one in candidates]).reshape(-1, 4, 4)
     return Comparison(candidates, poses, confidences(
         np.array([one.odds for one in candidates]), poses, none_right(joined.setting)), seen)
 
 
-def _proposed(joined: JoinedFrames, seen: Recognition) -> list[Candidate]:
-    """Return the places that keyframes recognize, as candidates, with their odds by points."""
+def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Candidate]
+              ) -> list[Candidate]:
+    """Return the places that keyframes recognize, as candidates.
+
+    Points add to the odds of the pose that the search of objects met there, if there is one. They
+    never take any: a dozen points agree by chance.
+    """
     none, most = none_right(joined.setting), CALIBRATION.attitude.vertical_sigmas
-    return [one._replace(recognized=place, odds=none - one.handicap
-                         + points_utility(place, one.support))
-            for one, place in zip(candidates_of(
-                joined, [unrefined(one.map_from_camera) for one in seen.places],
-                [one.tilt_error <= most for one in seen.places]), seen.places, strict=True)]
+    found = candidates_of(joined, [unrefined(one.map_from_camera) for one in seen.places],
+                          [one.tilt_error <= most for one in seen.places])
+    proposed = []
+    for one, place in zip(found, seen.places, strict=True):
+        points = points_utility(place)
+        alone = none + points + objects_utility(one.support) - one.handicap
+        there = [other.odds for other in met if SAME_ANSWER.agree(one.pose, other.pose)]
+        proposed.append(one._replace(recognized=place, alone=alone, odds=max(
+            [alone, *(odds + max(0.0, points) for odds in there)])))
+    return proposed
 
 
 def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecognizer) -> float:
@@ -251,8 +263,9 @@ def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
     rows = [row for row, (one, near) in enumerate(zip(compared.candidates, compared.leading,
                                                       strict=True))
             if one.recognized is not None or not near]
-    found = confidences(np.array([compared.candidates[row].odds for row in rows]),
-                        compared.poses[rows], none_right(joined.setting))
+    odds = [one.alone if near else one.odds for one, near in zip(
+        compared.candidates, compared.leading, strict=True)]
+    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
     return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
 
 
@@ -291,9 +304,9 @@ def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
     if recognizer is None or leading is None or leading.recognized is None:
         return np.zeros(len(twins))
     covered = np.array([recognizer.coverage(pose) for pose in [leading.pose, *twins]])
-    own = max(0.0, points_utility(leading.recognized, leading.support))
+    own = max(0.0, points_utility(leading.recognized))
     theirs = np.array([max([0.0] + [
-        points_utility(one.recognized, one.support) for one in compared.candidates
+        points_utility(one.recognized) for one in compared.candidates
         if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)]) for pose in twins])
     return np.maximum(0.0, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)) * own - theirs)
 

@@ -8,8 +8,10 @@ right: the more landmarks the map has, the more wrong poses fit by chance; a kno
 fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of an
 ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
 
-The search of objects chooses its poses by the support of their objects. Keyframes propose theirs
-by points, so their utility counts from that of none being right, whatever the size of the map.
+The search of objects chooses its poses among many by their support. Keyframes propose theirs by
+points: what the objects say of such a pose counts from the utility of none being right, whatever
+the size of the map. Points and objects that lead to one place add up theirs: by chance, features
+and boxes do so independently. Where they see one picture, see chance_genuine.
 """
 
 import math
@@ -105,20 +107,17 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
             + terms.vertical * setting.vertical)
 
 
-def points_utility(place: RecognizedPlace, support: Support,
-                   calibration: Calibration = CALIBRATION) -> float:
-    """Return the utility of a pose by keyframes, above that of none being right.
-
-    Parameters
-    ----------
-    place : RecognizedPlace
-    support : Support
-        By objects, of the same pose.
-    """
+def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+    """Return what the points of a place say for it: log odds, against a place by chance."""
     terms = calibration.keyframes
     return (terms.none + terms.inliers * math.log(max(1, place.inliers))
-            + terms.confirmed * place.confirmed
-            + terms.explained * min(terms.most_objects, support.inliers)
+            + terms.confirmed * place.confirmed)
+
+
+def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
+    """Return what objects say of a pose that keyframes propose: log odds, against none."""
+    terms = calibration.keyframes
+    return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))
 
 
