@@ -213,8 +213,10 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
 @pytest.mark.parametrize(('evidence', 'options', 'reason'), [
     (Evidence(3, 0.995), {'min_inliers': 4}, '3 objects matched < 4; turn the camera'),
     (Evidence(3, 0.995), {}, ''),
-    (Evidence(5, 0.5, rival=Rival(0.3, ORIGIN)), {}, 'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
-    (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {}, 'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
+    (Evidence(5, 0.5, rival=Rival(0.3, ORIGIN)), {},
+     'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
+    (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {},
+     'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
     (Evidence(5, 0.5, unexplained=4.0), {},
      'confidence 0.50 < 0.99; 5 objects matched, 4 unexplained; turn the camera to more objects'),
     (Evidence(5, 0.1, rival=Rival(0.3, ORIGIN)), {}, 'confidence 0.10 < 0.99; ambiguous'),

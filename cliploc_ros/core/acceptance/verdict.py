@@ -188,18 +188,21 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     confidence, needed = evidence.confidence, _needed(evidence, options)
     if confidence >= needed:
         return None
-    digits = 4 if confidence >= options.min_confidence else 2
-    compared = f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}g}'
     if confidence >= options.min_confidence:
-        return Refusal(RefusalKind.NOT_ALL_CROPS, f'{compared}, which it takes while '
-                       f'{evidence.crops_left} crops are not compared; raise timeout_s')
+        digits = 1 + math.ceil(-math.log10(1.0 - needed))
+        return Refusal(RefusalKind.NOT_ALL_CROPS,
+                       f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}f}, as '
+                       f'it takes without {evidence.crops_left} crops; raise timeout_s')
+    compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
     likely = max(evidence.likely, evidence.by_points)
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
                    'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
                    'found': found}.items(),
                   key=lambda item: item[1])[0]
-    if weakest == 'distinct' and evidence.twin is not None:
+    # the twin may be among the rivals, too
+    if evidence.twin is not None and evidence.distinct < options.min_confidence and (
+            weakest == 'distinct' or weakest == 'likely' and _is_ambiguous(evidence)):
         second = evidence.twin_map and f' (the second in {evidence.twin_map})'
         return Refusal(RefusalKind.LOOK_ALIKE,
                        f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look '
@@ -212,9 +215,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
         return Refusal(RefusalKind.CHANGED, f'{compared}{_points(evidence)}; is it a picture, or '
                                             'has the place changed? move, and ask again')
     if weakest == 'mirror':
-        return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; as a mirror image, the image fits '
-                                              'another pose as well; turn the camera away from '
-                                              'mirrors, to more objects')
+        return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
+                                              'pose; turn the camera to more objects')
     if weakest == 'found':
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '
@@ -225,8 +227,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
 def _unsure(evidence: Evidence, compared: str) -> Refusal:
     """Return the refusal of a pose that others rival, or that too little supports."""
     rival = evidence.rival
-    if rival is None or rival.likely <= max(_LEAST_RIVAL, min(0.9 * evidence.likely,
-                                                              0.5 * (1.0 - evidence.likely))):
+    if rival is None or not _is_ambiguous(evidence):
         return Refusal(RefusalKind.UNEXPLAINED,
                        f'{compared}; {evidence.inliers} objects matched, '
                        f'{round(evidence.unexplained)} unexplained{_points(evidence)}; '
@@ -240,6 +241,12 @@ def _unsure(evidence: Evidence, compared: str) -> Refusal:
     return Refusal(RefusalKind.AMBIGUOUS,
                    f'{compared}; ambiguous, another pose has {rival.likely:.2g}{where}; '
                    'turn the camera to objects that differ')
+
+
+def _is_ambiguous(evidence: Evidence) -> bool:
+    """Return whether a rival has most of the missing probability, or nearly that of the pose."""
+    return evidence.rival is not None and evidence.rival.likely > max(
+        _LEAST_RIVAL, min(0.9 * evidence.likely, 0.5 * (1.0 - evidence.likely)))
 
 
 def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:

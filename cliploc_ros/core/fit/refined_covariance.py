@@ -92,8 +92,8 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None
-                       ) -> NDArray[np.float64]:
+                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
+                       wrong_share: float = _WRONG_SHARE) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose that was refined on its inliers.
 
     Parameters
@@ -106,6 +106,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Time of each frame, in which odometry joins them.
     shared : ndarray (L, 2), optional
         By how much each landmark and its neighbours are displaced and turned together [m] [rad].
+    wrong_share : float
+        Probability that an object is not where its match says.
     """
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
@@ -124,7 +126,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         information, _shared_noise(of_objects, shared[fit.numbers]))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return np.asarray(matched + of_map + _WRONG_SHARE * _change_without_each(
+    return np.asarray(matched + of_map + wrong_share * _change_without_each(
         information - of_objects, noise - noise_of_objects, gradients, matched))
 
 
