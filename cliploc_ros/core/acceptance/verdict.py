@@ -202,7 +202,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
                   key=lambda item: item[1])[0]
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
-            weakest == 'distinct' or weakest == 'likely' and _is_ambiguous(evidence)):
+            weakest == 'distinct' or (weakest == 'likely' and _is_ambiguous(evidence))):
         second = evidence.twin_map and f' (the second in {evidence.twin_map})'
         return Refusal(RefusalKind.LOOK_ALIKE,
                        f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look '
