@@ -36,8 +36,8 @@ def by_objects(x, confidence, accepted):
 
 
 def by_keyframes(x, inliers=200, rival=0, confirmed=0.8, rival_x=20.0):
-    places = (RecognizedPlace(at(x), FINE, inliers, confirmed, 0.85),
-              RecognizedPlace(at(rival_x), FINE, rival, confirmed, 0.85))
+    places = (RecognizedPlace(at(x), FINE, FINE, inliers, confirmed, 0.85),
+              RecognizedPlace(at(rival_x), FINE, FINE, rival, confirmed, 0.85))
     return Recognition(places[:2 if rival else 1])
 
 

@@ -278,7 +278,7 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     def join(found, metres):
         seen = RecognizedPlace(make_transform(MAP_FROM_CAMERA[:3, :3], MAP_FROM_CAMERA[:3, 3]
                                          + np.array([metres, 0.0, 0.0])),
-                               fine, 200, 0.8, 0.85)
+                               fine, fine, 200, 0.8, 0.85)
         return combine(found, Recognition((seen,)), ObjectsThere(len(ROOM), 0),
                        RELOCALIZER.options)
 
