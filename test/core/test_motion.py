@@ -34,7 +34,7 @@ def driven(x=0.0, z=0.0):
     return make_transform(np.eye(3), np.array([x, 0.0, z]))
 
 
-MOTIONS = {'side': driven(x=0.2), 'oblique': driven(0.15, 0.15), 'forward': driven(z=1.0),
+MOTIONS = {'side': driven(x=0.2), 'oblique': driven(0.15, 0.15),
            'turn': turned(10.0, 0.5), 'back and turn': driven(-0.2, -0.1) @ turned(10.0)}
 
 
@@ -104,6 +104,15 @@ def test_where_a_picture_moves_like_the_room_nothing_is_claimed(room, motion):
         found = compare_motion(LAYER, first, look(points, second, rng), motion)
         assert found.picture < chi2.isf(0.05, 6)
         assert found.square < SURE
+
+
+def test_a_picture_that_the_camera_passes_is_not_seen_again(room):
+    pose, points = room
+    rng, motion = np.random.default_rng(5), driven(z=5.0)
+    first = look(points, seen_from(points, pose), rng)
+    found = compare_motion(LAYER, first, first._replace(map_from_camera=pose @ motion), motion)
+    assert found.picture == np.inf
+    assert found.square < SURE
 
 
 def test_what_looks_at_the_same_keyframes_share_does_not_count(room):

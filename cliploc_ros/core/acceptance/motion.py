@@ -16,10 +16,12 @@ from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import PER_RADIAN, RecognizedPlace
-from cliploc_ros.core.keyframes.point_pose import find_pose
+from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
 
 # Distances of pictures from the first camera [m], and how many points are tried on them.
 _PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
+# A camera sees what is further ahead than this [m].
+_AHEAD_M = 0.1
 
 
 class Motion(NamedTuple):
@@ -57,11 +59,9 @@ def compare_motion(layer: KeyframeLayer, first: RecognizedPlace, second: Recogni
     def square(pose: NDArray[np.float64]) -> float:
         step = pose_difference(expected, pose)
         return float(step @ information @ step)
-    points = first.points[::1 + len(first.points) // _MOST_POINTS]
+    pictures = [_on_picture(first, first_from_second, away_m) for away_m in _PICTURES_M]
     return Motion(square(second.map_from_camera), min(
-        np.inf if moved is None else square(moved.map_from_camera) for moved in (
-            find_pose(points, _as_picture(points, first.map_from_camera, first_from_second, away))
-            for away in _PICTURES_M)))
+        np.inf if one is None else square(one.map_from_camera) for one in pictures))
 
 
 def _covariance(layer: KeyframeLayer, first: RecognizedPlace, second: RecognizedPlace,
@@ -81,10 +81,12 @@ def _covariance(layer: KeyframeLayer, first: RecognizedPlace, second: Recognized
         odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2)
 
 
-def _as_picture(points: NDArray[np.float64], map_from_camera: NDArray[np.float64],
-                first_from_second: NDArray[np.float64], away_m: float) -> NDArray[np.float64]:
-    """Return where (n, 2) a second image shows points of a picture that faces the first camera."""
-    inside = (points - map_from_camera[:3, 3]) @ map_from_camera[:3, :3]
+def _on_picture(first: RecognizedPlace, first_from_second: NDArray[np.float64], away_m: float
+                ) -> PointPose | None:
+    """Return where the second image is recognized if both show a picture that faced the first."""
+    points = first.points[::1 + len(first.points) // _MOST_POINTS]
+    inside = (points - first.map_from_camera[:3, 3]) @ first.map_from_camera[:3, :3]
     shown = away_m * inside / inside[:, 2:]
     moved = (shown - first_from_second[:3, 3]) @ first_from_second[:3, :3]
-    return np.asarray(moved[:, :2] / moved[:, 2:])
+    ahead = moved[:, 2] > _AHEAD_M
+    return find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
