@@ -473,6 +473,8 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
     assert is_taken(given, shown) == is_taken_over
+    shown.pose.pose.orientation.y = 1e200
+    assert not is_taken(given, shown)
 
 
 def test_a_hand_over_ends_with_the_node(robot):

@@ -256,16 +256,14 @@ class HandOff:
 
         AMCL would move the pose on by tf, robot_localization's set_pose does not.
         """
-        patience_s = min(_ODOM_PATIENCE_S, _left_s(deadline)) if self._odometry.is_published \
-            else 0.0
-        moved = self._odometry.moved_since(stamp, patience_s)
-        if moved is None:
-            if self._odometry.is_published:
-                raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has '
-                                   'moved since its image: stamp both by one clock, send at 1 Hz '
-                                   'or more; ask again')
-            return
-        distance_m, angle_deg = moved
+        is_published = self._odometry.is_published
+        moved = self._odometry.moved_since(
+            stamp, min(_ODOM_PATIENCE_S, _left_s(deadline)) if is_published else 0.0)
+        if moved is None and is_published:
+            raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has moved '
+                               'since its image: stamp both by one clock, send at 1 Hz or more; '
+                               'ask again')
+        distance_m, angle_deg = moved or (0.0, 0.0)
         if distance_m > SAME_SPOT.distance_m or angle_deg > SAME_SPOT.angle_deg:
             raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
                                f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
@@ -319,7 +317,7 @@ def tolerance_of(given: PoseWithCovarianceStamped) -> Tolerance:
 def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
     """Return x, y and yaw of a pose as a transform (4, 4), which is all that AMCL takes of it."""
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
-    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     planar = np.eye(4)
     planar[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
     planar[:2, 3] = p.x, p.y
