@@ -73,7 +73,7 @@ class RelocalizerNode(ManagedNode):
 
     def open(self) -> None:
         """Accept requests; in continuous mode subscribe to frames."""
-        self._handoff.open()
+        self._handoff.open(self.settings['localizer_pose'])
         self._robot.open()
         self._pipeline.open()
         self._frames.open()
@@ -85,7 +85,7 @@ class RelocalizerNode(ManagedNode):
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
-        self._handoff.stop()
+        self._handoff.close()
         self._frames.close('the node was deactivated')
         self._pipeline.close()
         self._robot.close()

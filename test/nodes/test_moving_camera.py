@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for."""
 
+import re
 import time
 from itertools import count
 
@@ -101,6 +102,19 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     tester.destroy_subscription(subscription)
 
 
+def test_an_odom_frame_that_nobody_knows_withholds_the_pose(own_relocalizer, tester, lift):
+    """Nothing could be broadcast."""
+    own_relocalizer(expect='', base_frame='base_link', publish_tf=True, odom_frame='odomm',
+                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]', tf_timeout_s=0.1)
+    lift({100.0: 1.0})
+    answer = tester.relocalize(make_frame())
+    assert not answer.success
+    assert re.match(r"withheld: publish_tf: no transform from 'odomm' to 'base_link': .*; publish "
+                    r'it, or correct odom_frame \(accepted: x ', answer.message), answer.message
+    tester.wait(lambda: tester.poses, 'the pose itself')
+    assert not tester.initial_poses
+
+
 def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
     """With frames kept apart as well, and without a clock that jumps."""
     process = own_relocalizer(expect='', base_frame='base_link', publish_tf=True, fuse_frames=1,
@@ -111,6 +125,7 @@ def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
         one for one in msg.transforms if one.header.frame_id == 'map'), 100)
     wheels, odometry = tester.create_publisher(Odometry, 'odom', 10), Odometry()
     odometry.header.frame_id, odometry.child_frame_id = 'odom', 'base_link'
+    tester.wait(wheels.get_subscription_count, 'odometry to be heard')
 
     def accept(at_s):
         frame = make_frame(stamp_s=at_s)
@@ -120,7 +135,8 @@ def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
 
         def answered():
             publisher.publish(TFMessage(transforms=[standing]))
-            odometry.header.stamp = make_frame(stamp_s=at_s + 0.1 * next(ticks))[0].header.stamp
+            odometry.header.stamp = make_frame(
+                stamp_s=at_s - 0.5 + 0.1 * next(ticks))[0].header.stamp
             wheels.publish(odometry)
             return future.done()
         tester.feed_until(answered, frame)
