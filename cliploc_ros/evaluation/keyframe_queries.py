@@ -14,7 +14,6 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from cliploc_ros.core.combination import Image
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.evaluation.trials import Query
@@ -44,11 +43,7 @@ def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]
         features = query_features(frame.image_rgb)
         spent_ms = 1e3 * (time.perf_counter() - begin)
         # boxes of a recording are undistorted, features are not
-        observation = replace(queries[row].observation, camera=_pinhole(frame.camera))
+        observation = replace(queries[row].observation, camera=frame.camera.pinhole)
         found[row] = replace(queries[row], image=Image(features, frame.camera, observation),
                              features_ms=spent_ms)
     return tuple(found)
-
-
-def _pinhole(camera: Camera) -> Camera:
-    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

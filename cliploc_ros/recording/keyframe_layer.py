@@ -24,7 +24,7 @@ from cliploc_ros.core.keyframes.layer import (
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import depths_of_points
-from cliploc_ros.datasets.frames import Frame, Frames
+from cliploc_ros.datasets.frames import Frame, Frames, undistorted
 from cliploc_ros.errors import MappingError, OptionsError
 
 # Features that are found in an image, before those without a point are left out.
@@ -94,7 +94,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     """
     camera, seen = None, []
     for frame in _chosen(frames, options):
-        camera = camera or _pinhole(frame.camera)
+        camera = camera or frame.camera.pinhole
         seen.append(_look(frame, options))
     images = [one.posed for one in seen]
     points = [_points(images, row, one.depths)
@@ -129,11 +129,6 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
         yield raw.decode()
 
 
-def _pinhole(camera: Camera) -> Camera:
-    """Return the camera of the undistorted images."""
-    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-
-
 def _look(frame: Frame, options: LayerOptions) -> _Seen:
     """Return the features of an image; with depth, only those that have some."""
     assert frame.map_from_camera is not None
@@ -155,14 +150,8 @@ def _small_jpeg(frame: Frame) -> bytes:
     camera = frame.camera
     scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-    scales = np.array([width / camera.width, height / camera.height])
-    image = cv2.resize(frame.image_rgb, (width, height), interpolation=cv2.INTER_AREA)
-    if any(camera.distortion):
-        columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-        pixels = (np.column_stack([columns.ravel(), rows.ravel()]) + 0.5) / scales - 0.5
-        seen = camera.project_normalized(_pinhole(camera).normalize_points(pixels))
-        maps = ((seen + 0.5) * scales - 0.5).reshape(height, width, 2).astype(np.float32)
-        image = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+    image = cv2.resize(undistorted(frame.image_rgb, camera), (width, height),
+                       interpolation=cv2.INTER_AREA)
     _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
                               [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(content)
