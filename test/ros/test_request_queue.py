@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests in a real node with a real frame source; the localizer is the test's own function."""
 
+import array
 import logging
+import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -147,6 +149,37 @@ def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, cl
     assert request.result().verdict is Verdict.REFUSED
     assert 'time is up: waiting for' in request.result().message
     assert took_s < 1.0
+
+
+def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
+    """Ten of them fit into memory; the boxes of the first one come after twelve, or never."""
+    infos, boxes, images = camera.publishers
+    data = array.array('B', bytes(3840 * 2160 * 3))
+
+    def take(number):
+        """Publish an image, and wait until the node has it."""
+        header = Header(stamp=Time(sec=number))
+        before = node.frames._pairing.received['image']
+        infos.publish(CameraInfo(header=header))
+        images.publish(Image(header=header, height=2160, width=3840, step=3840 * 3,
+                             encoding='rgb8', data=data))
+        wait(lambda: node.frames._pairing.received['image'] > before, 'the image')
+
+    request = clients.submit(node.requests.answer)
+    wait(lambda: all(one.get_subscription_count() for one in camera.publishers), 'the node')
+    for number in range(1, 13):
+        take(number)
+    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
+    wait(request.done, 'the answer')
+    assert request.result().message == 'refused: nothing known'
+    node.settings._values = node.settings._values | {'timeout_s': 3.0}
+    request = clients.submit(node.requests.answer)
+    for number in range(13, 27):
+        take(number)
+    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=15))))
+    wait(request.done, 'the answer')
+    assert re.search('no fresh frame within 3 s: detections come 12 images late, and memory '
+                     'holds 256 MiB of images: use smaller images', request.result().message)
 
 
 def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
