@@ -48,8 +48,8 @@ class RelocalizerNode(ManagedNode):
                                    self._newest.offer if continuous else lambda frame: None,
                                    self.settings['detections_type'])
         self._handoff = HandOff(self, self._robot.odometry)
-        self._requests = Requests(self, self._frames, self._robot, self._jumps,
-                                  self._localize_and_keep, self._handoff)
+        self._requests = Requests(self, self._frames, self._robot, self._localize_and_keep,
+                                  self._handoff)
         self._cases = CaseRecorder(bool(self.settings['record_folder']))
         self._counters = RequestCounters()
         self._last_verdict = 'none yet'

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
@@ -21,7 +22,6 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
@@ -38,7 +38,7 @@ class Answering(ManagedNode):
                                              received_at=frame.received_at)
         self.robot = RobotStateSource(self)
         self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
-        self.requests = Requests(self, self.frames, self.robot, TimeJumps(self, lambda: None),
+        self.requests = Requests(self, self.frames, self.robot,
                                  lambda frame, times, deadline: self.localize(frame),
                                  HandOff(self, self.robot.odometry))
 
@@ -189,6 +189,38 @@ def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     wait(lambda: all(request.done() for request in requests), 'the answers')
     assert time.monotonic() - start < 0.9, 'they wait side by side'
     assert all('nobody publishes /image' in request.result().message for request in requests)
+
+
+class LateTransforms:
+    """In the place of tf2's buffer: it knows the images that are old enough."""
+
+    def __init__(self, late_s):
+        self.late_s, self.asked_at = late_s, {}
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        first = self.asked_at.setdefault(stamp.nanoseconds, time.monotonic())
+        if time.monotonic() < first + self.late_s:
+            raise LookupError('extrapolation into the future')
+        return TransformStamped()
+
+
+@pytest.mark.parametrize('late_s', [1.2, 60.0])
+def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
+    values = {'base_frame': 'base_link', 'timeout_s': 4.0, 'tf_timeout_s': 0.0}
+    node.settings._values = node.settings._values | values
+    node.robot.transforms._buffer = LateTransforms(late_s)
+    node.localize = lambda frame: Answer(
+        Verdict.REFUSED, 'seen', received_at=frame.received_at,
+        state=node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline))
+    begin = time.monotonic()
+    node.deadline = begin + 4.0
+    request = clients.submit(node.requests.answer)
+    shoot_until(camera, wait, request)
+    answer, took_s = request.result(), time.monotonic() - begin
+    if late_s < 4.0:
+        assert answer.message.startswith('refused: seen') and 1.2 < took_s < 4.0
+    else:
+        assert "no transform from 'base_link' to" in answer.message and 3.0 < took_s < 4.3
 
 
 def test_an_answer_keeps_to_the_time_out_while_the_map_loads(node, clients, wait):
