@@ -9,9 +9,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import extract, unit_rows
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
@@ -114,16 +114,22 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
     """Yield the images whose view no earlier one of them has, decoded."""
-    poses: list[NDArray[np.float64]] = []
+    size = options.distance_m or 1.0  # of the cells that poses lie in; no pose is nearer than 0
+    cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
 
     def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
         if pose is None:
             return False
-        for other in reversed(poses):
-            distance, angle = pose_error(pose, other)
-            if distance < options.distance_m and angle < options.angle_deg:
-                return False
-        poses.append(pose)
+        cell = np.floor(pose[:3, 3] / size).astype(np.int64)
+        near = np.array([other for step in np.ndindex(3, 3, 3)
+                         for other in cells.get(tuple((cell + step - 1).tolist()), ())]
+                        ).reshape(-1, 4, 4)
+        near = near[np.linalg.norm(near[:, :3, 3] - pose[:3, 3], axis=1) < options.distance_m]
+        turns = pose[:3, :3].T @ near[:, :3, :3]
+        if len(near) and (np.degrees(Rotation.from_matrix(turns).magnitude())
+                          < options.angle_deg).any():
+            return False
+        cells.setdefault(tuple(cell.tolist()), []).append(pose)
         return True
     for raw in frames.read_raw(is_new):
         yield raw.decode()
