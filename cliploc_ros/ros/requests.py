@@ -29,10 +29,11 @@ _GRACE_S = 0.2
 
 _SMALLER = 'choose a faster profile or a smaller'
 # Of each stage its name in a message, and what makes it faster.
-_STAGES = {'image': 'waiting for an image', 'detection': 'the detector',
+_STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
            'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
            'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
-_REMEDIES = {'image': "raise the camera's rate", 'detection': f'{_SMALLER} detector',
+_REMEDIES = {'image': 'raise the rate of the camera or of the detector',
+             'detection': f'{_SMALLER} detector',
              'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
              'search': 'lower iterations or time_budget_ms',
              'keyframes': "set keyframes_file to ''"}
@@ -120,7 +121,9 @@ class Requests:
             unlinked += not look.answer.is_linked
             is_up = look.answer.is_cut
         answer = look.answer
-        if is_up and answer.verdict is Verdict.REFUSED:
+        # more images of a place without objects are no remedy
+        if is_up and answer.verdict is Verdict.REFUSED and (
+                answer.is_cut or answer.kind is not RefusalKind.TOO_FEW_OBJECTS):
             answer = replace(answer, detail=f'{answer.detail}; {_time_is_up(stages_ms)}')
         if looks == 1:
             return answer

@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
@@ -18,10 +19,11 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import FrameSource
-from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
@@ -180,6 +182,25 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
     wait(request.done, 'the answer')
     assert re.search('no fresh frame within 3 s: detections come 12 images late, and memory '
                      'holds 256 MiB of images: use smaller images', request.result().message)
+
+
+@pytest.mark.parametrize(('kind', 'advice'), [
+    (RefusalKind.TOO_FEW_OBJECTS, 'turn the camera'),
+    (RefusalKind.AMBIGUOUS, 'turn the camera; time is up: waiting for an image with detections '
+     'took [0-9.]+ of [0-9.]+ s; raise the rate of the camera or of the detector, or raise '
+     'timeout_s')])
+def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clients, wait, kind,
+                                                             advice):
+    node.settings._values = node.settings._values | {'timeout_s': 0.6}
+    node.robot.is_linked_soon = lambda stamp, deadline: True
+    node.localize = lambda frame: Answer(
+        Verdict.REFUSED, 'turn the camera', received_at=frame.received_at, kind=kind,
+        state=RobotState(np.eye(4), place=object()),
+        stages_ms={'image': 200.0, 'search': 1.0})
+    request = clients.submit(node.requests.answer)
+    shoot_until(camera, wait, request)
+    assert re.fullmatch(rf'refused: {advice} \[\d+ frames in 0\.[567] s\]; kind {kind}',
+                        request.result().message)
 
 
 def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
