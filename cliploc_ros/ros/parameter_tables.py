@@ -172,7 +172,8 @@ RELOCALIZER = (
                  'pose; only where no other localizer does.',
                  read_only=True),
     ParameterRow('odom_frame', 'odom', 'Coordinate frame of odometry, for publish_tf.'),
-    ParameterRow('tf_timeout_s', 0.5, "Wait this long for a transform at the image's stamp.",
+    ParameterRow('tf_timeout_s', 0.5, "Wait this long for a transform at the image's stamp. A "
+                 "request waits for the camera's mount on base_frame until timeout_s.",
                  unit='s', low=0.0, high=60.0),
 )
 

@@ -103,7 +103,7 @@ class Pipeline:
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, values)
+        state = self._robot.at(image, values, deadline)
         localized = localizer.localize(frame, values, state, times, deadline)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)

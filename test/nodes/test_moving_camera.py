@@ -57,6 +57,20 @@ def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift)
     truth = MAP_FROM_CAMERA @ invert_transform(base_from_camera(1.5))
     for pose in (tester.poses[0], tester.initial_poses[0]):
         assert pose_error(transform_of(pose.pose.pose), truth) < (0.08, 1.0)
+    assert process.alive
+
+
+def test_a_request_waits_for_a_late_transform(own_relocalizer, tester, lift):
+    process = own_relocalizer(expect='', base_frame='base_link', timeout_s=6.0)
+    frame, begin = make_frame(stamp_s=100.5), time.monotonic()
+    future = tester.ask()
+
+    def answered():
+        late = time.monotonic() > begin + 2.0
+        lift({100.0: 1.0} | ({101.0: 2.0} if late else {}))
+        return future.done()
+    tester.feed_until(answered, frame)
+    assert future.result().success, future.result().message
     # no transform covers that time
     answer = tester.relocalize(make_frame(stamp_s=104.0))
     assert not answer.success
