@@ -6,14 +6,18 @@ Each room DIR/room_SEED has the exact map and folders of images. Layers are made
 ``mapping``, the demo's mapping walk, and ``one_side``, a walk around the room that looks ahead.
 The others are queries: ``viewpoints`` and ``other_light`` are the demo's wake-ups, once as the
 room was mapped and once in another light after four objects moved; ``other_side`` walks around the
-room the other way.
+room the other way. ``viewpoints_aside`` and ``other_light_aside`` are second looks, 20 cm
+aside.
 """
 
 import argparse
 from pathlib import Path
 
+import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from cliploc_ros.core.geometry.transforms import make_transform
 from demo_world.appearance import CLASSES
 from demo_world.make_changed_room import round_walk
 from demo_world.recording import record, write_true_map
@@ -24,6 +28,9 @@ from demo_world.trajectories import CAMERA, mapping_walk, query_walk
 _MAPPING_LIGHT = Light()
 _QUERY_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 _MAPPING_IMAGES, _SIDE_IMAGES = 30, 24
+# 20 cm to the right, turned by 5 degrees to the left.
+_ASIDE = make_transform(Rotation.from_euler('y', -5.0, degrees=True).as_matrix(),
+                        np.array([0.2, 0.0, 0.0]))
 
 
 def make_keyframe_room(folder: Path, seed: int, queries: int) -> None:
@@ -36,10 +43,11 @@ def make_keyframe_room(folder: Path, seed: int, queries: int) -> None:
     walks = {'mapping': mapping_walk(_MAPPING_IMAGES), 'one_side': sides[:_SIDE_IMAGES],
              'other_side': sides[_SIDE_IMAGES:][:: max(1, _SIDE_IMAGES // queries)],
              'viewpoints': query_walk(queries), 'other_light': query_walk(queries)}
+    walks |= {f'{name}_aside': walks[name] @ _ASIDE for name in ('viewpoints', 'other_light')}
     folder.mkdir(parents=True, exist_ok=True)
     write_true_map(folder / 'map.yaml', room)
     for number, (name, poses) in enumerate(walks.items()):
-        shown = (later, changed) if name == 'other_light' else (room, renderer)
+        shown = (later, changed) if name.startswith('other_light') else (room, renderer)
         with tqdm(total=len(poses), desc=name, unit='image') as bar:
             record(folder / name, *shown, poses, seed=seed + 5 + number, rate_hz=2.0,
                    advance=bar.update)

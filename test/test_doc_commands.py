@@ -27,7 +27,7 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
 OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
-MODULES = re.compile(r'(cliploc_ros|demo_world)\.')
+MODULES = re.compile(r'(cliploc_ros|demo_world|studies)\.')
 
 
 class _CaughtError(Exception):

@@ -12,7 +12,8 @@ ROOT = 'cliploc_ros'
 MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffix('.__init__'):
            path for path in sorted((PROJECT / ROOT).rglob('*.py'))}
 SOURCES = [*MODULES.values(), *sorted((PROJECT / 'test').rglob('*.py')),
-           *sorted((PROJECT / 'demo_world').glob('*.py'))]
+           *sorted((PROJECT / 'demo_world').glob('*.py')),
+           *sorted((PROJECT / 'studies').rglob('*.py'))]
 
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
@@ -22,8 +23,9 @@ LAYERS = (
     ('core.geometry',),
     ('core.index',),
     ('core.maps', 'core.observation', 'core.options'),
-    ('core.association', 'core.keyframes'),
+    ('core.association',),
     ('core.search',),
+    ('core.keyframes',),
     ('core.fit',),
     ('core.acceptance',),
     ('core',),

@@ -17,8 +17,9 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 MODULES = sorted((PROJECT / 'cliploc_ros').rglob('*.py'))
-SOURCES = [*MODULES, PROJECT / 'setup.py', *sorted((PROJECT / 'demo_world').rglob('*.py')),
-           *sorted((PROJECT / 'test').rglob('*.py'))]
+SOURCES = [*MODULES, PROJECT / 'setup.py', *(
+    path for folder in ('demo_world', 'studies', 'test')
+    for path in sorted((PROJECT / folder).rglob('*.py')))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
 EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',

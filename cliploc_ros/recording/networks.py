@@ -154,4 +154,4 @@ def _undistorted(detections: Detections, camera: Camera) -> NDArray[np.float64]:
     if not any(camera.distortion):
         return detections.bboxes_xyxy
     bboxes = camera.normalize_bboxes(detections.bboxes_xyxy)
-    return np.asarray(bboxes * [camera.fx, camera.fy] * 2 + [camera.cx, camera.cy] * 2)
+    return np.asarray(bboxes * ([camera.fx, camera.fy] * 2) + [camera.cx, camera.cy] * 2)

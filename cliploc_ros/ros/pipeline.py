@@ -164,8 +164,8 @@ def _summary(localized: Localized) -> str:
     crops = '' if seen.similarities is None else \
         f', CLIP of {localized.compared} of {len(seen.detections)} crops'
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
-    if found.recognized is not None and found.recognized.places:
-        keyframes += f', {found.recognized.places[0].inliers} points of keyframes agree'
+    if found.recognized is not None:
+        keyframes += f', {found.recognized.inliers} points of keyframes agree'
     return (f'confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
             f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}')

@@ -28,7 +28,7 @@ from cliploc_ros.core.search.prior import Prior
 _QUERY_FEATURES, _QUERY_PX = 2000, 400
 # Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
 # a place that looks alike is found, and those where objects propose.
-_SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
+_SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
@@ -44,10 +44,13 @@ NEAR_M, NEAR_DEG = 2.0, 40.0
 _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
-_NOTHING_KNOWN = Prior()
+#: Nothing is known of the camera.
+NOTHING_KNOWN = Prior()
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
+# Of what lies across an image, the part that counts: a few wrong matches lie anywhere [%].
+_MOST = (5.0, 95.0)
 # Points near each other share errors, and several keyframes have the same point: so many times as
 # large as those of as many independent points are the errors of poses and focal lengths. Of 570
 # right poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
@@ -63,15 +66,18 @@ class RecognizedPlace(NamedTuple):
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
-    covariance, shared : ndarray (6, 6)
-        In the order of core.fit.covariance; and its part that the keyframes cause, which looks at
-        the same keyframes share.
+    covariance : ndarray (6, 6)
+        In the order of core.fit.covariance.
     inliers : int
         Number of features that agree, without those that agree with a place found before.
     confirmed : float
         Share of the comparable cells of the image that show what the keyframes have there.
     expected : float
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    extent : float
+        How far the inliers reach across the image, as a share of what is comparable: 0 to 1, in
+        width or in height, whichever is more. Those in a picture of the place end with it, those
+        beside something that covers the place do not.
     cells : tuple of int
         Number of cells that confirm, and of those that are comparable: the keyframes expect points
         there, and the image has features.
@@ -86,6 +92,9 @@ class RecognizedPlace(NamedTuple):
         place: the vertical may be wrong, as with a wrong camera mount.
     keyframes, shares : tuple of int, tuple of float
         Those that points agree with, the most points first, and the share of the points.
+    shared : ndarray (6, 6)
+        The part of the covariance that errors of the keyframes cause: looks at the same ones share
+        it.
     pixels : ndarray (k, 2)
         Where the image, as it is, shows each point that agrees [px].
     rows : ndarray (k,) of int
@@ -96,10 +105,10 @@ class RecognizedPlace(NamedTuple):
 
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    shared: NDArray[np.float64]
     inliers: int
     confirmed: float
     expected: float
+    extent: float = 1.0
     cells: tuple[int, int] = (0, 0)
     focal_ratio: float = 1.0
     focal_deviation: float = np.inf
@@ -107,6 +116,7 @@ class RecognizedPlace(NamedTuple):
     tilt_error: float = 0.0
     keyframes: tuple[int, ...] = ()
     shares: tuple[float, ...] = ()
+    shared: NDArray[np.float64] = np.zeros((6, 6))
     pixels: NDArray[np.float64] = np.empty((0, 2))
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     points: NDArray[np.float64] = np.empty((0, 3))
@@ -161,7 +171,7 @@ class _Look(NamedTuple):
     features: Features
     bearings: NDArray[np.float64]
     camera: Camera
-    prior: Prior = _NOTHING_KNOWN
+    prior: Prior = NOTHING_KNOWN
 
 
 class _Place(NamedTuple):
@@ -189,7 +199,7 @@ class KeyframeLocalizer:
 
     def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
                  guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                 prior: Prior = _NOTHING_KNOWN) -> Recognition:
+                 prior: Prior = NOTHING_KNOWN) -> Recognition:
         """Find where an image was taken.
 
         Parameters
@@ -208,7 +218,7 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          prior: Prior = _NOTHING_KNOWN) -> Recognition:
+                          prior: Prior = NOTHING_KNOWN) -> Recognition:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
@@ -236,7 +246,7 @@ class KeyframeLocalizer:
         It counts the cells of the image in which keyframes near the pose expect points. Where it
         is 0, no keyframe is near: that an image is not recognized says nothing about this place.
         """
-        near = _keyframes_near(self.layer.map_from_camera, map_from_camera)
+        near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
     def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
@@ -246,9 +256,9 @@ class KeyframeLocalizer:
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
-            pose, covariance, shared, place.agreed, *self._confirmed(place, look, used),
+            pose, covariance, place.agreed, *self._confirmed(place, look, used),
             *_focal(place, look, used), look.prior.tilt_error(pose, covariance),
-            tuple(used.tolist()), tuple((counts[used] / counts.sum()).tolist()),
+            tuple(used.tolist()), tuple((counts[used] / counts.sum()).tolist()), shared,
             look.features.pixels[place.inliers.features], place.inliers.rows,
             place.inliers.points)
 
@@ -260,14 +270,14 @@ class KeyframeLocalizer:
                   if not any(_same_place(poses[one], poses[other]) for other in chosen))
         chosen += islice(others, _ELSEWHERE)
         for guess in guesses:
-            near = _keyframes_near(poses, guess)
-            chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
+            near = keyframes_near(poses, guess)
+            chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
         return chosen
 
     def _more(self, ranks: Sequence[int], chosen: Sequence[int], first: '_Place | None'
               ) -> list[int]:
         """Return more keyframes: those near the pose so far, and the next similar ones."""
-        near = _keyframes_near(self.layer.map_from_camera, first.map_from_camera
+        near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                )[:_MORE].tolist() if first else []
         return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                 if one not in chosen]
@@ -290,21 +300,27 @@ class KeyframeLocalizer:
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float, tuple[int, int]]:
-        """Return which cells have inliers, of those where keyframes expect some.
+                   ) -> tuple[float, float, float, tuple[int, int]]:
+        """Return which part of the image has inliers, of that where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The values are
-        the share, the one that is expected of so many inliers, whose density varies much from
-        cell to cell (a geometric distribution), and the numbers of cells.
+        the share of cells, the one that is expected of so many inliers, whose density varies much
+        from cell to cell (a geometric distribution), the extent, and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_IN_CELL) & self._expects(used, place.map_from_camera,
                                                               look.camera)
         count = int(comparable.sum())
         if not count:
-            return 0.0, 0.0, (0, 0)
+            return 0.0, 0.0, 0.0, (0, 0)
         confirmed = int(np.count_nonzero(place.cells[comparable]))
-        return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
+        pixels = look.features.pixels
+        reached = np.ptp(np.percentile(pixels[place.inliers.features], _MOST, axis=0), axis=0)
+        there = pixels[comparable[_cells_of(pixels, look.camera)]]
+        extent = float(np.max(reached / np.maximum(
+            np.ptp(np.percentile(there, _MOST, axis=0), axis=0), 1.0)))
+        return (confirmed / count, place.agreed / (count + place.agreed), min(1.0, extent),
+                (confirmed, count))
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
@@ -378,7 +394,7 @@ def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < _SAME_M and cosine > _SAME_COS)
 
 
-def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the keyframes that see what a pose sees, the most similar views first."""
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
@@ -399,9 +415,14 @@ def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Cam
 
 def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
     """Return how many pixels (m, 2) lie in each cell of the image."""
-    columns, rows = _CELLS
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    place = (pixels[inside] * (columns / camera.width, rows / camera.height)).astype(np.int64)
-    place = np.minimum(place, (columns - 1, rows - 1))
-    return np.bincount(place[:, 1] * columns + place[:, 0], minlength=columns * rows)
+    return np.bincount(_cells_of(pixels[inside], camera), minlength=_CELLS[0] * _CELLS[1])
+
+
+def _cells_of(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
+    """Return the number of the cell of each pixel (m, 2) in the image."""
+    last = np.array(_CELLS) - 1
+    place = (pixels * np.array(_CELLS) / (camera.width, camera.height)).astype(np.int64)
+    columns, rows = np.clip(place, 0, last).T
+    return np.asarray(rows * _CELLS[0] + columns)

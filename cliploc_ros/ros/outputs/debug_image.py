@@ -72,9 +72,9 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
     for line, text in enumerate(_lines(verdict, canvas.shape[1] // _CHAR_PX)):
         _write(canvas, text, np.array([6, 18 + 20 * line]),
                _ACCEPTED if found.accepted else _REFUSED)
-    if seen.layer is None or found.recognized is None or not found.recognized.places:
+    if seen.layer is None or found.recognized is None:
         return canvas
-    return beside_keyframe(canvas, found.recognized.places[0], seen.layer)
+    return beside_keyframe(canvas, found.recognized, seen.layer)
 
 
 def _similarity(observation: Observation, detection: int, landmark: int) -> str:

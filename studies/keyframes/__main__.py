@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where objects and keyframes together are wrong: ``python -m studies.keyframes``.
+
+``collect`` makes maps and layers of a part of each site, changes queries, map or layer, and stores
+what objects and keyframes say about each query. A run that was stopped goes on. ``judge`` decides
+about the stored records as the package does now, and prints what each way accepts.
+"""
+
+import argparse
+import json
+import sys
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+from tqdm import tqdm
+
+from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.output import write_text
+from cliploc_ros.parallel import run_tasks
+from studies.keyframes.cases import cases
+from studies.keyframes.judge import draw, make_judge, table
+from studies.keyframes.records import make_collect, read_places
+
+_FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
+
+
+def _collect(options: argparse.Namespace) -> int:
+    places = tuple(one for site in options.sites
+                   for one in read_places(site, options.model, options.blocks))
+    if len({one.site for one in places}) < 2:
+        raise OptionsError('--sites: images of other sites are needed: give two or more')
+    chosen = [one for one in places if any(text in one.name for text in options.places)]
+    names = [name for name in cases() if name.partition(':')[0] in options.families]
+    work = partial(make_collect, options.out, places, options.queries)
+    for tasks in (product(chosen, ['']),  # built once, before several workers need it
+                  ((place, name) for name, place in product(names, chosen))):
+        for _ in tqdm(run_tasks(work, tasks, workers=options.workers), unit='case', disable=None):
+            pass
+    return 0
+
+
+def _judge(options: argparse.Namespace) -> int:
+    paths = sorted(options.out.glob('cases/*/*.pickle'))
+    found = [one for _, result in run_tasks(make_judge, paths, workers=options.workers)
+             for one in result or () if one.family in options.families
+             and any(text in one.place for text in options.places)]
+    if not found:
+        raise OptionsError(f'{options.out}: no such records here; collect them first')
+    order = list(cases())
+    found.sort(key=lambda one: (order.index(one.case), one.place, one.number))
+    print('\n'.join(table(found, options.by)))
+    if options.json:
+        write_text(options.json, json.dumps([one._asdict() for one in found], indent=0))
+    if options.figure:
+        draw(found, options.figure)
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    parser = argparse.ArgumentParser(prog='keyframes', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument('--out', type=Path, default=Path('keyframes'), metavar='DIR',
+                        help='where the records are (%(default)s)')
+    common.add_argument('--families', nargs='+', default=_FAMILIES, choices=_FAMILIES,
+                        metavar='FAMILY', help=f'which cases: {", ".join(_FAMILIES)} (all)')
+    common.add_argument('--places', nargs='+', default=[''], metavar='TEXT',
+                        help='only places whose names contain one of these')
+    common.add_argument('--workers', type=positive_int, default=1, metavar='N',
+                        help='processes (%(default)s)')
+    collects = commands.add_parser('collect', parents=[common], help='store what is found')
+    collects.set_defaults(command=_collect)
+    collects.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
+                          help='RGB-D and TUM folders, the latter with the unit of their depth, '
+                               'and rooms of demo_world.make_keyframe_rooms')
+    collects.add_argument('--model', required=True, help='weights of YOLO for real images')
+    collects.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
+                          help='map and ask blocks of N images in turn, too')
+    collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
+                          help='the most of each case but the plain one (%(default)s)')
+    judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
+    judges.set_defaults(command=_judge)
+    judges.add_argument('--by', nargs='+', default=['case'],
+                        choices=['site', 'place', 'family', 'case'],
+                        help='what a line of the table is about (case)')
+    judges.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
+    judges.add_argument('--figure', type=Path, metavar='FILE.png',
+                        help='draw the reliability of the confidence')
+    options = parser.parse_args()
+    interrupt_on_sigterm()
+    return run_command(lambda: options.command(options))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
