@@ -68,8 +68,8 @@ def look(points, bearings, rng, keyframe=0, wrong=None):
     found = find_pose(points, bearings + noise)
     pose = found.map_from_camera if wrong is None else wrong @ found.map_from_camera
     return RecognizedPlace(
-        pose, 20.0 * found.covariance + SHARED, len(found.inliers), 0.8, 0.8,
-        keyframes=(keyframe,), shares=(1.0,), shared=SHARED, points=points[found.inliers])
+        pose, 20.0 * found.covariance + SHARED, SHARED, len(found.inliers), 0.8, 0.8,
+        keyframes=(keyframe,), shares=(1.0,), points=points[found.inliers])
 
 
 @pytest.mark.parametrize('name', MOTIONS)

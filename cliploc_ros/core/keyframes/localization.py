@@ -168,9 +168,9 @@ class KeyframeLocalizer:
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
-            pose, covariance, place.agreed, *self._confirmed(place, look, used),
+            pose, covariance, shared, place.agreed, *self._confirmed(place, look, used),
             *_focal(place, look, used), look.prior.tilt_error(pose, covariance),
-            tuple(used.tolist()), tuple((counts[used] / counts.sum()).tolist()), shared,
+            tuple(used.tolist()), tuple((counts[used] / counts.sum()).tolist()),
             look.features.pixels[place.inliers.features], place.inliers.rows,
             place.inliers.points)
 

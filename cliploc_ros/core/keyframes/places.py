@@ -14,8 +14,9 @@ class RecognizedPlace(NamedTuple):
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
-    covariance : ndarray (6, 6)
-        In the order of core.fit.covariance.
+    covariance, shared : ndarray (6, 6)
+        In the order of core.fit.covariance; and its part that the keyframes cause, which looks at
+        the same keyframes share.
     inliers : int
         Number of features that agree, without those that agree with a place found before.
     confirmed : float
@@ -40,9 +41,6 @@ class RecognizedPlace(NamedTuple):
         place: the vertical may be wrong, as with a wrong camera mount.
     keyframes, shares : tuple of int, tuple of float
         Those that points agree with, the most points first, and the share of the points.
-    shared : ndarray (6, 6)
-        The part of the covariance that errors of the keyframes cause: looks at the same ones share
-        it.
     pixels : ndarray (k, 2)
         Where the image, as it is, shows each point that agrees [px].
     rows : ndarray (k,) of int
@@ -53,6 +51,7 @@ class RecognizedPlace(NamedTuple):
 
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    shared: NDArray[np.float64]
     inliers: int
     confirmed: float
     expected: float
@@ -64,7 +63,6 @@ class RecognizedPlace(NamedTuple):
     tilt_error: float = 0.0
     keyframes: tuple[int, ...] = ()
     shares: tuple[float, ...] = ()
-    shared: NDArray[np.float64] = np.zeros((6, 6))
     pixels: NDArray[np.float64] = np.empty((0, 2))
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     points: NDArray[np.float64] = np.empty((0, 3))
@@ -85,8 +83,3 @@ class Recognition(NamedTuple):
 
     places: tuple[RecognizedPlace, ...] = ()
     is_complete: bool = True
-
-    @property
-    def rival(self) -> int:
-        """Return the number of inliers of the second place, which may be more; 0 without one."""
-        return self.places[1].inliers if len(self.places) > 1 else 0
