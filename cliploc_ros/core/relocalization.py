@@ -11,7 +11,7 @@ from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 

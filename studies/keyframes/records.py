@@ -23,9 +23,9 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     NOTHING_KNOWN,
     KeyframeLocalizer,
-    Recognition,
     query_features,
 )
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation

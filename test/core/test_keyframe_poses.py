@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses and points from matched features: exact cases, outliers, honest covariances."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,6 +20,7 @@ from cliploc_ros.core.keyframes.features import (
 )
 from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
+from cliploc_ros.core.search.prior import Prior
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 
@@ -105,6 +107,25 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
     assert (first.agreed, second.agreed) == (60, 120)
 
 
+def test_a_prior_excludes_by_height_and_tilt_and_tells_how_far_the_vertical_is_off():
+    def tilted(degrees, height=1.0):
+        """Return the pose of a camera that looks along the map's x axis, and leans to the side."""
+        level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+        return make_transform(level @ Rotation.from_euler('z', degrees, True).as_matrix(),
+                              np.array([5.0, 6.0, height]))
+    prior = Prior(min_height=0.5, max_height=1.5, max_tilt=np.radians(30.0))
+    assert [prior.allows(tilted(0.0, height)) for height in (0.4, 0.6, 1.4, 1.6)] == [
+        False, True, True, False]
+    assert [prior.allows(tilted(angle)) for angle in (-31.0, 29.0, 180.0)] == [False, True, False]
+    assert Prior().allows(tilted(180.0, -9.0))
+    covariance = np.diag([1.0, 1.0, 1.0, np.radians(4.0) ** 2, 1.0, 1.0])  # about the x axis
+    assert prior.tilt_error(tilted(20.0), covariance) == 0.0, 'unknown'
+    known = prior._replace(vertical_deviation=np.radians(3.0))
+    assert known.tilt_error(tilted(20.0), covariance) == pytest.approx(4.0)
+    assert known.tilt_error(tilted(-20.0), covariance) == pytest.approx(4.0)
+    assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)
+
+
 def test_of_equal_rooms_each_is_a_place_of_its_own():
     rng = np.random.default_rng(9)
     pose, points, bearings = look(rng, 40)
@@ -159,6 +180,17 @@ def test_features_are_found_in_any_image():
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert len(extract(empty, 300)) == 0
+
+
+def test_features_of_half_the_size_match_those_of_keyframes():
+    rng = np.random.default_rng(14)
+    small = rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
+    texture = cv2.resize(small, (800, 600), interpolation=cv2.INTER_CUBIC)
+    full, half = extract(texture, 300), extract(texture, 300, 400)
+    pairs = match(unit_rows(half.descriptors), unit_rows(full.descriptors))
+    shifts = half.pixels[pairs[:, 0]] - full.pixels[pairs[:, 1]]
+    assert len(pairs) > 60
+    assert np.mean(np.abs(shifts).max(axis=1) < 1.0) > 0.9
 
 
 def test_a_large_image_gives_its_own_pixels():

@@ -12,7 +12,7 @@ from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.keyframes.layer import FROM_DEPTH, KeyframeLayer
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 LAYER = KeyframeLayer(

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN, Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

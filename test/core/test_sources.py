@@ -12,7 +12,8 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.fit.fusion import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN, Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

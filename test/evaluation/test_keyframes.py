@@ -4,18 +4,22 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.recognition import ObjectsThere
-from cliploc_ros.core.combination import combine
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import prior_of
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
@@ -24,7 +28,7 @@ from studies.keyframes.cases import IMAGE_CHANGES, World, hang, make_picture, tw
 
 EVERY = LayerOptions(0.0, 0.0)
 OPTIONS = RelocalizerOptions(matching='class')
-NOWHERE = Relocalization(False, 'no objects')
+NO_OBJECTS = Detections(np.empty((0, 4)), (), np.empty(0))
 MAPPED, ASKED = range(0, 30, 3), range(1, 30, 6)
 
 
@@ -59,11 +63,16 @@ def layer(kitchen, room, tmp_path_factory):
     return load_layer_of_map(path, room)
 
 
-def answer(localizer, image_rgb, camera):
-    return combine(NOWHERE, localizer.localize(image_rgb, camera), ObjectsThere(0, 0), OPTIONS)
+@pytest.fixture
+def answer(room):
+    """Ask for an image in which no object is detected."""
+    def relocalize(localizer, image_rgb, camera):
+        recognizer = ImageRecognizer(localizer, localization.query_features(image_rgb), camera)
+        return Relocalizer(room, OPTIONS).relocalize([Observation(camera, NO_OBJECTS)], recognizer)
+    return relocalize
 
 
-def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
+def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries, answer):
     localizer = KeyframeLocalizer(layer)
     for frame in queries:
         found = answer(localizer, frame.image_rgb, frame.camera)
@@ -73,7 +82,7 @@ def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
 
 
 @pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])
-def test_changed_images_are_found(layer, queries, name):
+def test_changed_images_are_found(layer, queries, name, answer):
     localizer, frame = KeyframeLocalizer(layer), queries[0]
     image = IMAGE_CHANGES[name](frame.image_rgb, frame.image_rgb, np.random.default_rng(0))
     found = answer(localizer, np.clip(image, 0, 255).astype(np.uint8), frame.camera)
@@ -81,7 +90,7 @@ def test_changed_images_are_found(layer, queries, name):
     assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.25
 
 
-def test_another_room_is_refused(layer, office):
+def test_another_room_is_refused(layer, office, answer):
     localizer = KeyframeLocalizer(layer)
     for frame in office.select(range(0, 17, 4)).read():
         assert not answer(localizer, frame.image_rgb, frame.camera).accepted
@@ -93,14 +102,15 @@ def twins(layer, room):
     return KeyframeLocalizer(twin(1.0, 0, world, np.random.default_rng(0)).layer)
 
 
-def test_a_second_room_that_looks_the_same_is_refused(twins, queries):
+def test_a_second_room_that_looks_the_same_is_refused(twins, queries, answer):
     for frame in queries[:3]:
         seen = twins.localize(frame.image_rgb, frame.camera)
-        assert seen.rival > 0.5 * seen.inliers
-        assert not combine(NOWHERE, seen, ObjectsThere(0, 0), OPTIONS).accepted
+        assert len(seen.places) > 1
+        assert seen.places[1].inliers > 0.5 * seen.places[0].inliers
+        assert not answer(twins, frame.image_rgb, frame.camera).accepted
 
 
-def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
+def test_a_poster_of_another_place_is_refused(layer, queries, kitchen, answer):
     elsewhere = next(kitchen.select([27]).read())  # mapped
     frame = queries[0]
     picture = make_picture('crop', 0.3, frame.camera, elsewhere.image_rgb, frame.camera,
@@ -119,10 +129,10 @@ def test_a_search_that_time_cuts_short_gives_no_pose(twins, queries):
     for wait_s in np.linspace(0.0, 0.2, 21):
         seen = localizer.localize_features(features, frame.camera,
                                            deadline=time.monotonic() + wait_s)
-        found.append(seen is not None)
-        assert seen is None or seen.rival > 0.5 * seen.inliers
+        found.append(seen.is_complete)
+        assert len(seen.places) > 1 if seen.is_complete else not seen.places
     assert not found[0]
-    assert localizer.localize_features(features, frame.camera) is not None
+    assert len(localizer.localize_features(features, frame.camera).places) > 1
 
 
 def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
@@ -130,9 +140,9 @@ def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
     monkeypatch.setattr(localization, '_SIMILAR', 1)
     monkeypatch.setattr(localization, '_ELSEWHERE', 0)
     monkeypatch.setattr(localization, '_ENOUGH_INLIERS', 0)
-    few = localizer.localize(frame.image_rgb, frame.camera)
+    few = localizer.localize(frame.image_rgb, frame.camera).places[0]
     monkeypatch.setattr(localization, '_ENOUGH_INLIERS', few.inliers + 1)
-    more = localizer.localize(frame.image_rgb, frame.camera)
+    more = localizer.localize(frame.image_rgb, frame.camera).places[0]
     assert len(few.keyframes) == 1 < len(more.keyframes)
     assert more.inliers > few.inliers
 
@@ -142,10 +152,70 @@ def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
     frame = queries[0]
     with_guess = localizer.localize(frame.image_rgb, frame.camera, [frame.map_from_camera])
     without = localizer.localize(frame.image_rgb, frame.camera)
-    assert with_guess.inliers >= without.inliers
+    assert with_guess.places[0].inliers >= without.places[0].inliers
 
 
-def test_the_office_is_triangulated_without_depth(office, room):
+def test_a_layer_covers_what_its_keyframes_saw_and_nothing_else(layer, queries):
+    localizer, frame = KeyframeLocalizer(layer), queries[0]
+    assert localizer.coverage(frame.map_from_camera, frame.camera) > 0.6
+    away, behind = frame.map_from_camera.copy(), frame.map_from_camera.copy()
+    away[2, 3] += 5.0
+    behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    for pose in (away, behind):
+        assert localizer.coverage(pose, frame.camera) == 0.0
+    edge = frame.map_from_camera.copy()
+    edge[:3, 3] += 1.5 * edge[:3, 0]
+    assert 0.0 < localizer.coverage(edge, frame.camera) < 0.6
+
+
+@pytest.mark.parametrize('wrong', ['', 'height', 'vertical', 'tilt'])
+def test_height_and_tilt_exclude_places_and_the_vertical_tells_how_far_they_are_off(
+        layer, queries, wrong):
+    localizer = KeyframeLocalizer(layer)
+    for frame in queries:
+        up, height = frame.map_from_camera[2, :3], frame.map_from_camera[2, 3]
+        if wrong == 'vertical':  # 10 degrees off
+            level = np.cross(up, np.roll(up, 1))
+            up = Rotation.from_rotvec(np.radians(10.0) * level / np.linalg.norm(level)).apply(up)
+        shift = 0.5 if wrong == 'height' else 0.0
+        options = RelocalizerOptions(
+            matching='class', height_range_m=(height - 0.1 + shift, height + 0.1 + shift),
+            max_tilt_deg=1.0 if wrong == 'tilt' else 180.0)
+        observation = Observation(frame.camera, NO_OBJECTS,
+                                  up_in_camera=None if wrong == 'tilt' else up)
+        places = localizer.localize(frame.image_rgb, frame.camera,
+                                    prior=prior_of(observation, options)).places
+        assert bool(places) == (wrong in ('', 'vertical'))
+        assert all((place.tilt_error > 5.0) == (wrong == 'vertical') for place in places)
+
+
+@pytest.mark.parametrize('times', [0.5, 0.8, 1.0, 1.25, 2.0])
+def test_a_wrong_focal_length_shows_in_each_place(layer, queries, times):
+    localizer, errors = KeyframeLocalizer(layer), []
+    for frame in queries:
+        own = frame.camera
+        camera = Camera(own.width, own.height, times * own.fx, times * own.fy, own.cx, own.cy)
+        for place in localizer.localize(frame.image_rgb, camera).places[:1]:
+            errors.append(abs(np.log(place.focal_ratio)) / place.focal_deviation)
+            if errors[-1] > 3.0:
+                assert abs(place.focal_ratio * times - 1.0) < 0.1
+                assert place.focal_inliers > place.inliers
+    assert (np.median(errors) > 4.0) == (times != 1.0)
+    assert times != 1.0 or max(errors) < 3.0
+
+
+def test_a_smaller_picture_of_the_place_shows_by_its_focal_length(layer, kitchen, queries):
+    """As on a poster or a screen."""
+    mapped = next(kitchen.select([27]).read()).image_rgb
+    image = np.full_like(mapped, 128)
+    image[100:388, 150:534] = cv2.resize(mapped, None, fx=0.6, fy=0.6)
+    place = KeyframeLocalizer(layer).localize(image, queries[0].camera).places[0]
+    assert place.inliers > 20
+    assert abs(place.focal_ratio / 0.6 - 1.0) < 0.1
+    assert abs(np.log(place.focal_ratio)) > 3.0 * place.focal_deviation
+
+
+def test_the_office_is_triangulated_without_depth(office, room, answer):
     layer = build_layer(office.select(range(0, 17, 2)), room, EVERY)
     assert (np.diff(layer.offsets) > 100).all()
     localizer = KeyframeLocalizer(layer)

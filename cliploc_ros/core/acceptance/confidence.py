@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import PER_RADIAN, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import PER_RADIAN
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
 
 # Distances of pictures from the first camera [m], and how many points are tried on them.

@@ -9,7 +9,7 @@ import numpy as np
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
 # A refusal does not mention less likely rivals.

@@ -166,12 +166,12 @@ def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], f
         # of the residuals times the ratio: else an endless ratio would fit best
         by_x = np.stack([one, zero, -u / z, -u * v, 1.0 + u**2, -v, u], axis=1)
         by_y = np.stack([zero, one, -v / z, -1.0 - v**2, u * v, u, v], axis=1)
-        jacobian = np.stack([by_x, by_y], axis=1)[..., :len(information)] / deviation
+        jacobian = np.concatenate([by_x, by_y])[:, :len(information)] / deviation
         scaled = residuals / deviation
         weights = 1.0 / (1.0 + np.sum(scaled**2, axis=1) / 4.0)
-        information = np.einsum('nij,nik,n->jk', jacobian, jacobian, weights)
-        gradient = np.einsum('nij,ni,n->j', jacobian, scaled, weights)
-        step = -np.linalg.lstsq(information, gradient, rcond=None)[0]
+        weighted = jacobian.T * np.tile(weights, 2)
+        information = weighted @ jacobian
+        step = -np.linalg.lstsq(information, weighted @ scaled.T.ravel(), rcond=None)[0]
         step /= max(1.0, np.abs(step[6:]).sum() / _MOST_STEP)
         turn = Rotation.from_rotvec(step[3:6]).as_matrix()
         camera_from_map = make_transform(turn, step[:3]) @ camera_from_map

@@ -14,9 +14,9 @@ from cliploc_ros.core.keyframes.localization import (
     NOTHING_KNOWN,
     PROPOSED,
     KeyframeLocalizer,
-    Recognition,
     keyframes_near,
 )
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.search.prior import Prior
 
 

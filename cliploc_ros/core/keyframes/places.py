@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What keyframes say about an image: places, and the evidence for and against each."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class RecognizedPlace(NamedTuple):
+    """A pose by keyframes, and the evidence for and against it.
+
+    Parameters
+    ----------
+    map_from_camera : ndarray (4, 4)
+    covariance, shared : ndarray (6, 6)
+        In the order of core.fit.covariance; and its part that the keyframes cause, which looks at
+        the same keyframes share.
+    inliers : int
+        Number of features that agree, without those that agree with a place found before.
+    confirmed : float
+        Share of the comparable cells of the image that show what the keyframes have there.
+    expected : float
+        The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    extent : float
+        How far the inliers reach across the image, as a share of what is comparable: 0 to 1, in
+        width or in height, whichever is more. Those in a picture of the place end with it, those
+        beside something that covers the place do not.
+    cells : tuple of int
+        Number of cells that confirm, and of those that are comparable: the keyframes expect points
+        there, and the image has features.
+    focal_ratio, focal_deviation : float
+        The focal length that the points suggest as a multiple of the camera's, and its relative
+        standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
+        wrong intrinsics, and a picture of the place of another size, suggest another one.
+    focal_inliers : int
+        Number of features that agree under that focal length.
+    tilt_error : float
+        Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
+        place: the vertical may be wrong, as with a wrong camera mount.
+    keyframes, shares : tuple of int, tuple of float
+        Those that points agree with, the most points first, and the share of the points.
+    pixels : ndarray (k, 2)
+        Where the image, as it is, shows each point that agrees [px].
+    rows : ndarray (k,) of int
+        Which point of the layer that is.
+    points : ndarray (k, 3)
+        Where it is in the map [m].
+    """
+
+    map_from_camera: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    shared: NDArray[np.float64]
+    inliers: int
+    confirmed: float
+    expected: float
+    extent: float = 1.0
+    cells: tuple[int, int] = (0, 0)
+    focal_ratio: float = 1.0
+    focal_deviation: float = np.inf
+    focal_inliers: int = 0
+    tilt_error: float = 0.0
+    keyframes: tuple[int, ...] = ()
+    shares: tuple[float, ...] = ()
+    pixels: NDArray[np.float64] = np.empty((0, 2))
+    rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    points: NDArray[np.float64] = np.empty((0, 3))
+
+
+class Recognition(NamedTuple):
+    """The places where keyframes recognize an image.
+
+    Parameters
+    ----------
+    places : tuple of RecognizedPlace
+        None agrees with another one. The one whose points lie in the most cells of the image is
+        first: a poster has many points, but shows only a part of its place.
+    is_complete : bool
+        Whether all keyframes were matched that should be. A search that the deadline cut has no
+        places: it may have missed their rivals.
+    """
+
+    places: tuple[RecognizedPlace, ...] = ()
+    is_complete: bool = True
