@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.benchmark.floors import CAMERA, SeenFloor, make_floor, see_floor
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.maps.joined_map import join_maps

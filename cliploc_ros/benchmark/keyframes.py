@@ -64,11 +64,11 @@ def ask(map_file: Path, layer_file: Path, images: Path, requests: int) -> dict[s
     asked, errors = [], []
     for frame in frames.select(rows.tolist()).read():
         begin = time.process_time()
-        seen = localizer.localize(frame.image_rgb, frame.camera)
+        found = localizer.localize(frame.image_rgb, frame.camera).places
         asked.append(round(1e3 * (time.process_time() - begin)))
         assert frame.map_from_camera is not None
-        errors.append(None if seen is None else round(
-            pose_error(seen.map_from_camera, frame.map_from_camera)[0], 3))
+        errors.append(None if not found else round(
+            pose_error(found[0].map_from_camera, frame.map_from_camera)[0], 3))
     return {'keyframes': len(layer), 'file MB': round(layer_file.stat().st_size / 1e6),
             'load s': round(loaded, 2), 'requests ms': asked, 'errors m': errors,
             'memory MiB': round(_memory_mib() - before)}

@@ -84,6 +84,8 @@ class Observation:
     odom_from_camera : ndarray (4, 4) or None
         The camera in the coordinate frame of odometry, which links this frame to others; None if
         unknown.
+    odom_way_m : float
+        Way driven since the run of odometry began [m]; 0 where it is unknown.
     compared : ndarray (m,) of int or None
         The detections that the rows of similarities (m, L) belong to; None for all, in their
         order. The other detections are matched by class alone.
@@ -95,6 +97,7 @@ class Observation:
     stamp_ns: int = 0
     up_in_camera: NDArray[np.float64] | None = None
     odom_from_camera: NDArray[np.float64] | None = None
+    odom_way_m: float = 0.0
     compared: NDArray[np.int64] | None = None
 
     @property

@@ -7,9 +7,7 @@ classes alone, then with more and more of its crops, the most informative ones f
 pose is accepted or no crop is left.
 
 Each of these searches is another chance of a false accept. So a pose from a part of the crops
-needs stronger evidence than one from all of them, as in the interim analyses of clinical trials
-(Haybittle, "Repeated assessment of results in clinical trials of cancer treatment", 1971). That
-holds for a search that time ends, too.
+needs a greater confidence, see cliploc_ros.core.acceptance.verdict.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.index.similarities import Similarities
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -30,11 +28,6 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 
 #: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
 BATCH = 4
-# A pose from a part of the crops may be wrong with this share of the probability that one from all
-# crops may: each search is another chance of a false accept. With the default min_confidence a
-# pose needs .98, which 0 of 2,080 requests in simulated worlds with exchanged objects reached. On
-# 387 frames of TUM fr3, 45 % of the crops are compared; with a share of .01, 62 %; of 1, 35 %.
-_EARLY_SHARE = 0.2
 _NONE = np.empty(0, dtype=np.int64)
 _NO_LOOKS = Looks()
 
@@ -102,7 +95,8 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 
 
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
-                       observations: Iterable[Observation], looks: Looks = _NO_LOOKS
+                       observations: Iterable[Observation], looks: Looks = _NO_LOOKS,
+                       recognizer: ImageRecognizer | None = None
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
@@ -115,13 +109,15 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         The frame with more and more of its crops, one at least, see crops_on_demand.
     looks : Looks, optional
         Results of earlier frames, which have to agree.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes.
 
     Returns
     -------
     frame : SearchedFrame
         With the crops that it took.
     found : Relocalization
-        Its search_ms is the sum over all searches.
+        Its time is that of all searches.
 
     Raises
     ------
@@ -132,26 +128,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     for observation in observations:
         budget = relocalizer.begin(len(earlier) + 1)
         frame = relocalizer.search(observation, budget.search_end())
-        found = relocalizer.locate([*earlier, frame], budget, looks)
+        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer)
         search_ms += found.search_ms
-        if _has_a_part(observation):
-            found = _accepted_early(found, relocalizer.options)
         if found.accepted:
             break
     return frame, replace(found, search_ms=search_ms)
-
-
-def _has_a_part(observation: Observation) -> bool:
-    """Return whether crops are left that were not compared."""
-    return (observation.compared is not None
-            and len(observation.compared) < len(observation.detections))
-
-
-def _accepted_early(found: Relocalization, options: RelocalizerOptions) -> Relocalization:
-    """Return a result from a part of the crops, refused unless it is sure enough for that."""
-    needed = 1.0 - _EARLY_SHARE * (1.0 - options.min_confidence)
-    if not found.accepted or found.confidence >= needed:
-        return found
-    return replace(found, accepted=False, refusal_kind=RefusalKind.NOT_ALL_CROPS,
-                   reason=f'confidence {found.confidence:.4f} < {needed:.4f}, as it takes without '
-                          'all crops; raise timeout_s')

@@ -11,7 +11,7 @@ from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
 from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
@@ -70,11 +70,10 @@ class Relocalization:
     stamp_ns : int
         Stamp of the newest observation [ns].
     source : str
-        What the best pose comes from: 'objects', 'keyframes' or 'both', see
-        cliploc_ros.core.combination.
+        What proposes the best pose: 'objects', 'keyframes' or 'both'.
     refusal_kind : RefusalKind or None
         Kind of the refusal, which programs compare; None when accepted.
-    recognized : Recognized or None
+    recognition : Recognition or None
         What keyframes say, whatever the best pose comes from; None without keyframes.
     """
 
@@ -91,7 +90,12 @@ class Relocalization:
     stamp_ns: int = 0
     source: str = 'objects'
     refusal_kind: RefusalKind | None = None
-    recognized: Recognized | None = None
+    recognition: Recognition | None = None
+
+    @property
+    def recognized(self) -> RecognizedPlace | None:
+        """Return the first place that keyframes recognize; None without one."""
+        return self.recognition.places[0] if self.recognition and self.recognition.places else None
 
     @property
     def solved(self) -> bool:

@@ -6,17 +6,24 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.comparison import JoinedFrames, compare, evidence_of
-from cliploc_ros.core.acceptance.confidence import utilities
+from cliploc_ros.core.acceptance.comparison import (
+    Comparison,
+    JoinedFrames,
+    compare,
+    evidence_of,
+    pose_of,
+)
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
-from cliploc_ros.core.acceptance.spread import spread
-from cliploc_ros.core.acceptance.verdict import refusal
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
+from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.association.candidates import check_k
-from cliploc_ros.core.fit.finalists import covariance_of, find_with_rivals
+from cliploc_ros.core.fit.finalists import find_with_rivals
 from cliploc_ros.core.fit.rig import cameras_from_last, make_rig
+from cliploc_ros.core.geometry.tolerances import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -58,7 +65,8 @@ class Relocalizer:
         """Compile the kernels, or read them from disk, before the first request needs them."""
         warm_up(call_every_kernel)
 
-    def relocalize(self, observations: Sequence[Observation]) -> Relocalization:
+    def relocalize(self, observations: Sequence[Observation],
+                   recognizer: ImageRecognizer | None = None) -> Relocalization:
         """Find where the camera was when it saw the last of some frames.
 
         Several frames are localized as one: each of them gives hypotheses, which are scored and
@@ -69,6 +77,8 @@ class Relocalizer:
         observations : sequence of Observation
             One frame, or up to MAX_FRAMES of one moving camera, linked by odom_from_camera. The
             result is the pose of the last one.
+        recognizer : ImageRecognizer, optional
+            Of the keyframes, for the image of the last frame.
 
         Returns
         -------
@@ -85,7 +95,7 @@ class Relocalizer:
         budget = self.begin(len(observations))
         frames = [self.search(one, budget.search_end(number, len(observations)))
                   for number, one in enumerate(observations, start=1)]
-        return self.locate(frames, budget)
+        return self.locate(frames, budget, recognizer=recognizer)
 
     def begin(self, frames: int) -> TimeBudget:
         """Return the time budget of a relocalization with some frames; it starts now."""
@@ -102,7 +112,8 @@ class Relocalizer:
         return search_frame(self._map, observation, self._options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
-               looks: Looks = _NO_LOOKS) -> Relocalization:
+               looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None
+               ) -> Relocalization:
         """Find where the camera was when it saw the last of some searched frames.
 
         Parameters
@@ -112,6 +123,8 @@ class Relocalizer:
             Time left for the refinement; a new one by default.
         looks : Looks, optional
             Results of earlier frames, which have to agree.
+        recognizer : ImageRecognizer, optional
+            Of the keyframes, for the image of the last frame.
 
         Raises
         ------
@@ -120,44 +133,53 @@ class Relocalizer:
         """
         budget = budget or self.begin(len(frames))
         cameras = cameras_from_last([one.observation for one in frames])
-        if not any(one.has_samples for one in frames):
-            detections = sum(len(one.observation.detections) for one in frames)
-            return _nothing_found(frames, budget, Refusal(
-                RefusalKind.TOO_FEW_OBJECTS,
-                f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
-                'correspondence candidates; turn the camera to more objects'))
         rig = make_rig([one.scene for one in frames], cameras,
                        np.stack([one.vertical for one in frames]), self._map.position_sigmas)
         finalists, is_upright = find_with_rivals(frames, rig, self._options.refine,
                                                  budget.refinement_end)
-        if not finalists:
-            return _nothing_found(frames, budget, Refusal(
-                RefusalKind.UNEXPLAINED,
-                'no pose explains the detections; turn the camera to more objects'))
         joined = JoinedFrames(self._map, self._options, frames, rig, cameras)
-        compared = compare(joined, finalists, is_upright)
-        best, matches, poses = compared.finalists[0], compared.matches[0], compared.poses
-        covariance = covariance_of(frames, rig, best, matches, self._map.shared_sigmas)
-        nearby = np.zeros((6, 6)) if best.information is None else spread(
-            poses, utilities(compared.supports) - compared.handicaps)
-        evidence = evidence_of(joined, compared, covariance.matched, looks)
+        compared = compare(joined, finalists, is_upright, recognizer)
+        if not compared.candidates:
+            return _nothing_found(frames, budget)
+        pose, covariance = pose_of(joined, compared)
+        evidence = evidence_of(joined, compared, covariance, looks, recognizer)
         refused = refusal(evidence, self._options)
+        shown = compared.by_objects or compared.candidates[0]
         return Relocalization(
             accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
-            hypotheses=tuple(map(Hypothesis, poses, (one.score for one in compared.finalists),
-                                 compared.likely * evidence.certainty, compared.supports,
-                                 compared.handicaps.tolist())),
-            matches=matches[-1], evidence=evidence, covariance=covariance.whole + nearby,
-            tried=_tried(frames), best_iteration=best.iteration, coverage=coverage_of(frames),
-            search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
+            hypotheses=_hypotheses(pose, compared, evidence), matches=shown.matches[-1],
+            evidence=evidence, covariance=covariance, tried=_tried(frames),
+            best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
+            search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
+            source=compared.source, recognition=compared.recognition)
 
 
-def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget, refused: Refusal
-                   ) -> Relocalization:
-    return Relocalization(False, refused.reason, refusal_kind=refused.kind, tried=_tried(frames),
-                          coverage=coverage_of(frames), search_ms=budget.elapsed_ms,
-                          stamp_ns=frames[-1].observation.stamp_ns)
+def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence
+                ) -> tuple[Hypothesis, ...]:
+    """Return the pose that leads, and the best one of each other place."""
+    found: list[Hypothesis] = []
+    for one, its_pose, likely in zip(compared.candidates, [pose, *compared.poses[1:]],
+                                     compared.likely, strict=True):
+        if not any(SAME_PLACE.agree(its_pose, other.map_from_camera) for other in found):
+            found.append(Hypothesis(
+                its_pose, one.finalist.score, evidence.confidence if not found
+                else float(likely) * evidence.found * evidence.certainty, one.support,
+                one.handicap))
+    return tuple(found)
+
+
+def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Relocalization:
+    if any(one.has_samples for one in frames):
+        kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'
+    else:
+        detections = sum(len(one.observation.detections) for one in frames)
+        kind = RefusalKind.TOO_FEW_OBJECTS
+        reason = (f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
+                  'correspondence candidates')
+    return Relocalization(False, f'{reason}; turn the camera to more objects', refusal_kind=kind,
+                          tried=_tried(frames), coverage=coverage_of(frames),
+                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
 
 
 def _tried(frames: Sequence[SearchedFrame]) -> int:

@@ -7,14 +7,17 @@ where the successive looks are sure of it on average.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.geometry.tolerances import SAME_VIEW
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import localize_on_demand
 from cliploc_ros.core.relocalization import Relocalization
@@ -22,10 +25,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.succession import Known, succeed
 from cliploc_ros.units import NS_PER_S
-
-# A camera that moved less sees the same again: its new frame replaces the one before.
-_MOVED_M = 0.05
-_MOVED_DEG = 3.0
 
 
 class KeptFrame(NamedTuple):
@@ -57,11 +56,12 @@ class Session:
         self.observation: Observation | None = None
 
     def localize(self, observation: Observation, run: int = 0, limit: int = 1,
-                 length_s: float = 0.0, more: Iterable[Observation] = ()) -> Relocalization:
+                 length_s: float = 0.0, more: Iterable[Observation] = (),
+                 recognizer: ImageRecognizer | None = None) -> Relocalization:
         """Localize with a frame and, where odometry places it, with those before it.
 
         Odometry links all frames of one run. A new run or a stamp before the last one forgets
-        frames and looks. Looks persist while the run lasts, whatever `length_s`.
+        frames and looks. Looks persist until a pose is accepted, whatever `length_s`.
 
         Parameters
         ----------
@@ -76,6 +76,8 @@ class Session:
         more : iterable of Observation, optional
             The same frame with more and more of its crops, taken until the pose is accepted, see
             cliploc_ros.core.on_demand.
+        recognizer : ImageRecognizer, optional
+            Of the keyframes, for the image of this frame.
 
         Raises
         ------
@@ -84,7 +86,8 @@ class Session:
         """
         stages = chain([observation], more)
         if observation.odom_from_camera is None:
-            alone, found = localize_on_demand(self._relocalizer, (), stages)
+            alone, found = localize_on_demand(self._relocalizer, (), stages,
+                                              recognizer=recognizer)
             self.observation = alone.observation
             return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
@@ -92,12 +95,16 @@ class Session:
         self._run, self._stamp_ns = run, observation.stamp_ns
         earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
         newest, found = localize_on_demand(
-            self._relocalizer, [one.searched for one in earlier], stages, self._looks)
+            self._relocalizer, [one.searched for one in earlier], stages, self._looks,
+            recognizer)
         self._frames = [*earlier, KeptFrame(newest, anchor)]
         self.observation = newest.observation
-        if found.map_from_camera is not None:
-            self._looks = self._looks.with_look(observation, found.map_from_camera,
-                                                found.confidence)
+        if found.accepted:
+            self._looks = Looks()
+        elif found.map_from_camera is not None:
+            self._looks = self._looks.with_look(Look(
+                replace(observation, similarities=None, compared=None), found.map_from_camera,
+                found.confidence, found.recognized))
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:
@@ -138,7 +145,7 @@ def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit:
 def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
     """Return how far a camera drove and turned, in the steps that make a frame a new one."""
     distance_m, angle_deg = pose_error(before, after)
-    return distance_m / _MOVED_M, angle_deg / _MOVED_DEG
+    return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg
 
 
 def _least_useful(anchors: Sequence[NDArray[np.float64]]) -> int:

@@ -10,9 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.combination import Image, join_keyframes
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
+from cliploc_ros.core.keyframes.localization import (
+    KeyframeLocalizer,
+    query_features,
+)
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import stages_of
@@ -102,12 +105,10 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
     found = None
     for frame in case.frames:
         image, seen = _seen(frame, parameters)
-        found = _localize(session, observe(image, seen), landmark_map, options, parameters)
-        if keyframes is not None:
-            assert session.observation is not None
-            found = join_keyframes(
-                found, Image(query_features(image), seen.camera, session.observation),
-                landmark_map, keyframes, options)
+        recognizer = None if keyframes is None else ImageRecognizer(
+            keyframes, query_features(image), seen.camera)
+        found = _localize(session, observe(image, seen), landmark_map, options, parameters,
+                          recognizer)
     assert found is not None  # a case has a frame
     accepted = case.report.get('found') == 'accepted'
     reason = '' if accepted else str(case.report.get('reason', '')).rpartition(' [')[0]
@@ -115,12 +116,13 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
 
 
 def _localize(session: Session, observation: Observation, landmark_map: LandmarkMap,
-              options: RelocalizerOptions, parameters: Mapping[str, Any]) -> Relocalization:
+              options: RelocalizerOptions, parameters: Mapping[str, Any],
+              recognizer: ImageRecognizer | None) -> Relocalization:
     stages = stages_of(landmark_map, observation, options)
     if observation.odom_from_camera is None:
-        return session.localize(next(stages), more=stages)
+        return session.localize(next(stages), more=stages, recognizer=recognizer)
     return session.localize(next(stages), 0, parameters['fuse_frames'],
-                            parameters['fuse_window_s'], stages)
+                            parameters['fuse_window_s'], stages, recognizer)
 
 
 def _seen(frame: CaseFrame, parameters: Mapping[str, Any]

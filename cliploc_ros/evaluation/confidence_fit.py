@@ -11,17 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
-from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Objects
 from cliploc_ros.core.acceptance.confidence import (
-    DEFAULT,
-    Calibration,
     Setting,
     confidences,
     none_right,
     utilities,
 )
 from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import OptionsError
@@ -64,7 +62,7 @@ class Case:
     is_elsewhere : bool
         Whether the map shows another place, so that every pose is wrong.
     certainty : float
-        See Evidence.
+        That nothing besides the poses found makes the best one wrong, see Evidence.
     """
 
     place: str
@@ -86,16 +84,18 @@ def judge(found: Relocalization, map_from_camera: NDArray[np.float64], place: st
     return Case(place, tuple(one.support for one in found.hypotheses), poses,
                 (errors < RIGHT_M) & (not is_elsewhere),
                 np.array([one.handicap for one in found.hypotheses]), setting, weight,
-                is_elsewhere, 1.0 if found.evidence is None else found.evidence.certainty)
+                is_elsewhere, 1.0 if found.evidence is None
+                else found.evidence.certainty * found.evidence.found)
 
 
-def outcomes(cases: Sequence[Case], calibration: Calibration = DEFAULT) -> Judged:
+def outcomes(cases: Sequence[Case], calibration: Calibration = CALIBRATION) -> Judged:
     """Return the confidence (n,) in the likeliest pose of each case, and whether it is right."""
     likely, right = [], []
     for case in cases:
         lead = _lead(case, calibration)
-        likely.append(case.certainty * confidences(case.supports, case.poses, case.setting,
-                                                   calibration, case.handicaps)[lead])
+        likely.append(case.certainty * confidences(
+            utilities(case.supports, calibration) - case.handicaps, case.poses,
+            none_right(case.setting, calibration), calibration)[lead])
         right.append(case.right[lead])
     return np.array(likely), np.array(right, dtype=bool)
 
@@ -104,7 +104,7 @@ def _lead(case: Case, calibration: Calibration) -> int:
     """Return which hypothesis leads; one that contradicts a known vertical never does."""
     odds = utilities(case.supports, calibration) - case.handicaps
     if case.setting.vertical > 0.0:
-        odds = np.where(case.handicaps < WRONG_MOUNT, odds, -np.inf)
+        odds = np.where(case.handicaps < CALIBRATION.attitude.wrong_mount, odds, -np.inf)
     return int(np.argmax(odds))
 
 
@@ -131,13 +131,15 @@ def fit(cases: Sequence[Case]) -> Calibration:
     data = _arrays(cases)
     scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
     bounds = list(_SIGNS)
-    start = np.append(np.zeros(len(_FIELDS)), [1.0, DEFAULT.map_size, DEFAULT.vertical])
+    installed = CALIBRATION.objects
+    start = np.append(np.zeros(len(_FIELDS)), [1.0, installed.map_size, installed.vertical])
     for column in (1, 2):  # size of the map, vertical
         if np.ptp(data.settings[:, column]) == 0.0:
             row = len(_FIELDS) + column
             bounds[row] = (start[row], start[row])
     solved = minimize(_loss, start, (data, scale), jac=True, method='L-BFGS-B', bounds=bounds)
-    return _levelled(cases, Calibration(*map(float, [*solved.x / scale, 0.0, 0.0])))
+    return _levelled(cases, CALIBRATION._replace(
+        objects=Objects(*map(float, [*solved.x / scale, 0.0, 0.0]))))
 
 
 def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
@@ -161,14 +163,15 @@ def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
                  for knee in _KNEES]
     best = int(np.argmin([one.fun for one in solutions]))
     shift, slope = solutions[best].x
-    return raw._replace(none_right=raw.none_right + float(shift), knee=_KNEES[best],
-                        slope=float(np.clip(slope, 0.0, _MOST_SLOPE)))
+    return raw._replace(objects=raw.objects._replace(
+        none_right=raw.objects.none_right + float(shift), knee=_KNEES[best],
+        slope=float(np.clip(slope, 0.0, _MOST_SLOPE))))
 
 
 def _log_odds(case: Case, lead: int, calibration: Calibration) -> tuple[float, float, float]:
     """Return the utilities of the leading place, of all hypotheses, and of none being right."""
     odds = utilities(case.supports, calibration) - case.handicaps
-    agreeing = agreeing_poses(case.poses)[lead]
+    agreeing = SAME_ANSWER.agreeing(case.poses)[lead]
     return (float(np.logaddexp.reduce(odds[agreeing])), float(np.logaddexp.reduce(odds)),
             none_right(case.setting, calibration))
 
@@ -265,9 +268,9 @@ def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[
 
 
 def paste(calibration: Calibration) -> str:
-    """Return the coefficients as source code."""
-    return ('\nfitted on all of them, for cliploc_ros/core/acceptance/confidence.py:\n'
-            + ', '.join(f'{name}={value:.3g}' for name, value in calibration._asdict().items()))
+    """Return the coefficients for the installed file."""
+    return '\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
+        f'{name}: {value:.3g}' for name, value in calibration.objects._asdict().items())
 
 
 def draw_judged(folder: Path, title: str, judged: Mapping[str, Judged]) -> None:

@@ -13,11 +13,9 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
-from cliploc_ros.core.combination import Image
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.datasets.frames import Frames
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.evaluation.trials import ImageFeatures, Query
 
 
 def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]:
@@ -43,12 +41,5 @@ def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]
         begin = time.perf_counter()
         features = query_features(frame.image_rgb)
         spent_ms = 1e3 * (time.perf_counter() - begin)
-        # boxes of a recording are undistorted, features are not
-        observation = replace(queries[row].observation, camera=_pinhole(frame.camera))
-        found[row] = replace(queries[row], image=Image(features, frame.camera, observation),
-                             features_ms=spent_ms)
+        found[row] = replace(queries[row], image=ImageFeatures(features, frame.camera, spent_ms))
     return tuple(found)
-
-
-def _pinhole(camera: Camera) -> Camera:
-    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

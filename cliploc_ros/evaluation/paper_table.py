@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cliploc_ros.core.acceptance.confidence import FITTED_ON
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary, compare, find_best
 from cliploc_ros.evaluation.trials import Result
@@ -73,7 +72,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
              '(one of bf and auto, which draw no samples); ± is the standard deviation over '
              'trials, at 1 m.',
-             f'Confidences are fitted on {FITTED_ON}.']
+             'Confidences are fitted on simulated worlds.']
     lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'

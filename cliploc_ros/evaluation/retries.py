@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
 from cliploc_ros.core.acceptance.verdict import refusal
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation

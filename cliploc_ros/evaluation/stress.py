@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation import sensors, troubles

@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods run on queries: the pose that each search found, and its error."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.combination import Image, join_keyframes
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.joined_map import place_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -32,6 +32,14 @@ from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.units import NS_PER_S
 
 
+class ImageFeatures(NamedTuple):
+    """Local features, the camera that they are of, and the time that they took [ms]."""
+
+    features: Features
+    camera: Camera
+    spent_ms: float
+
+
 @dataclass(frozen=True)
 class Query:
     """An observation to localize, and the true pose.
@@ -45,18 +53,15 @@ class Query:
         Ground truth.
     neighbours : tuple of Observation
         Other frames, which odometry links to it.
-    image : Image, optional
+    image : ImageFeatures, optional
         Its local features, for keyframes.
-    features_ms : float
-        Time that they took [ms].
     """
 
     number: int
     observation: Observation
     map_from_camera: NDArray[np.float64]
     neighbours: tuple[Observation, ...] = ()
-    image: Image | None = None
-    features_ms: float = 0.0
+    image: ImageFeatures | None = None
 
 
 @dataclass(frozen=True)
@@ -199,32 +204,32 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     localize = _localize_on_demand if on_demand else _localize
     results = []
     for query in queries:
-        found, crops_share = localize(landmark_map, relocalizer, query)
-        spent_ms = 0.0
+        recognizer, spent_ms = None, 0.0
         if keyframes is not None and query.image is not None and method.keyframes:
-            begin = time.perf_counter()
-            found = join_keyframes(found, query.image, landmark_map, keyframes,
-                                   relocalizer.options)
-            spent_ms = query.features_ms + 1e3 * (time.perf_counter() - begin)
+            recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
+        found, crops_share = localize(landmark_map, relocalizer, query, recognizer)
+        if recognizer is not None and query.image is not None:
+            spent_ms = query.image.spent_ms + recognizer.spent_ms
         results.append(replace(_judge(landmark_map, method.name, trial, query, found, crops_share),
                                keyframes_ms=spent_ms))
     return results
 
 
-def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
-              ) -> tuple[Relocalization, float]:
+def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query,
+              recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
     """Localize with all crops; return the result and the share of crops compared."""
-    found = relocalizer.relocalize([*query.neighbours, query.observation])
+    found = relocalizer.relocalize([*query.neighbours, query.observation], recognizer)
     return found, float(relocalizer.options.needs_similarities)
 
 
-def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query
-                        ) -> tuple[Relocalization, float]:
+def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query,
+                        recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
     """Localize as the node does: with each frame after those before it, crops on demand."""
     frames: list[SearchedFrame] = []
     for observation in (*query.neighbours, query.observation):
         frame, found = localize_on_demand(
-            relocalizer, frames, stages_of(landmark_map, observation, relocalizer.options))
+            relocalizer, frames, stages_of(landmark_map, observation, relocalizer.options),
+            recognizer=recognizer if observation is query.observation else None)
         frames.append(frame)
     crops = sum(len(one.observation.detections) for one in frames)
     compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
@@ -252,4 +257,4 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
         map='' if pose is None else place_of(landmark_map, pose).name,
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
-        keyframe_inliers=0 if found.recognized is None else int(found.recognized.inliers))
+        keyframe_inliers=0 if found.recognized is None else found.recognized.inliers)

@@ -55,6 +55,13 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     return replace(landmark_map, centers=centers), queries
 
 
+def mirror_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                     rng: np.random.Generator) -> World:
+    """Mirror the map left to right, as a robot sees a room in a mirror; the share is ignored."""
+    return replace(landmark_map, centers=landmark_map.centers * (-1.0, 1.0, 1.0),
+                   quats_xyzw=landmark_map.quats_xyzw * (1.0, -1.0, -1.0, 1.0)), queries
+
+
 def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange labels and classes of a share of the landmarks."""

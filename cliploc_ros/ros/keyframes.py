@@ -5,22 +5,25 @@
 import logging
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.combination import Image, join_keyframes
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
+from cliploc_ros.core.keyframes.localization import (
+    KeyframeLocalizer,
+    query_features,
+)
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_urls import path_of
+from cliploc_ros.ros.node.diagnostics import StageTimes
 
 logger = logging.getLogger(__name__)
 
@@ -31,21 +34,18 @@ _LEAST_S = 0.5
 
 
 class Keyframes:
-    """A layer, and the map that it belongs to.
+    """A layer, and where it is from.
 
     Parameters
     ----------
     localizer : KeyframeLocalizer
-    landmark_map : LandmarkMap
     file, file_hash : str
         Where the layer is from, for the diagnostics.
     """
 
-    def __init__(self, localizer: KeyframeLocalizer, landmark_map: LandmarkMap, file: str = '',
-                 file_hash: str = '') -> None:
+    def __init__(self, localizer: KeyframeLocalizer, file: str = '', file_hash: str = '') -> None:
         self.file, self.file_hash = file, file_hash
         self._localizer = localizer
-        self._map = landmark_map
         self._notes: set[str] = set()
 
     def __len__(self) -> int:
@@ -57,29 +57,27 @@ class Keyframes:
         """Return the layer."""
         return self._localizer.layer
 
-    def join(self, found: Relocalization, image_rgb: NDArray[np.uint8], observation: Observation,
-             options: RelocalizerOptions, deadline: float) -> Relocalization:
-        """Return the answer of objects and keyframes together.
+    def recognizer(self, image_rgb: NDArray[np.uint8], camera: Camera, deadline: float,
+                   times: StageTimes) -> ImageRecognizer | None:
+        """Return the keyframe search of an image; None where too little time is left.
 
         Parameters
         ----------
-        found : Relocalization
-            By objects.
         image_rgb : ndarray (h, w, 3) uint8
-        observation : Observation
-            Of the image.
-        options : RelocalizerOptions
+        camera : Camera
         deadline : float
             When the request ends (monotonic clock) [s].
+        times : StageTimes
+            Of this image.
         """
         if deadline - time.monotonic() < _LEAST_S:
-            return found
-        note = self._localizer.layer.camera_note(observation.camera)
+            return None
+        note = self._localizer.layer.camera_note(camera)
         if note and note not in self._notes:
             self._notes.add(note)
             logger.warning('%s', note)
-        image = Image(query_features(image_rgb), observation.camera, observation)
-        return join_keyframes(found, image, self._map, self._localizer, options, deadline)
+        return ImageRecognizer(self._localizer, partial(query_features, image_rgb), camera,
+                               deadline, times.begin)
 
 
 def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyframes | None:
@@ -95,7 +93,7 @@ def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyf
         return None
     try:
         layer = load_layer_of_map(path, landmark_map)
-        return Keyframes(KeyframeLocalizer(layer), landmark_map, str(path), layer_hash(path))
+        return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
     except MapError as error:
         logger.error('localizing without keyframes: %s', error)
         return None

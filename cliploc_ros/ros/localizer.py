@@ -176,21 +176,21 @@ class Localizer:
         observation = Observation(
             camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
             up_in_camera=state.up_in_camera,
-            odom_from_camera=None if place is None else place.odom_from_camera)
+            odom_from_camera=None if place is None else place.odom_from_camera,
+            odom_way_m=0.0 if place is None else place.way_m)
         options = relocalizer_options(values)
         session = self._session_for(options)
         times.begin('search')
         stages = self._stages(image, observation, options, times, deadline)
+        recognizer = None if self._keyframes is None else self._keyframes.recognizer(
+            image, camera, deadline, times)
         if place is None:
-            found = session.localize(next(stages), more=stages)
+            found = session.localize(next(stages), more=stages, recognizer=recognizer)
         else:
             found = session.localize(next(stages), place.run, values['fuse_frames'],
-                                     values['fuse_window_s'], stages)
+                                     values['fuse_window_s'], stages, recognizer)
         seen = session.observation
         assert seen is not None
-        if self._keyframes is not None:
-            times.begin('keyframes')
-            found = self._keyframes.join(found, image, seen, options, deadline)
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = session.covariance_for_filter(found) \

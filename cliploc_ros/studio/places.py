@@ -122,7 +122,7 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
         is_whole = len(trials) % _OPTIONS.headings == 0
         if is_whole and time.monotonic() - begin > limit_s:
             break
-    look_alikes = find_look_alikes(landmark_map, np.random.default_rng(_OPTIONS.random_seed))
+    look_alikes = find_look_alikes(landmark_map)
     return Places(landmarks, grid, judge_grid(grid, model, trials, _OPTIONS.headings),
                   tuple(look_alikes), detector)
 

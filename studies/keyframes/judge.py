@@ -5,26 +5,28 @@
 import pickle
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
-from cliploc_ros.core.acceptance.recognition import NO_OBJECTS, objects_there
-from cliploc_ros.core.combination import combine
 from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trust import draw_reliability, within_ellipsoid
-from studies.keyframes.records import Record, StoredCase, by_objects
+from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
 
 WAYS = ('objects', 'keyframes', 'both')
 _LIMITS_M = (0.1, 0.25, 0.5, 1.0)
-_NOTHING = Relocalization(False, 'not searched')
+_NO_BOXES = Detections(np.empty((0, 4)), (), np.empty(0))
 
 
 class Outcome(NamedTuple):
@@ -47,18 +49,19 @@ class Outcome(NamedTuple):
 
 def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
     """Return the package's answer to a record by objects, by keyframes, or by both."""
-    found = _NOTHING if way == 'keyframes' else _by_objects(case, record)
-    last = record.looks[-1]
-    if way == 'objects' or last.seen is None:
-        return found
-    there = NO_OBJECTS if way == 'keyframes' else objects_there(
-        case.landmark_map, last.searched.observation, last.seen.map_from_camera)
-    return combine(found, last.seen, there, record.options)
+    searched, keyframes = [one.searched for one in record.looks], _keyframes(case)
+    if way == 'keyframes':
+        relocalizer = Relocalizer(case.landmark_map, record.options)
+        searched = [relocalizer.search(replace(one.observation, detections=_NO_BOXES))
+                    for one in searched]
+    return localize(case.landmark_map, record.options, searched, [
+        None if way == 'objects' else StoredRecognizer(
+            one.seen, keyframes, one.searched.observation.camera) for one in record.looks])
 
 
 @lru_cache(maxsize=1)
-def _by_objects(case: StoredCase, record: Record) -> Relocalization:
-    return by_objects(case.landmark_map, record.options, [one.searched for one in record.looks])
+def _keyframes(case: StoredCase) -> KeyframeLocalizer:
+    return KeyframeLocalizer(case.layer)
 
 
 def make_judge() -> Callable[[Path], list[Outcome]]:

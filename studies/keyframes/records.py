@@ -14,18 +14,26 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes import features
-from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.features import DIMENSIONS, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognized, query_features
+from cliploc_ros.core.keyframes.localization import (
+    NOTHING_KNOWN,
+    KeyframeLocalizer,
+    Recognition,
+    query_features,
+)
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.search.prior import Prior
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera
@@ -36,7 +44,8 @@ from cliploc_ros.mapping.building import build_map
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.recording.networks import MAX_DETECTIONS, Look
+from cliploc_ros.recording.networks import MAX_DETECTIONS
+from cliploc_ros.recording.networks import Look as Networks
 from cliploc_ros.recording.recorder import record_every_frame
 from studies.keyframes.cases import (
     Case,
@@ -51,7 +60,6 @@ from studies.keyframes.cases import (
     pose_of,
 )
 
-_GUESSES = 3  # poses of objects that propose keyframes
 # Of a rendered room: what is mapped, what is asked, and where second looks come from.
 _ROOM_WALKS = (('mapping', 'viewpoints', 'viewpoints_aside'),
                ('mapping', 'other_light', 'other_light_aside'),
@@ -59,10 +67,10 @@ _ROOM_WALKS = (('mapping', 'viewpoints', 'viewpoints_aside'),
 
 
 class Seen(NamedTuple):
-    """What is known of one image: the search of its objects, and its keyframes."""
+    """What is known of one image: the search of its objects, and what keyframes say."""
 
     searched: SearchedFrame
-    seen: Recognized | None
+    seen: Recognition
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,23 +85,41 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class StoredCase:
-    """The records of a case at a place, and its changed map."""
+    """The records of a case at a place, its changed map, and its layer without descriptors."""
 
     place: str
     name: str
     landmark_map: LandmarkMap
+    layer: KeyframeLayer
     records: tuple[Record, ...]
 
 
-def by_objects(landmark_map: LandmarkMap, options: RelocalizerOptions,
-               frames: list[SearchedFrame]) -> Relocalization:
-    """Return the answer of objects at the last look of a robot that looked before, too."""
+_NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, DIMENSIONS), np.uint8),
+                        np.empty(0, np.float32))
+
+
+class StoredRecognizer(ImageRecognizer):
+    """Says of an image again what keyframes said when it was collected."""
+
+    def __init__(self, seen: Recognition, keyframes: KeyframeLocalizer, camera: Camera) -> None:
+        super().__init__(keyframes, _NO_FEATURES, camera)
+        self._seen = seen
+
+    def recognize(self, guesses: Sequence[Floats], prior: Prior = NOTHING_KNOWN) -> Recognition:
+        """Return what was stored."""
+        return self._seen
+
+
+def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
+             frames: Sequence[SearchedFrame],
+             recognizers: Sequence[ImageRecognizer | None]) -> Relocalization:
+    """Return the answer at the last look of a robot that looked before, too."""
     relocalizer, looks = Relocalizer(landmark_map, options), Looks()
-    for count in range(1, len(frames) + 1):
-        found = relocalizer.locate(frames[:count], looks=looks)
+    for count, (frame, recognizer) in enumerate(zip(frames, recognizers, strict=True), start=1):
+        found = relocalizer.locate(frames[:count], looks=looks, recognizer=recognizer)
         if found.map_from_camera is not None:
-            looks = looks.with_look(frames[count - 1].observation, found.map_from_camera,
-                                    found.confidence)
+            looks = looks.with_look(Look(frame.observation, found.map_from_camera,
+                                         found.confidence, found.recognized))
     return found
 
 
@@ -160,7 +186,9 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
                 records[number] = _ask(number, case, query, world.landmark_map, localizer, looker,
                                        rng)
         if len(records) > len(stored):
-            _keep(path, StoredCase(place.name, name, world.landmark_map, tuple(records.values())))
+            _keep(path, StoredCase(place.name, name, world.landmark_map, replace(
+                world.layer, descriptors=np.empty((0, DIMENSIONS), np.uint8)),
+                tuple(records.values())))
     return collect
 
 
@@ -172,7 +200,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
             raw for raw in place.mapped
             if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
         landmark_map = build_map(
-            record_every_frame(frames, Look(looker)).detections).landmark_map \
+            record_every_frame(frames, Networks(looker)).detections).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '
@@ -200,11 +228,12 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
         searched = relocalizer.search(Observation(
             camera, boxes, stamp_ns=second * 1_000_000_000, up_in_camera=query.up_in_camera,
             odom_from_camera=odom))
-        found = by_objects(landmark_map, options, [*(one.searched for one in looks), searched])
-        guesses = [one.map_from_camera for one in found.hypotheses[:_GUESSES]]
-        local = Features(*(column[:case.features]
-                           for column in vars(looker.features(image)).values()))
-        looks.append(Seen(searched, localizer.localize_features(local, camera, guesses)))
+        recognizer = ImageRecognizer(localizer, Features(
+            *(column[:case.features] for column in vars(looker.features(image)).values())),
+            camera)
+        found = relocalizer.locate([*(one.searched for one in looks), searched],
+                                   recognizer=recognizer)
+        looks.append(Seen(searched, found.recognition or Recognition()))
     return Record(number, tuple(looks), query.truths, options)
 
 

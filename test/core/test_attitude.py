@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, utilities
+from cliploc_ros.core.acceptance.attitude import tilt_handicaps
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    confidences,
+    none_right,
+    utilities,
+)
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
@@ -17,6 +23,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 
+WRONG_MOUNT = CALIBRATION.attitude.wrong_mount
 # Optical axes of a level camera that looks along the map's x axis: right, down, forward.
 LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
@@ -44,10 +51,11 @@ def test_the_heading_does_not_matter_nor_a_deviation_of_zero():
 
 
 def test_a_handicap_takes_confidence_and_gives_it_to_the_rival():
-    supports, poses = [Support(4, 2.5, 6.0, 8.0, 6.0)] * 2, np.tile(np.eye(4), (2, 1, 1))
+    odds, poses = utilities([Support(4, 2.5, 6.0, 8.0, 6.0)] * 2), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 5.0
-    level = confidences(supports, poses, Setting(40))
-    upside_down = confidences(supports, poses, Setting(40), handicaps=np.array([WRONG_MOUNT, 0.0]))
+    none = none_right(Setting(40))
+    level = confidences(odds, poses, none)
+    upside_down = confidences(odds - [WRONG_MOUNT, 0.0], poses, none)
     assert level[0] == pytest.approx(level[1])
     assert upside_down[0] < 0.02 < level[1] < upside_down[1]
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import (
     DIMENSIONS,
@@ -17,7 +17,7 @@ from cliploc_ros.core.keyframes.features import (
     match,
     unit_rows,
 )
-from cliploc_ros.core.keyframes.point_pose import find_pose
+from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
@@ -39,7 +39,7 @@ def test_a_pose_is_exact_without_noise_and_despite_outliers(far_m):
     rng = np.random.default_rng(1)
     pose, points, bearings = look(rng, offset=(far_m, 0.0, 0.0))
     bearings[:100] = rng.permutation(bearings[:100])
-    found = find_pose(points, bearings, CAMERA)
+    found = find_pose(points, bearings)
     error_m, error_deg = pose_error(found.map_from_camera, pose)
     assert error_m < 1e-4
     assert error_deg < 1e-3
@@ -50,20 +50,40 @@ def test_covariances_of_noisy_features_are_honest():
     rng, squares = np.random.default_rng(2), []
     for _ in range(60):
         pose, points, bearings = look(rng, 60, noise_px=1.0)
-        found = find_pose(points, bearings, CAMERA)
+        found = find_pose(points, bearings)
         squares.append(normalized_square(found.map_from_camera, found.covariance, pose))
     # six degrees of freedom; the deviation of this mean is .45
     assert 4.0 < np.mean(squares) < 8.0
 
 
+@pytest.mark.parametrize('ratio', [0.5, 0.8, 0.95, 1.0, 1.05, 1.25, 2.0])
+def test_points_tell_the_focal_length_also_where_few_agree_with_the_given_one(ratio):
+    rng = np.random.default_rng(12)
+    _, points, bearings = look(rng, 400, noise_px=1.0)
+    bearings[::4] = rng.permutation(bearings[::4])
+    start = invert_transform(find_pose(points, bearings * ratio).map_from_camera)
+    found, deviation, inliers = free_focal(points, bearings * ratio, start)
+    assert abs(np.log(found / ratio)) < 2.0 * deviation < 0.03
+    assert len(inliers) > 250
+
+
+def test_a_plane_that_fills_little_of_the_image_tells_no_focal_length():
+    rng = np.random.default_rng(13)
+    bearings = rng.uniform(-0.1, 0.1, (100, 2))
+    points = 2.0 * np.column_stack([bearings, np.ones(100)])
+    bearings += rng.normal(0.0, 1.0 / CAMERA.fx, bearings.shape)
+    found = free_focal(points, bearings, np.eye(4))
+    assert found is None or found[1] > 0.5
+
+
 def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
     rng = np.random.default_rng(3)
     _, points, bearings = look(rng, 30)
-    assert find_pose(points[:5], bearings[:5], CAMERA) is None
-    assert find_pose(np.empty((0, 3)), np.empty((0, 2)), CAMERA) is None
-    found = find_pose(points, rng.permutation(bearings), CAMERA)
+    assert find_pose(points[:5], bearings[:5]) is None
+    assert find_pose(np.empty((0, 3)), np.empty((0, 2))) is None
+    found = find_pose(points, rng.permutation(bearings))
     assert found is None or len(found.inliers) < 12
-    assert find_pose(np.ones((20, 3)), np.zeros((20, 2)), CAMERA) is None
+    assert find_pose(np.ones((20, 3)), np.zeros((20, 2))) is None
 
 
 def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_points():
@@ -78,10 +98,26 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
                         np.zeros((180, DIMENSIONS), np.uint8), np.ones(180, np.float32))
     matched = localization._Matched(np.arange(180), np.concatenate([points, shown]),
                                     np.repeat([0, 1], [60, 120]), np.arange(180))
-    first, second = localization._places(matched, localization._Look(features, seen, CAMERA))
+    look_at = localization._Look(features, seen, CAMERA)
+    first, second = localization._places(localization._place(matched, look_at), matched, look_at)
     assert pose_error(first.map_from_camera, room)[0] < 1e-3
     assert pose_error(second.map_from_camera, poster)[0] < 1e-3
     assert (first.agreed, second.agreed) == (60, 120)
+
+
+def test_of_equal_rooms_each_is_a_place_of_its_own():
+    rng = np.random.default_rng(9)
+    pose, points, bearings = look(rng, 40)
+    features = Features(bearings * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
+                        np.zeros((40, DIMENSIONS), np.uint8), np.ones(40, np.float32))
+    rooms = [points + np.array([x, 0.0, 0.0]) for x in (0.0, 10.0, 20.0)]
+    matched = localization._Matched(np.tile(np.arange(40), 3), np.concatenate(rooms),
+                                    np.repeat([0, 1, 2], 40), np.arange(120))
+    look_at = localization._Look(features, bearings, CAMERA)
+    found = localization._places(localization._place(matched, look_at), matched, look_at)
+    assert sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found])) == [
+        0.0, 10.0, 20.0]
+    assert [one.agreed for one in found] == [40, 40, 40]
 
 
 def test_rays_of_equal_features_meet_in_their_point():

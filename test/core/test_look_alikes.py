@@ -149,10 +149,12 @@ def test_what_was_matched_must_look_alike_too():
 
 def test_only_labels_tell_places_apart():
     own = Support(inliers=6, score=5.0, likeness=12.0)
-    assert chance_distinct(own, [Support(inliers=3, score=2.0, likeness=12.0)]) == (0.5, 0)
+    same = Support(inliers=3, score=2.0, likeness=12.0)
+    assert chance_distinct(own, [same], np.zeros(1)) == (0.5, 0)
     differing = Support(inliers=3, score=2.0, likeness=0.0)
-    assert chance_distinct(own, [differing])[0] > 0.99
-    chance, likeliest = chance_distinct(own, [differing, Support(likeness=1e9), differing])
+    assert chance_distinct(own, [differing], np.zeros(1))[0] > 0.99
+    chance, likeliest = chance_distinct(own, [differing, Support(likeness=1e9), differing],
+                                        np.zeros(3))
     assert (chance < 1e-6, likeliest) == (True, 1)
 
 

@@ -108,7 +108,7 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     stages = crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: 0)
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
     assert found.confidence == sure > options.min_confidence
-    assert not found.accepted and 'without all crops; raise timeout_s' in found.reason
+    assert not found.accepted and 'without 12 crops; raise timeout_s' in found.reason
     assert found.refusal_kind == 'not_all_crops'
 
 

@@ -39,8 +39,9 @@ def boxes_at(map_from_camera, noise_px=0.0, rng=None):
     return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
 
 
-def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None):
-    """The pose of the last camera in a map with these centres, and its covariances."""
+def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None,
+           wrong_share=0.0):
+    """The pose of the last camera in a map with these centres, and its covariance."""
     scenes = [make_scene(CAMERA.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
                          ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
               for pose in poses]
@@ -50,7 +51,8 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=No
     found = refine_rig(rig, start[:3, :3].copy(), start[:3, 3].copy())
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
-            refined_covariance(rig, found.rotation, found.translation, stamps, shared))
+            refined_covariance(rig, found.rotation, found.translation, stamps, shared,
+                               wrong_share))
 
 
 def turning(count):
@@ -68,7 +70,7 @@ def test_errors_of_landmarks_are_covered_if_the_map_states_them(frames):
         for name, given in (('stated', sigma), ('default', DEFAULT_SIGMA_M)):
             pose, covariance = fitted(turning(frames), centers, given,
                                       np.random.default_rng(seed), 2.0)
-            squares[name].append(normalized_square(pose, covariance.matched,
+            squares[name].append(normalized_square(pose, covariance,
                                                    MAP_FROM_CAMERA if frames == 1
                                                    else turning(frames)[-1]))
     shares = {name: (np.array(one) < chi2.ppf(0.95, 6)).mean() for name, one in squares.items()}
@@ -79,29 +81,31 @@ def test_errors_of_landmarks_are_covered_if_the_map_states_them(frames):
 
 
 def test_errors_of_landmarks_do_not_average_out_over_frames():
-    one, four = (fitted([MAP_FROM_CAMERA] * count, ROOM.centers, 0.2)[1].matched
+    one, four = (fitted([MAP_FROM_CAMERA] * count, ROOM.centers, 0.2)[1]
                  for count in (1, 4))
     np.testing.assert_allclose(four, one, rtol=0.1, atol=1e-6)
 
 
 def test_the_covariance_holds_the_chance_that_an_object_is_wrong():
-    _, covariance = fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)
-    added = covariance.whole - covariance.matched
+    def added_in(centers):
+        return (fitted([MAP_FROM_CAMERA], centers, 0.02, wrong_share=0.07)[1]
+                - fitted([MAP_FROM_CAMERA], centers, 0.02)[1])
+
+    added = added_in(ROOM.centers)
     assert np.linalg.eigvalsh(added).min() > -1e-9
-    assert np.trace(added[:3, :3]) > 0.01 * np.trace(covariance.matched[:3, :3])
+    assert np.trace(added[:3, :3]) > 0.01 * np.trace(
+        fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)[1][:3, :3])
     displaced = ROOM.centers.copy()
     displaced[4] += [0.15, 0.1, 0.0]
-    _, contradicted = fitted([MAP_FROM_CAMERA], displaced, 0.02)
-    more = contradicted.whole - contradicted.matched
-    assert np.trace(more[:3, :3]) > np.trace(added[:3, :3])
+    assert np.trace(added_in(displaced)[:3, :3]) > np.trace(added[:3, :3])
 
 
 def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
     """The reference first, last or between: steps add up outwards from it."""
     way = [MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([0.3 * step, 0.0, 0.0]))
            for step in (0, 1, 2, 1)]
-    middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1].matched
-    end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1].matched
+    middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1]
+    end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1]
     assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
 
 
@@ -149,7 +153,7 @@ def test_an_error_that_all_landmarks_share_is_that_of_the_pose(frames):
         for name, shared in (('stated', sigmas), ('unknown', 0 * sigmas)):
             pose, covariance = fitted(poses, centers, 0.01, np.random.default_rng(seed), 2.0,
                                       shared=np.tile(shared, (len(ROOM), 1)))
-            squares[name].append(normalized_square(pose, covariance.matched, poses[-1]))
+            squares[name].append(normalized_square(pose, covariance, poses[-1]))
     shares = {name: (np.array(one) < chi2.ppf(0.95, 6)).mean() for name, one in squares.items()}
     print(f'\n{frames} frames, map off by 5 cm and 2 degrees: {shares} in the 95 % ellipsoids')
     assert shares['stated'] >= 0.87

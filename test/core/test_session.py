@@ -9,11 +9,9 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.recognition import ObjectsThere
-from cliploc_ros.core.combination import combine
+from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN, Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -160,34 +158,48 @@ def test_a_frame_that_cannot_be_searched_is_dropped(session):
     assert fused(session, frame(2.0, 20.0)) == 2
 
 
-def drive(session, seconds, metres, run=0):
+def drive(session, seconds, metres, run=0, objects=12):
     """Localize with a view that never changes, although odometry says that the robot drives."""
-    return session.localize(frame(seconds, metres=metres), run, limit=1, length_s=5.0)
+    seen = SEEN.select(np.arange(objects))
+    return session.localize(frame(seconds, metres=metres, detections=seen), run, limit=1,
+                            length_s=5.0)
 
 
 def test_a_pose_that_earlier_looks_contradict_is_refused(session):
-    found = drive(session, 0.0, 0.0)
-    assert found.accepted
-    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
-    for number in range(1, 7):
-        found = drive(session, number, 1.0 * number)
+    for number in range(4):
+        found = drive(session, number, 3.0 * number, objects=3)
         assert not found.accepted and found.hypotheses
-    assert found.reason.startswith('mean confidence 0.14 < 0.5 of the last 7 frames in this pose')
+    found = drive(session, 5.0, 12.0)
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
+    assert found.reason.startswith('mean confidence 0.')
+    assert 'of the last 5 frames in this pose' in found.reason
 
 
-def test_looks_persist_across_requests_while_odometry_links_them(session):
+def test_an_accepted_pose_ends_the_looks(session):
+    """Odometry drifts between requests: what was accepted a while ago contradicts nothing."""
+    for number in range(35):
+        found = drive(session, 60.0 * number, 1.0 * number)
+        assert found.accepted, f'request {number}: {found.reason}'
+        assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
+
+
+def test_looks_that_led_to_no_accepted_pose_persist_while_odometry_links_them(session):
     """Frames are dropped after five seconds, looks are not."""
-    drive(session, 0.0, 0.0)
-    assert not drive(session, 1000.0, 3.0).accepted
-    assert drive(session, 2000.0, 3.0, run=1).accepted, 'another run'
-    assert not drive(session, 2001.0, 6.0, run=1).accepted
+    for number in range(4):
+        drive(session, number, 3.0 * number, objects=3)
+    assert not drive(session, 1000.0, 12.0).accepted
+    assert drive(session, 2000.0, 12.0, run=1).accepted, 'another run'
+    for number in range(4):
+        drive(session, 2001.0 + number, 3.0 * number, run=1, objects=3)
+    assert not drive(session, 2010.0, 15.0, run=1).accepted
     assert drive(session, 1999.0, 9.0, run=1).accepted, 'time went back'
 
 
 def test_the_same_frame_again_is_no_further_look(session):
-    drive(session, 0.0, 0.0)
+    for number in range(4):
+        drive(session, number, 3.0 * number, objects=3)
     for _ in range(3):
-        assert not drive(session, 1.0, 3.0).accepted
+        assert not drive(session, 10.0, 12.0).accepted
 
 
 class Camera:
@@ -196,11 +208,11 @@ class Camera:
     def __init__(self):
         self.looks = Looks()
 
-    def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0, confidence=1.0):
+    def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0, confidence=1.0, way_m=0.0):
         """Return the mean confidence of all looks in one that finds the camera at x_m, yaw_deg."""
-        observation = frame(seconds, degrees, metres)
+        observation = replace(frame(seconds, degrees, metres), odom_way_m=way_m)
         earlier = self.looks.confidences_in(observation, pose(yaw_deg, x_m))
-        self.looks = self.looks.with_look(observation, pose(yaw_deg, x_m), confidence)
+        self.looks = self.looks.with_look(Look(observation, pose(yaw_deg, x_m), confidence))
         return (sum(earlier) + confidence) / (len(earlier) + 1)
 
 
@@ -244,6 +256,13 @@ def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
     assert max(stuck) < 0.5, 'poses that do not move although the robot does'
 
 
+@pytest.mark.parametrize(('way_m', 'agrees'), [(0.0, False), (10.0, False), (33.0, True)])
+def test_the_further_a_robot_drove_the_less_exactly_looks_have_to_agree(camera, way_m, agrees):
+    """After 33 m, odometry that drifts by 3 % is wrong by 1 m; the robot is back at its start."""
+    camera.look(0.0, 0.0)
+    assert (camera.look(60.0, 1.0, way_m=way_m) == 1.0) == agrees
+
+
 def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
     for number in range(100):
         camera.look(number / 10, 9.0)
@@ -255,7 +274,7 @@ def test_a_look_without_odometry_stands_alone(camera):
     camera.look(0.0, 9.0)
     unlinked = replace(frame(1.0), odom_from_camera=None)
     assert camera.looks.confidences_in(unlinked, pose()) == ()
-    assert len(camera.looks.with_look(unlinked, pose(), 1.0)) == 1
+    assert len(camera.looks.with_look(Look(unlinked, pose(), 1.0))) == 1
 
 
 def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
@@ -272,25 +291,39 @@ def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
     np.testing.assert_array_equal(session.covariance_for_filter(alone), alone.covariance)
 
 
+class Says:
+    """A keyframe search with a known answer."""
+
+    def __init__(self, place):
+        self._place = place
+
+    def recognize(self, guesses, prior=NOTHING_KNOWN):
+        return Recognition((self._place,))
+
+    def coverage(self, map_from_camera):
+        return 1.0
+
+
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
+    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 200, 0.9, 0.9, 1.0))
 
-    def join(found, metres):
-        seen = Recognized(make_transform(MAP_FROM_CAMERA[:3, :3], MAP_FROM_CAMERA[:3, 3]
-                                         + np.array([metres, 0.0, 0.0])),
-                          fine, 200, 0, None, 0.8, 0.85, (0,))
-        return combine(found, seen, ObjectsThere(len(ROOM), 0), RELOCALIZER.options)
+    def localize(seconds, run=0, detections=SEEN, recognizer=keyframes):
+        found = session.localize(frame(seconds, detections=detections), run, 5, 5.0,
+                                 recognizer=recognizer)
+        assert found.accepted
+        return found
 
-    objects = session.localize(frame(0), 0, 5, 5.0)
-    first = join(objects, 0.01)
-    assert first.source == 'both' and first.accepted
+    first = localize(0)
+    assert first.source == 'both'
     given = session.covariance_for_filter(first)
     np.testing.assert_array_equal(given, fine)
-    assert (np.diag(given) < np.diag(objects.covariance)).all()
-    again = session.covariance_for_filter(join(session.localize(frame(1), 0, 5, 5.0), 0.01))
+    again = session.covariance_for_filter(localize(1))
     assert (np.diag(again) > 100.0 * np.diag(fine)).all(), 'nothing new'
-    rough = session.covariance_for_filter(session.localize(frame(2), 0, 5, 5.0))
+    objects = localize(2, recognizer=None)
+    assert (np.diag(given) < np.diag(objects.covariance)).all()
+    rough = session.covariance_for_filter(objects)
     assert (np.diag(rough) > 100.0 * np.diag(objects.covariance)).all(), 'objects tell less'
-    alone = join(session.localize(frame(3, detections=NOTHING), 1, 5, 5.0), 0.0)
-    assert alone.source == 'keyframes' and alone.accepted
+    alone = localize(3, 1, NOTHING)
+    assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)

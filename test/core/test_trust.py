@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import Setting, confidences
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    confidences,
+    none_right,
+    utilities,
+)
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
-from cliploc_ros.core.acceptance.verdict import Evidence, refusal
+from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
 from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
@@ -152,39 +157,44 @@ def poses_at(*positions):
 
 
 STRONG, WEAK = Support(7, 5.0, 10.0, 14.0, 14.0), Support(3, 1.5, 10.0, 2.0, 4.0)
-ROOM = Setting(40)
+ROOM, ORIGIN = Setting(40), (0.0, 0.0, 0.0)
+
+
+def share(supports, poses, setting):
+    """Return the confidences of poses that objects support."""
+    return confidences(utilities(supports), poses, none_right(setting))
 
 
 def test_confidence_is_shared_by_poses_that_differ():
-    alone = confidences([STRONG], poses_at(0), ROOM)[0]
-    first, second = confidences([STRONG, STRONG], poses_at(0, 5), ROOM)
+    alone = share([STRONG], poses_at(0), ROOM)[0]
+    first, second = share([STRONG, STRONG], poses_at(0, 5), ROOM)
     assert alone > 0.99
     assert first == pytest.approx(second)
     assert 0.45 < first <= 0.5
 
 
 def test_poses_that_agree_speak_for_each_other():
-    assert confidences([STRONG, STRONG], poses_at(0, 0.6), ROOM).min() > 0.99
+    assert share([STRONG, STRONG], poses_at(0, 0.6), ROOM).min() > 0.99
     turned = poses_at(0, 0.6)
     turned[1, :3, :3] = Rotation.from_euler('z', 90, degrees=True).as_matrix()
-    assert confidences([STRONG, STRONG], turned, ROOM).max() <= 0.5
+    assert share([STRONG, STRONG], turned, ROOM).max() <= 0.5
 
 
 def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
     fair = Support(4, 3.0, 8.0, 6.0, 8.0)
-    small, large, level, vague = (confidences([fair], poses_at(0), setting)[0] for setting in (
+    small, large, level, vague = (share([fair], poses_at(0), setting)[0] for setting in (
         Setting(20), Setting(2000), Setting(2000, 1.0), Setting(2000, 45.0)))
     assert large < level < small
     assert vague == large
     # a better vertical than any that the fit has seen says no more than the best of those
-    assert (confidences([fair], poses_at(0), Setting(2000, 0.01))
-            == confidences([fair], poses_at(0), Setting(2000, 0.5)))
+    assert (share([fair], poses_at(0), Setting(2000, 0.01))
+            == share([fair], poses_at(0), Setting(2000, 0.5)))
 
 
 def test_little_support_is_little_confidence():
-    weak, rival = confidences([WEAK, WEAK], poses_at(0, 5), ROOM)
+    weak, rival = share([WEAK, WEAK], poses_at(0, 5), ROOM)
     assert weak + rival < 0.3
-    assert confidences([Support()], poses_at(0), ROOM)[0] < 0.01
+    assert share([Support()], poses_at(0), ROOM)[0] < 0.01
 
 
 def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
@@ -193,7 +203,7 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
         count = rng.integers(1, 9)
         supports = [Support(int(rng.integers(0, 9)), rng.uniform(0, 9), rng.uniform(0, 30),
                             rng.uniform(0, 20)) for _ in range(count)]
-        found = confidences(supports, poses_at(*5.0 * np.arange(count)), ROOM)
+        found = share(supports, poses_at(*5.0 * np.arange(count)), ROOM)
         # none is more certain than .9999, so none is less likely than .0001
         assert (found >= 0).all() and found.sum() <= 1.0 + 1e-4 * count
         highest = max(highest, found.sum())
@@ -203,11 +213,13 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
 @pytest.mark.parametrize(('evidence', 'options', 'reason'), [
     (Evidence(3, 0.995), {'min_inliers': 4}, '3 objects matched < 4; turn the camera'),
     (Evidence(3, 0.995), {}, ''),
-    (Evidence(5, 0.5, 0.3), {}, 'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
-    (Evidence(5, 0.5, 0.1), {}, 'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
+    (Evidence(5, 0.5, rival=Rival(0.3, ORIGIN)), {},
+     'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
+    (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {},
+     'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
     (Evidence(5, 0.5, unexplained=4.0), {},
      'confidence 0.50 < 0.99; 5 objects matched, 4 unexplained; turn the camera to more objects'),
-    (Evidence(5, 0.1, 0.3), {}, 'confidence 0.10 < 0.99; ambiguous'),
+    (Evidence(5, 0.1, rival=Rival(0.3, ORIGIN)), {}, 'confidence 0.10 < 0.99; ambiguous'),
     (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
     (Evidence(8, 0.98999), {}, 'confidence 0.98 < 0.99; 8 objects matched'),
     (Evidence(8, 0.29), {}, 'confidence 0.29 < 0.99; 8 objects matched'),
@@ -248,9 +260,9 @@ def test_no_refusal_names_a_rival_at_the_same_place(office_map, queries, observe
                       for one in found.hypotheses]
             elsewhere = [one.confidence for one, (metres, degrees) in zip(
                 found.hypotheses, errors, strict=True) if metres >= 1.0 or degrees >= 45.0]
-            assert 0.0 < found.evidence.rival <= 1.0 - best.confidence
-            assert found.evidence.rival <= max(elsewhere) / (
-                found.evidence.found * found.evidence.near) + 1e-9
+            assert 0.0 < found.evidence.rival.likely <= 1.0 - best.confidence
+            assert found.evidence.rival.likely <= max(elsewhere) / (
+                found.evidence.found * found.evidence.certainty) + 1e-9
     assert ambiguous > 1
 
 

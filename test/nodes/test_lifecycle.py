@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from processes import PROJECT
@@ -68,9 +69,9 @@ def manage(start, tester):
     """Start a node that waits for its manager; return both."""
     managers = []
 
-    def run(name, fresh=False, **parameters):
+    def run(name, fresh=False, environment=(), **parameters):
         process = start(f'nodes.{name}', fresh=fresh,
-                        parameters={'autostart': 'false', **parameters})
+                        parameters={'autostart': 'false', **parameters}, **dict(environment))
         managers.append(Manager(tester, name))
         return process, managers[-1]
     yield run
@@ -199,6 +200,22 @@ def test_a_failing_configure_can_be_tried_again(manage, tester, room_map, tmp_pa
     assert 'the node is unconfigured' in tester.answer(tester.ask()).message
     manager.do('configure', 'activate')
     assert tester.relocalize(make_frame()).success
+
+
+def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_map):
+    """On the topic and with the name that Nav2's manager listens for, by a stand-in for bondpy."""
+    heard = []
+    tester.create_subscription(KeyValue, '/bond', heard.append, 10)
+    path = f'{PROJECT / "test/nodes/stand_ins"}:{os.environ.get("PYTHONPATH", "")}'
+    process, manager = manage('relocalizer', environment={'PYTHONPATH': path},
+                              **class_matching(room_map))
+    for _ in range(2):
+        manager.do('configure', 'activate')
+        tester.wait(lambda: KeyValue(key='relocalizer', value='alive') in heard, 'its heartbeat')
+        manager.do('deactivate', 'cleanup')
+        tester.wait(lambda: KeyValue(key='relocalizer', value='dead') in heard, 'its end')
+        heard.clear()
+    assert 'Traceback' not in process.output()
 
 
 def test_who_takes_over_a_node_that_started_itself_is_its_manager(own_relocalizer, tester):

@@ -8,7 +8,7 @@ import pytest
 from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
@@ -99,8 +99,9 @@ def layer_of(room, **images):
 def recognized(found):
     """Answer by five of the points, which the image shows 100 px further up."""
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
-    seen = Recognized(np.eye(4), np.eye(6), 5, 0, None, 0.8, 0.8, (0,), pixels, np.arange(5))
-    return replace(found, recognized=seen)
+    seen = RecognizedPlace(np.eye(4), np.eye(6), 5, 0.8, 0.8, keyframes=(0,), pixels=pixels,
+                           rows=np.arange(5))
+    return replace(found, recognized=Recognition((seen,)))
 
 
 def test_the_best_keyframe_is_beside_the_image(room, found):

@@ -198,16 +198,16 @@ def rest(wheels):
     """Publish half a second of odometry of a robot at rest."""
     for tick in range(6):
         odometry = Odometry()
-        odometry.header.stamp = Time(nanosec=tick * 10**8)
+        odometry.header.stamp = Time(sec=100, nanosec=tick * 10**8)
         odometry.pose.pose.orientation.w = 1.0
         wheels.publish(odometry)
 
 
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
-    """Publish one message of odometry for each moment, and wait until the last is heard."""
+    """Publish odometry at moments since the image, and wait until the last is heard."""
     for moment_s in moments_s:
         odometry = Odometry()
-        odometry.header.stamp = Time(sec=int(moment_s), nanosec=round(moment_s % 1 * 1e9))
+        odometry.header.stamp = Time(sec=100 + int(moment_s), nanosec=round(moment_s % 1 * 1e9))
         odometry.pose.pose.position.x = speed_m_s * moment_s
         odometry.twist.twist.linear.x = twist_m_s
         wheels.publish(odometry)
@@ -265,6 +265,59 @@ def test_a_robot_that_has_moved_since_its_image_gets_no_pose(robot, wheels, x_m,
     else:
         robot.hand_over()
         robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+def stand(robot, wheels, places):
+    """Publish where the robot was at moments since the image, and wait until that is heard."""
+    for moment_s, x_m in places.items():
+        odometry = Odometry()
+        odometry.header.stamp = Time(sec=int(100 + moment_s), nanosec=round(moment_s % 1 * 1e9))
+        odometry.pose.pose.position.x = x_m
+        wheels.publish(odometry)
+    robot.wait(lambda: robot.odometry.recent(60.0, 0.0) == odometry, 'odometry')
+
+
+@pytest.mark.parametrize('places', [
+    {-0.5: 0.0, 0.5: 1.0, 1.5: 1.0}, {-1.5: 0.0, 0.5: 0.2, 1.5: 0.2}, {-0.5: 0.0, 0.6: 1.0,
+                                                                     0.8: 1.0, 1.0: 1.0}])
+def test_slow_odometry_tells_that_the_robot_has_moved_since_its_image(robot, wheels, places):
+    """It was somewhere between two places when the image was taken, and stands now."""
+    robot.localizer.subscribe()
+    robot.meet()
+    stand(robot, wheels, places)
+    with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+        robot.hand_over()
+    assert not robot.localizer.poses
+
+
+@pytest.mark.parametrize(('x_m', 'is_withheld'), [(1.0, True), (0.0, False)])
+def test_an_image_newer_than_odometry_waits_for_it(robot, wheels, x_m, is_withheld):
+    robot.localizer.subscribe()
+    robot.meet()
+    stand(robot, wheels, {-2.0: 0.0, -1.0: 0.0})
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(robot.hand_over)
+        robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
+        stand(robot, wheels, {0.3: x_m})
+        if is_withheld:
+            with pytest.raises(HandOffError, match=r'^the robot has moved by 1\.00 m'):
+                handing_over.result()
+            assert not robot.localizer.poses
+        else:
+            handing_over.result()
+            robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize('moments_s', [(-4.0, -3.5, -3.0), (1.0, 2.0), (-4.0, 0.5, 1.0)])
+def test_odometry_that_does_not_tell_whether_the_robot_has_moved_withholds_the_pose(
+        robot, wheels, moments_s):
+    """All of it is older than the image or newer, or it was silent about the image."""
+    robot.localizer.subscribe()
+    robot.meet()
+    stand(robot, wheels, dict.fromkeys(moments_s, 0.0))
+    with pytest.raises(HandOffError, match=r'^/odom does not tell whether the robot has moved'):
+        robot.hand_over(2.5)
+    assert not robot.localizer.poses
 
 
 @pytest.mark.parametrize('speed_m_s', [0.0, 0.5])

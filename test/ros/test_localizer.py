@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
 from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
@@ -53,6 +53,12 @@ def localize(localizer, frame, values, up_in_camera=None):
 
 def timer():
     return StageTimes('waiting', time.monotonic())
+
+
+def test_the_observation_has_the_way_driven(localizer, values):
+    state = RobotState(np.eye(4), place=CameraPlace(np.eye(4), 0, 2.5))
+    localized = localizer.localize(make_frame(), values, state, timer())
+    assert localized.seen.observation.odom_way_m == 2.5
 
 
 def test_a_perfect_view_gives_the_true_pose(localizer, values):

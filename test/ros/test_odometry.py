@@ -65,6 +65,14 @@ def test_the_camera_is_where_its_mount_has_it(robot, source):
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
 
 
+def test_it_knows_the_way_driven_until_the_image(robot, source):
+    talk(source, *np.arange(9.0, 12.05, 0.1))
+    assert place(robot, 9.0).way_m == 0.0
+    assert place(robot, 11.05).way_m == pytest.approx(0.2, abs=0.03)
+    talk(source, 12.1, child_frame='camera')
+    assert place(robot, 12.1).way_m == 0.0, 'another run'
+
+
 def test_odometry_of_the_camera_needs_no_mount(robot, source):
     talk(source, 10.0, child_frame='camera')
     np.testing.assert_allclose(place(robot, 10.0).odom_from_camera, odom_from_base(10.0),
@@ -151,6 +159,17 @@ def test_an_origin_that_is_reset_is_a_restart(source, restarts, capfd):
     assert '/odom restarted, for its time, place or frames jumped' in capfd.readouterr().err
 
 
+def test_a_driver_that_begins_anew_after_a_silence_is_a_restart(robot, source, restarts):
+    talk(source, *np.arange(9.5, 10.05, 0.1))
+    run = place(robot, 10.0).run
+    for moment in (13.0, 13.1):
+        anew = message(moment)
+        anew.pose.pose.position.y = 0.6  # 1.4 m away, and turned
+        source.take(anew)
+    assert restarts == [13_000_000_000]
+    assert place(robot, 13.05).run != run
+
+
 def test_odometry_that_goes_on_is_no_restart(source, restarts):
     broken = message(10.15)
     broken.pose.pose.orientation.w = float('nan')
@@ -205,10 +224,12 @@ def test_slow_odometry_gives_its_mean_speed(source, moments):
 
 
 def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
-    assert source.moved_since(stamp(9.85)) is None
+    assert source.moved_since(stamp(9.85), 0.0) is None
     talk(source, *np.arange(9.5, 10.55, 0.1))
-    assert source.moved_since(stamp(9.75)) == (pytest.approx(0.075), pytest.approx(15.0))
-    assert source.moved_since(stamp(9.4)) is None and source.moved_since(stamp(10.6)) is None
+    assert source.moved_since(stamp(9.75), 0.0) == (pytest.approx(0.08), pytest.approx(16.0))
+    assert source.moved_since(stamp(10.5), 0.0) == (0.0, 0.0)
+    assert source.moved_since(stamp(9.4), 0.0) is None
+    assert source.moved_since(stamp(10.6), 0.0) is None
 
 
 def test_no_speed_is_taken_across_a_restart(source):

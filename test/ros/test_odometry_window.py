@@ -115,6 +115,50 @@ def test_odometry_that_was_reset_joins_nothing_across_it():
         window.pose_at(round(50.5 * S))
 
 
+def talk(window, seconds, x_m=0.0, degrees=0.0):
+    """Take a pose; return whether it begins another run."""
+    run = window.run
+    window.add(round(seconds * S), np.array([x_m, 0.0, 0.0]), turned(degrees))
+    return window.run != run
+
+
+@pytest.mark.parametrize('period_s', [0.02, 0.1, 1.0])
+@pytest.mark.parametrize(('x_m', 'degrees', 'restarts'), [
+    (0.0, 0.0, False), (0.08, 4.0, False), (1.0, 0.0, True), (-0.2, 0.0, True), (0.0, 8.0, True)])
+@pytest.mark.parametrize('silence_s', [3.5, 60.0])
+def test_a_robot_that_stood_before_a_silence_is_where_it_was(period_s, silence_s, x_m, degrees,
+                                                             restarts):
+    """Or its driver has begun at another origin, within a distance that it could have driven."""
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, period_s):
+        assert not talk(window, moment)
+    assert talk(window, 5.0 + silence_s, x_m, degrees) == restarts
+
+
+@pytest.mark.parametrize(('x_m', 'degrees', 'restarts'), [
+    (3.5, 30.0, False), (2.6, 0.0, False), (3.2, 15.0, False), (0.0, 0.0, True), (5.0, 30.0, True),
+    (3.5, 80.0, True)])
+def test_a_robot_that_drove_before_a_silence_goes_on_or_stops(x_m, degrees, restarts):
+    """At .5 m/s and 15 degrees/s for 2 s. Its driver begins at (0, 0), where it did not drive."""
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, 0.1):
+        assert not talk(window, moment, 0.5 * moment, 15.0 * (moment - 5.0))
+    assert talk(window, 7.0, x_m, degrees) == restarts
+
+
+def test_nobody_knows_where_a_robot_went_in_a_long_silence():
+    window = OdometryWindow(10.0)
+    for moment in np.arange(0.0, 5.01, 0.1):
+        assert not talk(window, moment, 0.5 * moment)
+    assert talk(window, 9.0, 4.5)
+
+
+def test_a_slow_source_that_misses_two_messages_goes_on():
+    window = OdometryWindow(30.0)
+    for moment in (0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 9.0):
+        assert not talk(window, moment, 0.3 * moment)
+
+
 def test_odometry_that_was_reset_where_it_began_is_told_by_its_heading():
     window = OdometryWindow(10.0)
     drive(window, (50.0, 53.0), speed_m_s=0.0)
@@ -133,3 +177,25 @@ def test_it_tells_what_it_may_know_of():
                                     (8.0, False, False)):
         assert window.spans(round(moment * S), S) == spans
         assert window.is_ahead(round(moment * S)) == is_ahead
+
+
+def test_the_way_is_what_was_driven_not_how_far_it_led():
+    window = OdometryWindow(10.0)
+    for tick in range(400):  # 40 s there and back, by 2 m at .1 m/s
+        x_m = 0.01 * (200 - abs(tick - 200))
+        window.add(tick * S // 10, np.array([x_m, 0.0, 0.0]), UPRIGHT)
+    assert window.way_at(39 * S) == pytest.approx(3.9, abs=0.05)
+    assert window.way_at(35 * S) == pytest.approx(3.5, abs=0.05)
+    window.add(39 * S + S // 20, np.array([0.1, 0.0, 0.0]), UPRIGHT)  # late
+    assert window.way_at(39 * S + S // 20) == window.way_at(39 * S)
+    window.clear()
+    window.add(50 * S, np.zeros(3), UPRIGHT)
+    assert window.way_at(50 * S) == 0.0, 'each run begins with none'
+
+
+def test_a_robot_that_stands_drives_no_way():
+    """Visual odometry trembles by millimetres."""
+    window, rng = OdometryWindow(10.0), np.random.default_rng(0)
+    for tick in range(3000):
+        window.add(tick * S // 50, rng.normal(0.0, 0.002, 3), UPRIGHT)
+    assert window.way_at(60 * S) < 0.2

@@ -11,8 +11,7 @@ densities is the evidence. It never counts in favour of a pose.
 import numpy as np
 from numpy.typing import NDArray
 
-#: Log odds that what is known of the vertical is right. A guess: one mount of a hundred is wrong.
-WRONG_MOUNT = 4.6
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 
 
 def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float
@@ -32,4 +31,4 @@ def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float
     # the optical frame's second axis is down
     tilts = np.arccos(np.clip(-map_from_cameras[:, 2, 1], -1.0, 1.0))
     against = 0.5 * (tilts / deviation) ** 2 - np.log(2.0 / deviation ** 2)
-    return np.clip(against, 0.0, WRONG_MOUNT)
+    return np.clip(against, 0.0, CALIBRATION.attitude.wrong_mount)

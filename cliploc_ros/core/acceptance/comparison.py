@@ -1,107 +1,109 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The best poses of a search, compared: the likeliest one, and what speaks for and against it.
+"""The poses of all sources compared: the likeliest one, and the evidence for and against it.
 
-Each pose is measured on all frames. The likeliest one of each place remains. The evidence for the
-first of them is all that decides whether it is accepted.
+Poses that the search of objects met and poses that keyframes recognized compete in one list. Each
+is measured on the detections of all frames and on the points of the keyframes. The likeliest one
+leads, and the evidence for it is all that decides whether it is accepted.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M, agreeing_poses
-from cliploc_ros.core.acceptance.attitude import WRONG_MOUNT, tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, utilities
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.candidates import (
+    Candidate,
+    JoinedFrames,
+    candidates_of,
+    refined,
+    supports_of,
+    unrefined,
+)
+from cliploc_ros.core.acceptance.confidence import (
+    chance_genuine,
+    confidences,
+    none_right,
+    objects_utility,
+    points_utility,
+)
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
-from cliploc_ros.core.acceptance.verdict import Evidence, is_exhaustive
+from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
+from cliploc_ros.core.acceptance.spread import spread
+from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
-    Match,
+    covariance_of,
     first_of_each_place,
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import Rig
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.fit.fusion import fuse
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.keyframes.localization import (
+    Recognition,
+)
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.joined_map import Place, place_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of
+from cliploc_ros.core.search.frame_search import coverage_of, prior_of
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
-_NONE = np.empty(0, dtype=np.int64)
-# Factor on the covariance where it decides. On simulated worlds (seeds 0 to 39) a factor of 1
-# accepts 8 more of 241 single images, and 2 of these are wrong.
-_CAUTION = 1.35
-
-
-class JoinedFrames(NamedTuple):
-    """What poses are compared on: searched frames of one camera, in a map.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-    frames : sequence of F SearchedFrame
-    rig : Rig
-        The same frames.
-    cameras : ndarray (F, 4, 4)
-        Each camera from the last.
-    """
-
-    landmark_map: LandmarkMap
-    options: RelocalizerOptions
-    frames: Sequence[SearchedFrame]
-    rig: Rig
-    cameras: NDArray[np.float64]
-
-    @property
-    def knows_vertical(self) -> bool:
-        """Return whether the vertical of any frame is known."""
-        return bool(self.rig.verticals[:, 6].any())
-
-    @property
-    def setting(self) -> Setting:
-        """Return what the chance of a wrong pose depends on, besides the supports."""
-        return Setting(len(self.landmark_map),
-                       self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
+# The most poses of objects that propose keyframes.
+_MOST_GUESSES = 3
 
 
 class Comparison(NamedTuple):
-    """The finalists, best first, and what supports or contradicts each.
+    """The candidates, and what decides between them.
 
     Parameters
     ----------
-    finalists : list of m Finalist
+    candidates : list of m Candidate
+        The leading one first; of those of one source, one of each place.
     poses : ndarray (m, 4, 4)
-        map_from_camera.
-    matches : list of m list of tuple of Match
-        Inliers in each frame.
-    supports : list of m Support
-    handicaps, likely : ndarray (m,)
-        See confidences: the log odds against each, and its probability.
+    likely : ndarray (m,)
+        Probability of each, shared by those that agree.
+    recognition : Recognition or None
+        What keyframes say.
     """
 
-    finalists: list[Finalist]
+    candidates: list[Candidate]
     poses: NDArray[np.float64]
-    matches: list[list[tuple[Match, ...]]]
-    supports: list[Support]
-    handicaps: NDArray[np.float64]
     likely: NDArray[np.float64]
+    recognition: Recognition | None
+
+    @property
+    def leading(self) -> NDArray[np.bool_]:
+        """Return which candidates (m,) agree with the leading one."""
+        return SAME_ANSWER.agreeing(self.poses)[0]
+
+    @property
+    def source(self) -> str:
+        """Return what proposes the leading place: 'objects', 'keyframes' or 'both'."""
+        if self.by_objects is None:
+            return 'keyframes'
+        return 'objects' if self.by_keyframes is None else 'both'
+
+    @property
+    def by_objects(self) -> Candidate | None:
+        """Return the best candidate of the leading place that the search of objects met."""
+        return next((one for one, near in zip(self.candidates, self.leading, strict=True)
+                     if near and one.recognized is None), None)
+
+    @property
+    def by_keyframes(self) -> Candidate | None:
+        """Return the best candidate of the leading place that keyframes propose."""
+        return next((one for one, near in zip(self.candidates, self.leading, strict=True)
+                     if near and one.recognized is not None), None)
 
 
-def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDArray[np.bool_]
-            ) -> Comparison:
-    """Return the finalists with their supports, the likeliest first, one of each place.
+def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDArray[np.bool_],
+            recognizer: ImageRecognizer | None = None) -> Comparison:
+    """Return the candidates compared; none where neither source has any.
 
     Poses that ignore the known vertical come last. Without refinement the greatest score is
     first, as in the paper.
@@ -110,101 +112,202 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
     ----------
     joined : JoinedFrames
     finalists : sequence of m Finalist
+        Of the search of objects.
     is_upright : ndarray (m,) of bool
         Which of them use the known vertical.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes, for the image of the last frame.
     """
-    poses = np.array([one.map_from_camera for one in finalists])
-    matches = [matches_of(joined.rig, one) for one in finalists]
-    supports = _supports(joined, poses, matches)
-    handicaps = np.where(is_upright, 0.0, WRONG_MOUNT) if joined.knows_vertical \
-        else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
-    order = list(range(len(finalists)))
+    candidates = candidates_of(joined, finalists, is_upright.tolist())
     if joined.options.refine:
-        likeliest = np.argsort(handicaps - utilities(supports), kind='stable')
-        order = [row for known in (True, False) for row in first_of_each_place(
-            likeliest[is_upright[likeliest] == known].tolist(), finalists, MAX_DISTINCT)]
-    supports, poses, handicaps = [supports[row] for row in order], poses[order], handicaps[order]
-    return Comparison([finalists[row] for row in order], poses, [matches[row] for row in order],
-                      supports, handicaps,
-                      confidences(supports, poses, joined.setting, handicaps=handicaps))
+        order = sorted(range(len(candidates)), key=lambda row: -candidates[row].odds)
+        candidates = [candidates[row] for known in (True, False) for row in first_of_each_place(
+            [row for row in order if candidates[row].is_upright == known], finalists,
+            MAX_DISTINCT)]
+    seen = None
+    if recognizer is not None:
+        seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]],
+                                    prior_of(joined.frames[-1].observation, joined.options))
+        candidates = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
+                      for one in candidates]
+        candidates += _proposed(joined, seen, candidates)
+        candidates.sort(key=lambda one: (not one.is_upright, -one.odds))
+    poses = np.array([one.pose for one in candidates]).reshape(-1, 4, 4)
+    return Comparison(candidates, poses, confidences(
+        np.array([one.odds for one in candidates]), poses, none_right(joined.setting)), seen)
 
 
-def _supports(joined: JoinedFrames, poses: NDArray[np.float64],
-              matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
-    """Return the support of each pose, from its matches in each frame."""
-    used = [one.observation if joined.options.needs_similarities
-            else replace(one.observation, similarities=None) for one in joined.frames]
-    compared = [ComparedFrame(
-        one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        seen.similarities, one.scene, seen.similarity_rows)
-        for one, seen in zip(joined.frames, used, strict=True)]
-    last_from_cameras = np.linalg.inv(joined.cameras)
-    return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)
-            for pose, found in zip(poses, matches, strict=True)]
+def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Candidate]
+              ) -> list[Candidate]:
+    """Return the places that keyframes recognize, as candidates.
+
+    Points add to the odds of the pose that the search of objects met there, if there is one. They
+    never take any: a dozen points agree by chance.
+    """
+    none, most = none_right(joined.setting), CALIBRATION.attitude.vertical_sigmas
+    found = candidates_of(joined, [unrefined(one.map_from_camera) for one in seen.places],
+                          [one.tilt_error <= most for one in seen.places])
+    proposed = []
+    for one, place in zip(found, seen.places, strict=True):
+        points = points_utility(place)
+        alone = none + points + objects_utility(one.support) - one.handicap
+        there = [other.odds for other in met if SAME_ANSWER.agree(one.pose, other.pose)]
+        proposed.append(one._replace(recognized=place, alone=alone, odds=max(
+            [alone, *(odds + max(0.0, points) for odds in there)])))
+    return proposed
+
+
+def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecognizer) -> float:
+    """Return what it says against a pose (4, 4) that keyframes near it do not recognize it."""
+    if not seen.is_complete or any(SAME_ANSWER.agree(pose, one.map_from_camera)
+                                   for one in seen.places):
+        return 0.0
+    return CALIBRATION.keyframes.missed * recognizer.coverage(pose)
+
+
+def pose_of(joined: JoinedFrames, compared: Comparison
+            ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the pose (4, 4) of the leading place and its covariance (6, 6).
+
+    A pose of many points stays as it is: objects are rougher. One of few points can be off by
+    more than its covariance says, so it is made less certain, and fused with that of the objects.
+    """
+    by_objects, by_keyframes = compared.by_objects, compared.by_keyframes
+    found = None
+    if by_objects is not None:
+        covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
+                                   by_objects.matches, joined.landmark_map.shared_sigmas)
+        if by_objects.finalist.information is not None:
+            others = [one for one in compared.candidates if one.recognized is None]
+            others.sort(key=lambda one: one is not by_objects)
+            covariance = covariance + spread(np.array([one.pose for one in others]),
+                                             np.array([one.odds for one in others]))
+        found = by_objects.pose, covariance
+    if by_keyframes is None or by_keyframes.recognized is None:
+        assert found is not None
+        return found
+    place = by_keyframes.recognized
+    doubt = max(1.0, CALIBRATION.keyframes.good_covariance / place.inliers) ** 4
+    if found is None or doubt == 1.0:
+        return by_keyframes.pose, doubt * place.covariance
+    return fuse(*found, by_keyframes.pose, doubt * place.covariance)
 
 
 def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[np.float64],
-                looks: Looks) -> Evidence:
-    """Return the evidence for the best pose, the first of all.
+                looks: Looks, recognizer: ImageRecognizer | None = None) -> Evidence:
+    """Return the evidence for the leading pose.
 
     Parameters
     ----------
     joined : JoinedFrames
     compared : Comparison
     covariance : ndarray (6, 6)
-        Of the best pose, given its matches.
+        Of the leading pose.
     looks : Looks
         Results of earlier frames.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes, where there are some.
     """
-    frames, best, pose = joined.frames, compared.finalists[0], compared.poses[0]
-    coverage, its, likely = coverage_of(frames), compared.supports[0], compared.likely
-    elsewhere = np.nonzero(~agreeing_poses(compared.poses)[0])[0]
-    rivals = likely[elsewhere]
-    rival = elsewhere[np.argmax(rivals)] if len(elsewhere) else 0
-    distinct, twin = _distinct(joined, compared)
+    best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
+    coverage, last = coverage_of(joined.frames), joined.frames[-1].observation
+    distinct, twin = _distinct(joined, compared, recognizer)
+    recognized = place and place.recognized
     return Evidence(
-        its.inliers, likely[0],
-        min(max(rivals, default=0.0), 1.0 - likely[0]),
-        distinct=distinct, place=place_of(joined.landmark_map, pose).position,
-        twin=twin and twin.position,
+        best.support.inliers, float(compared.likely[0]), _by_points(joined, compared),
+        _rival(joined, compared), distinct,
+        place_of(joined.landmark_map, compared.poses[0]).position, twin and twin.position,
+        twin.name if twin else '',
         # the covariance of a minimal sample is too rough to decide
-        near=1.0 if best.information is None else share_within(
-            RIGHT_M, _CAUTION * covariance),
-        deviation_m=math.sqrt(np.trace(covariance[:3, :3])),
-        coverage=coverage,
-        tried=sum(one.known_tried for one in frames),
-        meetings=math.inf if is_exhaustive(coverage, joined.options)
-        else meetings_of(frames, best, compared.matches[0]),
-        unexplained=its.unexplained,
-        earlier=looks.confidences_in(frames[-1].observation, pose),
-        rival_map=place_of(joined.landmark_map, compared.poses[rival]).name,
-        twin_map=twin.name if twin else '')
+        1.0 if place is None and best.finalist.information is None
+        else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
+        math.sqrt(np.trace(covariance[:3, :3])), coverage,
+        sum(one.known_tried for one in joined.frames),
+        math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
+        else meetings_of(joined.frames, best.finalist, best.matches),
+        best.support.unexplained, chance_genuine(recognized) if recognized else 1.0,
+        _not_mirrored(joined, compared), recognized,
+        looks.confidences_in(last, compared.poses[0]),
+        0 if last.compared is None else len(last.detections) - len(last.compared))
 
 
-def _distinct(joined: JoinedFrames, compared: Comparison) -> tuple[float, Place | None]:
-    """Return the probability that no place that looks alike has the best pose's camera.
+def _not_mirrored(joined: JoinedFrames, compared: Comparison) -> float:
+    """Return the probability that the image is no mirror image.
 
-    Next to it is where the camera would be at the likeliest of these places.
+    Features of a mirror image match nothing, so keyframes exclude it. A pose that is refused
+    anyway is not worth the time.
     """
-    matched = np.array(sorted({one.landmark for found in compared.matches[0]
-                               for one in found}), dtype=np.int64)
-    elsewhere = ~agreeing_poses(compared.poses)[0]
-    poses = find_twins(joined.landmark_map, compared.poses[0], matched, compared.poses[elsewhere])
-    low, high = joined.options.height_range_m
-    twins = [_fitted(joined, pose) for pose in poses if low <= pose[2, 3] <= high]
-    if not twins:
+    if (compared.by_keyframes is not None or not joined.options.refine
+            or compared.likely[0] < joined.options.min_confidence
+            or compared.candidates[0].support.inliers < joined.options.min_inliers):
+        return 1.0
+    return chance_not_mirrored(joined, compared.candidates[0])
+
+
+def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
+    """Return the likeliest pose that does not agree with the leading one."""
+    others = np.nonzero(~compared.leading)[0]
+    if len(others) == 0:
+        return None
+    row = others[np.argmax(compared.likely[others])]
+    place = place_of(joined.landmark_map, compared.poses[row])
+    same_source = compared.by_objects if compared.candidates[row].recognized is None \
+        else compared.by_keyframes
+    return Rival(min(float(compared.likely[row]), 1.0 - float(compared.likely[0])),
+                 place.position, place.name, same_source is None)
+
+
+def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
+    """Return the probability of the leading place without what the search of objects met there."""
+    if compared.by_keyframes is None:
+        return 0.0
+    rows = [row for row, (one, near) in enumerate(zip(compared.candidates, compared.leading,
+                                                      strict=True))
+            if one.recognized is not None or not near]
+    odds = [one.alone if near else one.odds for one, near in zip(
+        compared.candidates, compared.leading, strict=True)]
+    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
+    return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
+
+
+def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecognizer | None
+              ) -> tuple[float, Place | None]:
+    """Return the probability that no place that looks alike has the leading pose's camera.
+
+    Next to it is where the camera would be at the likeliest of these places. Keyframes tell a
+    twin apart as far as they cover it.
+    """
+    best, (low, high) = compared.candidates[0], joined.options.height_range_m
+    matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
+                       dtype=np.int64)
+    found = find_twins(joined.landmark_map, best.pose, matched,
+                       compared.poses[~compared.leading])
+    twins = [refined(joined, unrefined(pose)) for pose in found if low <= pose[2, 3] <= high]
+    poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
+    # a twin that refinement moved back to the leading pose is no other place
+    others = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
+    if len(others) == 0:
         return 1.0, None
-    poses = np.array([one.map_from_camera for one in twins])
-    supports = _supports(joined, poses, [matches_of(joined.rig, one) for one in twins])
-    chance, likeliest = chance_distinct(compared.supports[0], supports)
-    return chance, place_of(joined.landmark_map, poses[likeliest])
+    supports = supports_of(joined, poses[others],
+                           [matches_of(joined.rig, twins[row - 1]) for row in others])
+    chance, likeliest = chance_distinct(best.support, supports, _leads_of_points(
+        compared, poses[others], recognizer))
+    return chance, place_of(joined.landmark_map, poses[others][likeliest])
 
 
-def _fitted(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Finalist:
-    """Return a pose (4, 4) that no search met, refined like those that it met."""
-    pose = invert_transform(map_from_camera)
-    start = Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
-    if not joined.options.refine:
-        return start
-    refined = refine_rig(joined.rig, start.rotation, start.translation)
-    return start._replace(**refined._asdict())
+def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
+                     recognizer: ImageRecognizer | None) -> NDArray[np.float64]:
+    """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
+
+    They say nothing about a twin that they do not cover.
+    """
+    leading = compared.by_keyframes
+    if recognizer is None or leading is None or leading.recognized is None:
+        return np.zeros(len(twins))
+    covered = np.array([recognizer.coverage(pose) for pose in [leading.pose, *twins]])
+    own = max(0.0, points_utility(leading.recognized))
+    theirs = np.array([max([0.0] + [
+        points_utility(one.recognized) for one in compared.candidates
+        if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)]) for pose in twins])
+    return np.maximum(0.0, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)) * own - theirs)
+
+

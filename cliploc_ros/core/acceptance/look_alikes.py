@@ -4,7 +4,7 @@
 
 A camera sees the same at two places whose landmarks a turn about the vertical and a shift lay on
 each other. Such twins of the best pose are found in the map, so they count as rivals even if the
-search met one of the places only.
+search met one of the places only. `check_map` lists the places of a map that have twins.
 
 Two poses at places that look alike explain the same detections. Which of them matches one object
 more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
@@ -13,12 +13,14 @@ logit of its own, with these two terms only, weighs such poses.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER, SAME_MOVE
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -29,10 +31,8 @@ from cliploc_ros.core.maps.landmark_map import LandmarkMap
 _PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
 # Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
 _LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
-# Moves that lay a place within this of where another one does are the same.
-_SAME_M, _SAME_COSINE = 1.0, np.cos(np.radians(30.0))
-# The camera of a twin is elsewhere: as far away, or turned as far, as poses that do not agree.
-_ELSEWHERE_COSINE = np.cos(np.radians(45.0))
+_SAME_TURN = np.cos(np.radians(SAME_MOVE.angle_deg))
+_OWN_TURN = np.cos(np.radians(SAME_ANSWER.angle_deg))
 # Both places are upright: one is moved onto the other by a turn about the vertical.
 _MOST_TILT = np.cos(np.radians(20.0))
 # How near a landmark must lie to one of its class, each time after the move is fitted [m].
@@ -42,8 +42,64 @@ _NEAR_M = (0.6, 0.45, 0.3)
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
 # The most twins of a pose, and poses of the search whose places are compared.
 _TWINS, _OTHERS = 3, 5
-# Log odds of a unit of likeness, and of an object that was matched by class alone.
-_LIKENESS, _UNLABELLED = 0.44, 0.5
+_NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
+
+
+class Alike(NamedTuple):
+    """Places that look like one place, the most alike first.
+
+    Parameters
+    ----------
+    moves : ndarray (m, 4, 4)
+        Each takes the place onto another one: a turn about the vertical and a shift.
+    landmarks : ndarray (r,) of int
+        Landmarks of the place.
+    others : ndarray (m, r) of int
+        The landmark of its class at the same spot of the other place, where found.
+    found : ndarray (m, r) of bool
+    """
+
+    moves: NDArray[np.float64]
+    landmarks: NDArray[np.int64]
+    others: NDArray[np.int64]
+    found: NDArray[np.bool_]
+
+
+def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
+               matched: NDArray[np.int64] = _NOBODY,
+               moves: NDArray[np.float64] = _NOWHERE) -> Alike:
+    """Return the places that look like the one around a position.
+
+    A place looks like another one if at least four landmarks, .38 of those around it, and .4 of
+    those matched have one of their class at the same spot there. Moves that leave the position
+    within 1 m and 45 degrees lead to no other place.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        L landmarks, z up.
+    position : ndarray (3,)
+    matched : ndarray (n,) of int, optional
+        Landmarks that belong to the place wherever they are.
+    moves : ndarray (k, 4, 4), optional
+        Moves to try besides those that the map suggests.
+    """
+    rows = _place(landmark_map, position, matched)
+    if len(rows) < _LEAST_LANDMARKS:
+        return Alike(_NOWHERE, rows, np.empty((0, len(rows)), np.int64),
+                     np.empty((0, len(rows)), np.bool_))
+    moves, others, found = _verified(landmark_map, rows, np.concatenate(
+        [_moves_of_map(landmark_map, rows), moves]), position)
+    shares = found.mean(axis=1)
+    alike = shares >= _LEAST_SHARE
+    if len(matched):
+        alike &= found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED
+    ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
+    misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
+    order = np.lexsort([(misses * found).sum(axis=1), -shares])
+    order = order[alike[order]]
+    order = order[_distinct(moves[order], position, _TWINS)]
+    return Alike(moves[order], rows, others[order], found[order])
 
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
@@ -56,30 +112,22 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
         L landmarks, z up.
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
-        Landmarks that the pose explains detections with.
+        Landmarks that the pose explains detections with; all around it count where there are none.
     others : ndarray (k, 4, 4)
         Poses that a search met elsewhere, best first: the places of five are compared, too.
 
     Returns
     -------
     ndarray (m, 4, 4)
-        At most 3 poses, the place that is most alike first. A place looks like another one if at
-        least four landmarks, .38 of those around it, and .4 of those matched have one of their
-        class at the same spot there.
+        At most 3 poses, the place that is most alike first.
     """
-    rows = _place(landmark_map, map_from_camera[:3, 3], matched)
-    if len(matched) == 0 or len(rows) < _LEAST_LANDMARKS:
-        return np.empty((0, 4, 4))
-    moves = np.concatenate([_moves_of_map(landmark_map, rows),
-                            _moves_of_poses(map_from_camera, others[:_OTHERS])])
-    moves, found = _verified(landmark_map, rows, moves, map_from_camera[:3, 3])
-    shares = found.mean(axis=1)
-    alike = (shares >= _LEAST_SHARE) & (found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
-    moves = moves[alike][np.argsort(-shares[alike], kind='stable')]
-    return moves[_distinct(moves, map_from_camera[:3, 3], _TWINS)] @ map_from_camera
+    alike = find_alike(landmark_map, map_from_camera[:3, 3], matched,
+                       _moves_of_poses(map_from_camera, others[:_OTHERS]))
+    return np.asarray(alike.moves @ map_from_camera)
 
 
-def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]:
+def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.float64]
+                    ) -> tuple[float, int]:
     """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
     Parameters
@@ -87,7 +135,9 @@ def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]
     its : Support
         Of the pose.
     twins : sequence of Support
-        Of the poses at places that look like its own, one at least.
+        Of the m poses at places that look like its own, one at least.
+    leads : ndarray (m,)
+        Log odds by which keyframes prefer the pose to each.
 
     Returns
     -------
@@ -95,8 +145,9 @@ def chance_distinct(its: Support, twins: Sequence[Support]) -> tuple[float, int]
     likeliest : int
         The twin that is likeliest.
     """
-    leads = np.array([_LIKENESS * (its.likeness - one.likeness)
-                      + _UNLABELLED * (its.unlabelled - one.unlabelled) for one in twins])
+    terms = CALIBRATION.places
+    leads = leads + [terms.likeness * (its.likeness - one.likeness)
+                     + terms.unlabelled * (its.unlabelled - one.unlabelled) for one in twins]
     return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
             int(np.argmin(leads)))
 
@@ -119,8 +170,12 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     if len(moves) == 0:
         return moves
     middle = landmark_map.centers[rows].mean(axis=0)
-    votes = _are_same(moves, middle).astype(np.float64) @ repeats.votes[order]
-    moves = moves[np.argsort(-votes, kind='stable')]
+    weights = _are_same(moves, middle) * repeats.votes[order]
+    votes = weights.sum(axis=1)
+    # each move is the mean of those that are the same
+    ends = weights @ (moves[:, :3, :3] @ middle + moves[:, :3, 3]) / votes[:, None]
+    moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
+                           middle, ends)[np.argsort(-votes, kind='stable')]
     return moves[_distinct(moves, middle, _MOVES)]
 
 
@@ -149,8 +204,8 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
     """Return which moves (m, m) take a point to the same place by the same turn."""
     ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
     cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
-    return np.asarray((np.linalg.norm(ends[:, None] - ends, axis=2) < _SAME_M)
-                      & (cosines > _SAME_COSINE))
+    near = np.linalg.norm(ends[:, None] - ends, axis=2) < SAME_MOVE.distance_m
+    return np.asarray(near & (cosines > _SAME_TURN))
 
 
 def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
@@ -165,8 +220,9 @@ def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
 
 
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
-              position: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return moves (m, 4, 4) fitted to a place, and which landmarks (m, r) they take to others."""
+              position: NDArray[np.float64]
+              ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return moves (m, 4, 4) fitted to a place, and what they take its landmarks (m, r) to."""
     centers = landmark_map.centers[rows]
     for near_m in _NEAR_M:
         ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
@@ -177,8 +233,8 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
             moves = _fitted(centers, landmark_map.centers[others], found)
     steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
     elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
-                 | (moves[:, 0, 0] < _ELSEWHERE_COSINE))
-    return moves[elsewhere], found[elsewhere]
+                 | (moves[:, 0, 0] < _OWN_TURN))
+    return moves[elsewhere], others[elsewhere], found[elsewhere]
 
 
 def _fitted(before: NDArray[np.float64], after: NDArray[np.float64], found: NDArray[np.bool_]

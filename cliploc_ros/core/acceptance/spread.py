@@ -10,12 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.agreement import agreeing_poses
-
-# Hypotheses near each other share landmarks and errors, so the difference of their supports says
-# less than between places. Chosen on simulated worlds (seeds 0 to 39): 1 covers too little in
-# shops.
-_SHARPNESS = 0.5
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 
 
 def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -36,8 +32,9 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
     ndarray (6, 6)
         Of position [m] and rotation about the map's axes [rad].
     """
-    agreeing = agreeing_poses(poses)[0]
-    weights = np.exp(_SHARPNESS * (odds[agreeing] - odds[agreeing].max()))
+    agreeing = SAME_ANSWER.agreeing(poses)[0]
+    # poses near each other share landmarks and errors: their supports differ by less than they say
+    weights = np.exp(CALIBRATION.covariance.sharpness * (odds[agreeing] - odds[agreeing].max()))
     turns = Rotation.from_matrix(poses[agreeing, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
     steps = np.concatenate([poses[agreeing, :3, 3] - poses[0, :3, 3], turns], axis=1)
     squares = (steps.T * (weights / weights.sum())) @ steps

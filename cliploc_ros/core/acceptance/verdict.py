@@ -1,48 +1,67 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The decision to accept or refuse the best pose. A wrong pose is worse than none."""
+"""The decision to accept or refuse the leading pose. A wrong pose is worse than none."""
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
+from cliploc_ros.core.keyframes.localization import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
-# A search that tried fewer samples has not looked for rivals: its confidence means nothing.
-_MIN_ITERATIONS = 500
-# Chance that a likely pose is wrong where the search hardly met it. A guess on the safe side: of
-# the poses of likelihood .99 that 100 to 1,000 samples (ransac, b-prosac, auto) met once or never,
-# 9 of 813 were wrong on the 258 TUM frames, which also fitted the confidence; 2 of 48 of ransac by
-# classes in the demo. The default min_confidence takes two meetings.
-_MISSED_IS_RIGHT = 0.6
-# What the looks of a robot must give a pose on average. Of 156 robots in maps with exchanged
-# places (TUM fr3) that accept a confidence of .5, 87 accepted a wrong pose within 20 looks; 48
-# where most looks had to lead to the pose, 21 with this mean. On the true map 44, 41 and 39 of 52
-# accepted.
-_MEAN_CONFIDENCE = 0.5
 # A refusal does not mention less likely rivals.
 _LEAST_RIVAL = 0.001
 _LOOK_ABOUT = 'turn the camera to more objects'
 
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The likeliest pose that does not agree with the leading one.
+
+    Parameters
+    ----------
+    likely : float
+        Its probability.
+    place : tuple of float
+        Where its camera is [m].
+    map : str
+        Name of its map, where there are several.
+    is_other_source : bool
+        Whether keyframes propose one of the two poses and objects the other.
+    """
+
+    likely: float
+    place: Point
+    map: str = ''
+    is_other_source: bool = False
+
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for and against the best hypothesis.
+    """Evidence for and against the leading pose.
 
     Parameters
     ----------
     inliers : int
         Number of objects that it explains.
     likely : float
-        Probability that it is right, given the hypotheses found, see
+        Probability that it is right, given all poses found, see
         cliploc_ros.core.acceptance.confidence.
-    rival : float
-        Probability that the likeliest hypothesis that does not agree with it is right instead; 0
-        without one.
+    by_points : float
+        The same without the poses that the search of objects met at its place; 0 where keyframes
+        do not propose it.
+    rival : Rival or None
     distinct : float
         Probability that its place is not mistaken for one that looks alike.
     place, twin : tuple of float, optional
         Where the camera is, and where it would be at the likeliest place that looks alike [m].
+    twin_map : str
+        Name of the twin's map, where there are several.
     near : float
         Probability that it is within 1 m if it is right, given its covariance.
     deviation_m : float
@@ -52,58 +71,66 @@ class Evidence:
     tried : int
         Number of samples that the search tried.
     meetings : float
-        Number of these samples that hold only inliers of the best hypothesis; infinite for a
+        Number of these samples that hold only inliers of the best pose of objects; infinite for a
         search that tried all samples.
     unexplained : float
         Number of other detected objects of the map's classes.
+    genuine : float
+        Probability that the place is there, not a picture of it, see chance_genuine.
+    not_mirrored : float
+        Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror.
+    recognized : RecognizedPlace or None
+        What keyframes show at the pose.
     earlier : tuple of float
         Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks.
-    rival_map, twin_map : str
-        Name of the map of the likeliest rival and of the twin, where there are several maps.
+    crops_left : int
+        Number of crops that were not compared with labels yet.
     """
 
     inliers: int
     likely: float
-    rival: float = 0.0
+    by_points: float = 0.0
+    rival: Rival | None = None
     distinct: float = 1.0
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    twin: tuple[float, float, float] | None = None
+    place: Point = (0.0, 0.0, 0.0)
+    twin: Point | None = None
+    twin_map: str = ''
     near: float = 1.0
     deviation_m: float = 0.0
     coverage: float = 1.0
     tried: int = 0
     meetings: float = math.inf
     unexplained: float = 0.0
+    genuine: float = 1.0
+    not_mirrored: float = 1.0
+    recognized: RecognizedPlace | None = None
     earlier: tuple[float, ...] = ()
-    rival_map: str = ''
-    twin_map: str = ''
+    crops_left: int = 0
 
     @property
     def found(self) -> float:
-        """Return the probability that the search has not missed a better pose.
+        """Return the probability that the search of objects has not missed a better pose.
 
         A rival with as many inliers is met about as often as the best pose. Random draws miss it
         with probability exp(-meetings) (Fischler and Bolles 1981). That holds for ransac. For
-        auto and PROSAC, whose order is not random, it is an assumption: of the likely poses of
-        auto that it met once or never, 1 of 93 was wrong, of the others 0 of 454 (100, 300 and
-        1,000 samples; same frames as above).
+        auto and PROSAC, whose order is not random, it is an assumption.
         """
-        return 1.0 - _MISSED_IS_RIGHT * math.exp(-self.meetings)
+        return 1.0 - CALIBRATION.search.missed_is_right * math.exp(-self.meetings)
+
+    @property
+    def certainty(self) -> float:
+        """Return the probability that nothing besides the poses found makes it wrong."""
+        return self.distinct * self.near * self.genuine * self.not_mirrored
 
     @property
     def confidence(self) -> float:
-        """Return the probability that the best hypothesis is within 1 m of the truth."""
-        return self.likely * self.certainty
+        """Return the probability that the leading pose is within 1 m of the truth."""
+        return max(self.likely * self.found, self.by_points) * self.certainty
 
     @property
     def mean_confidence(self) -> float:
         """Return the mean confidence of all looks in this pose."""
         return (sum(self.earlier) + self.confidence) / (len(self.earlier) + 1)
-
-    @property
-    def certainty(self) -> float:
-        """Return the probability that nothing besides the hypotheses found makes it wrong."""
-        return self.distinct * self.found * self.near
 
 
 def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
@@ -112,71 +139,119 @@ def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
 
 
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Return why the best hypothesis is refused; None if it is accepted."""
-    return (_too_short(evidence, options) or _too_few(evidence, options)
-            or _too_unlikely(evidence, options) or _contradicted(evidence, options))
+    """Return why the leading pose is refused; None if it is accepted.
+
+    What the search of objects lacks does not matter where keyframes alone are sure enough.
+    """
+    by_points = evidence.by_points * evidence.certainty >= _needed(evidence, options)
+    lacks = None if by_points else _too_short(evidence, options) or _too_few(evidence, options)
+    return lacks or _too_unlikely(evidence, options) or _contradicted(evidence, options)
+
+
+def _needed(evidence: Evidence, options: RelocalizerOptions) -> float:
+    """Return the confidence that a pose needs; more while crops are left.
+
+    Each search with more crops is another chance of a false accept, as in the interim analyses of
+    clinical trials (Haybittle, "Repeated assessment of results in clinical trials of cancer
+    treatment", 1971). That holds for a search that time ends, too.
+    """
+    if not evidence.crops_left:
+        return options.min_confidence
+    return 1.0 - CALIBRATION.search.early_share * (1.0 - options.min_confidence)
 
 
 def _too_short(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    kind = RefusalKind.SEARCH_CUT_SHORT
+    kind, least = RefusalKind.SEARCH_CUT_SHORT, int(CALIBRATION.search.least_samples)
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
-        if evidence.tried < _MIN_ITERATIONS:
-            return Refusal(kind, f'search stopped after {evidence.tried} < {_MIN_ITERATIONS} '
+        if evidence.tried < least:
+            return Refusal(kind, f'search stopped after {evidence.tried} < {least} '
                                  'hypotheses; raise the time budget and iterations')
     elif evidence.coverage < 1.0:
         return Refusal(kind, f'search stopped after {100 * evidence.coverage:.3g} % of the '
                              'samples; raise the time budget or set algorithm to auto')
-    elif options.algorithm not in ('auto', 'bf') and options.iterations < _MIN_ITERATIONS:
-        return Refusal(kind, f'iterations {options.iterations} < {_MIN_ITERATIONS}, too few to '
-                             f'find rivals; set iterations to {_MIN_ITERATIONS} or more')
+    elif options.algorithm not in ('auto', 'bf') and options.iterations < least:
+        return Refusal(kind, f'iterations {options.iterations} < {least}, too few to '
+                             f'find rivals; set iterations to {least} or more')
     return None
 
 
 def _too_few(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if evidence.inliers >= options.min_inliers:
         return None
-    return Refusal(RefusalKind.TOO_FEW_OBJECTS, f'{evidence.inliers} objects matched < '
-                                                f'{options.min_inliers}; {_LOOK_ABOUT}')
+    return Refusal(RefusalKind.TOO_FEW_OBJECTS,
+                   f'{evidence.inliers} objects matched < {options.min_inliers}'
+                   f'{_points(evidence)}; {_LOOK_ABOUT}')
 
 
 def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    if evidence.confidence >= options.min_confidence:
+    """Return a refusal that names the evidence which takes most of the missing probability."""
+    confidence, needed = evidence.confidence, _needed(evidence, options)
+    if confidence >= needed:
         return None
-    compared = f'confidence {_rounded_down(evidence.confidence)} < {options.min_confidence:g}'
-    # the rival holds most of the missing probability, or is about as likely as the pose
-    is_ambiguous = evidence.rival > max(_LEAST_RIVAL, min(0.9 * evidence.likely,
-                                                          0.5 * (1.0 - evidence.likely)))
-    others = evidence.likely * evidence.found * evidence.near
-    if (evidence.twin is not None and evidence.distinct < options.min_confidence
-            and (is_ambiguous or others >= options.min_confidence)):
+    if confidence >= options.min_confidence:
+        digits = 1 + math.ceil(-math.log10(1.0 - needed))
+        return Refusal(RefusalKind.NOT_ALL_CROPS,
+                       f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}f}, as '
+                       f'it takes without {evidence.crops_left} crops; raise timeout_s')
+    compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
+    likely = max(evidence.likely, evidence.by_points)
+    found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
+    weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
+                   'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
+                   'found': found}.items(),
+                  key=lambda item: item[1])[0]
+    # the twin may be among the rivals, too
+    if evidence.twin is not None and evidence.distinct < options.min_confidence and (
+            weakest == 'distinct' or (weakest == 'likely' and _is_ambiguous(evidence))):
         second = evidence.twin_map and f' (the second in {evidence.twin_map})'
         return Refusal(RefusalKind.LOOK_ALIKE,
                        f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look '
                        f'alike{second}; turn the camera to objects that differ')
-    if evidence.likely * evidence.distinct * evidence.found >= options.min_confidence:
+    if weakest == 'near':
         return Refusal(RefusalKind.UNCERTAIN_POSITION,
                        f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                        'turn the camera to more or nearer objects')
-    if evidence.likely >= options.min_confidence:
+    if weakest == 'genuine' and evidence.recognized is not None:
+        return Refusal(RefusalKind.CHANGED, f'{compared}{_points(evidence)}; is it a picture, or '
+                                            'has the place changed? move, and ask again')
+    if weakest == 'mirror':
+        return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
+                                              'pose; turn the camera to more objects')
+    if weakest == 'found':
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '
                        f'{evidence.tried} samples; raise iterations or set algorithm to auto')
-    if is_ambiguous:
-        return Refusal(RefusalKind.AMBIGUOUS,
-                       f'{compared}; ambiguous, another pose has {evidence.rival:.2g}'
-                       f'{_in(evidence.rival_map)}; turn the camera to objects that differ')
-    return Refusal(RefusalKind.UNEXPLAINED,
-                   f'{compared}; {evidence.inliers} objects matched, '
-                   f'{round(evidence.unexplained)} unexplained; {_LOOK_ABOUT}')
+    return _unsure(evidence, compared)
 
 
-def _in(map_name: str) -> str:
-    return f' in {map_name}' if map_name else ''
+def _unsure(evidence: Evidence, compared: str) -> Refusal:
+    """Return the refusal of a pose that others rival, or that too little supports."""
+    rival = evidence.rival
+    if rival is None or not _is_ambiguous(evidence):
+        return Refusal(RefusalKind.UNEXPLAINED,
+                       f'{compared}; {evidence.inliers} objects matched, '
+                       f'{round(evidence.unexplained)} unexplained{_points(evidence)}; '
+                       f'{_LOOK_ABOUT}')
+    if rival.is_other_source:
+        apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
+        return Refusal(RefusalKind.CONTRADICTION,
+                       f'{compared}; objects and keyframes contradict each other, their poses are '
+                       f'{apart:.2f} m apart; {_LOOK_ABOUT}')
+    where = f' in {rival.map}' if rival.map else ''
+    return Refusal(RefusalKind.AMBIGUOUS,
+                   f'{compared}; ambiguous, another pose has {rival.likely:.2g}{where}; '
+                   'turn the camera to objects that differ')
+
+
+def _is_ambiguous(evidence: Evidence) -> bool:
+    """Return whether a rival has most of the missing probability, or nearly that of the pose."""
+    return evidence.rival is not None and evidence.rival.likely > max(
+        _LEAST_RIVAL, min(0.9 * evidence.likely, 0.5 * (1.0 - evidence.likely)))
 
 
 def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     """Return a refusal if the looks before this one were too unsure of this pose."""
-    needed = min(_MEAN_CONFIDENCE, options.min_confidence)
+    needed = min(CALIBRATION.looks.mean_confidence, options.min_confidence)
     if evidence.mean_confidence >= needed:
         return None
     return Refusal(RefusalKind.FRAMES_DISAGREE,
@@ -184,10 +259,18 @@ def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
                    f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
 
 
-def _point(position: tuple[float, float, float]) -> str:
+def _points(evidence: Evidence) -> str:
+    """Return what keyframes show at the pose, as a part of a sentence; empty without any."""
+    if evidence.recognized is None:
+        return ''
+    return (f', {evidence.recognized.inliers} points of keyframes agree in '
+            f'{evidence.recognized.confirmed:.0%} of the image')
+
+
+def _point(position: Point) -> str:
     return f'({position[0]:.1f}, {position[1]:.1f}, {position[2]:.1f})'
 
 
-def _rounded_down(share: float) -> str:
-    """Return two decimals, never rounded up: 0.9899 stays below 0.99."""
-    return f'{math.floor(share * 100 + 1e-9) / 100:.2f}'
+def _rounded_down(share: float, digits: int = 2) -> str:
+    """Return some decimals, never rounded up: 0.9899 stays below 0.99."""
+    return f'{math.floor(share * 10**digits + 1e-9) / 10**digits:.{digits}f}'

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import batched, pairwise
-from math import comb, cos, inf, radians
+from math import comb, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -19,20 +19,17 @@ from cliploc_ros.core.fit.covariance import (
 )
 from cliploc_ros.core.fit.refined_covariance import (
     POSE_UNKNOWN,
-    PoseCovariance,
     refined_covariance,
 )
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.rig import Rig
 from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.tolerances import SAME_MINIMUM
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
 from cliploc_ros.core.search.leaders import MAX_DISTINCT, are_near, same_place
 
-# Refined poses nearer than this are one minimum of the cost. Places can have several.
-_SAME_MINIMUM_M, _SAME_MINIMUM_DEG = 0.05, 2.0
-_SAME_MINIMUM_TRACE = 1.0 + 2.0 * cos(radians(_SAME_MINIMUM_DEG))
 # The most refined poses that are compared by their support. Of 614 frames of TUM fr3 (maps of its
 # splits, one image), 16 solve 449 within 0.5 m, 8 solve 440.
 _COMPARED = 16
@@ -162,7 +159,8 @@ def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]
     distinct: list[Finalist] = []
     for one in sorted(improved, key=lambda one: -one.score):
         if not any(are_near(one.rotation, one.translation, better.rotation, better.translation,
-                            _SAME_MINIMUM_M, _SAME_MINIMUM_TRACE) for better in distinct):
+                            SAME_MINIMUM.distance_m, SAME_MINIMUM.least_trace)
+                   for better in distinct):
             distinct.append(one)
     return distinct
 
@@ -220,7 +218,7 @@ def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> i
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                   matches: Sequence[Sequence[Match]],
-                  shared: NDArray[np.float64] | None = None) -> PoseCovariance:
+                  shared: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
@@ -243,7 +241,7 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
     covariance = (_sample_covariance(frames, cameras, pose,
                                      _scatter(frames, cameras, pose, matches))
                   + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
-    return PoseCovariance(covariance, covariance)
+    return covariance
 
 
 def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,

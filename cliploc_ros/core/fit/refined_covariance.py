@@ -48,23 +48,8 @@ _WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
 _PRIOR_SQUARE, _PRIOR_WEIGHT, _MOST_RESIDUAL = 2.8, 6.0, 4.0
 
 
-class PoseCovariance(NamedTuple):
-    """Covariances (6, 6) of x, y, z [m] and of the rotations about the map's fixed axes [rad].
-
-    Parameters
-    ----------
-    matched : ndarray (6, 6)
-        If each object is what it is matched with.
-    whole : ndarray (6, 6)
-        With the chance that one is not.
-    """
-
-    matched: NDArray[np.float64]
-    whole: NDArray[np.float64]
-
-
 #: Of a pose whose boxes do not fix it.
-POSE_UNKNOWN = PoseCovariance(np.diag(PRIOR_VARIANCES), np.diag(PRIOR_VARIANCES))
+POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 class _Fit(NamedTuple):
@@ -107,9 +92,9 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None
-                       ) -> PoseCovariance:
-    """Return the covariance of a pose that was refined on its inliers.
+                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
+                       wrong_share: float = _WRONG_SHARE) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose that was refined on its inliers.
 
     Parameters
     ----------
@@ -121,6 +106,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Time of each frame, in which odometry joins them.
     shared : ndarray (L, 2), optional
         By how much each landmark and its neighbours are displaced and turned together [m] [rad].
+    wrong_share : float
+        Probability that an object is not where its match says.
     """
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
@@ -139,9 +126,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         information, _shared_noise(of_objects, shared[fit.numbers]))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return PoseCovariance(
-        matched + of_map, matched + of_map + _WRONG_SHARE * _change_without_each(
-            information - of_objects, noise - noise_of_objects, gradients, matched))
+    return np.asarray(matched + of_map + wrong_share * _change_without_each(
+        information - of_objects, noise - noise_of_objects, gradients, matched))
 
 
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],

@@ -18,8 +18,6 @@ KIND = 'rootsift-128-uint8'
 DIMENSIONS = 128
 # A unit vector of square roots times this fits into a byte; no entry of a real one exceeds .5.
 _SCALE = 512.0
-# Larger images are made smaller first: it bounds the time.
-_LONGEST_SIDE_PX = 800
 # A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
 # leaves out features of little contrast.
 _DARK = 160.0
@@ -49,11 +47,14 @@ class Features:
         return len(self.pixels)
 
 
-def extract(image_rgb: NDArray[np.uint8], most: int) -> Features:
-    """Return the strongest features of an image (h, w, 3), at most so many."""
-    longest = max(image_rgb.shape[:2])
+def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800) -> Features:
+    """Return the strongest features of an image (h, w, 3), at most so many.
+
+    A larger image is made smaller first: it bounds the time. Features of different sizes of an
+    image match: those that the smaller one lacks are its finest.
+    """
     gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, _LONGEST_SIDE_PX / longest)
+    scale = min(1.0, longest_side_px / max(image_rgb.shape[:2]))
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     bright = float(np.percentile(gray, 99))

@@ -15,33 +15,49 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose
+from cliploc_ros.core.keyframes.point_pose import (
+    LEAST_INLIERS,
+    agreeing,
+    find_pose,
+    free_focal,
+)
+from cliploc_ros.core.search.prior import Prior
 
-# Features of a query; keyframes that are matched: the most similar ones, then the most similar
-# ones elsewhere, so that a place that looks alike is found, and those where objects propose.
-_QUERY_FEATURES = 2000
-_SIMILAR, _ELSEWHERE, _PROPOSED = 5, 2, 3
+# Most features of a query, and its longest side. At the size of keyframes, features take twice the
+# time at equal success.
+_QUERY_FEATURES, _QUERY_PX = 2000, 400
+# Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
+# a place that looks alike is found, and those where objects propose.
+_SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
+#: Places of an image that do not agree with each other.
+MOST_PLACES = 3
 # Places differ by more than 1 m or 45 degrees, as poses that do not agree.
 _MOST_RANKED = 500
 _SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
 NEAR_M, NEAR_DEG = 2.0, 40.0
+# Samples of three points that are tried: for the first place, and for each one elsewhere.
+_ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
+#: Nothing is known of the camera.
+NOTHING_KNOWN = Prior()
 # Cells of the image (columns, rows), and how many points and features make one comparable.
 _CELLS = (8, 6)
 _LEAST_IN_CELL = 4
+# Of what lies across an image, the part that counts: a few wrong matches lie anywhere [%].
+_MOST = (5.0, 95.0)
 # Errors that all points of a keyframe share: of its pose, and of its points, which matter the
 # more the further the image is from the keyframe. Chosen on the kitchen, see the study.
 _KEYFRAME_M, _KEYFRAME_RAD, _PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
-class Recognized(NamedTuple):
-    """A pose by keyframes, and what speaks for and against it.
+class RecognizedPlace(NamedTuple):
+    """A pose by keyframes, and the evidence for and against it.
 
     Parameters
     ----------
@@ -49,16 +65,27 @@ class Recognized(NamedTuple):
     covariance : ndarray (6, 6)
         In the order of core.fit.covariance.
     inliers : int
-        Number of points that agree.
-    rival : int
-        Number of points that agree with the best pose elsewhere, without those; 0 without one.
-        Those may be more: the pose whose points lie in more parts of the image comes first.
-    rival_pose : ndarray (4, 4) or None
-        That pose.
+        Number of features that agree, without those that agree with a place found before.
     confirmed : float
-        Share of the parts of the image that show what the keyframes have there: 0 to 1.
+        Share of the comparable cells of the image that show what the keyframes have there.
     expected : float
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
+    extent : float
+        How far the inliers reach across the image, as a share of what is comparable: 0 to 1, in
+        width or in height, whichever is more. Those in a picture of the place end with it, those
+        beside something that covers the place do not.
+    cells : tuple of int
+        Number of cells that confirm, and of those that are comparable: the keyframes expect points
+        there, and the image has features.
+    focal_ratio, focal_deviation : float
+        The focal length that the points suggest as a multiple of the camera's, and its relative
+        standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
+        wrong intrinsics, and a picture of the place of another size, suggest another one.
+    focal_inliers : int
+        Number of features that agree under that focal length.
+    tilt_error : float
+        Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
+        place: the vertical may be wrong, as with a wrong camera mount.
     keyframes : tuple of int
         Those that points agree with, the most points first.
     pixels : ndarray (k, 2)
@@ -70,13 +97,39 @@ class Recognized(NamedTuple):
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
     inliers: int
-    rival: int
-    rival_pose: NDArray[np.float64] | None
     confirmed: float
     expected: float
-    keyframes: tuple[int, ...]
+    extent: float = 1.0
+    cells: tuple[int, int] = (0, 0)
+    focal_ratio: float = 1.0
+    focal_deviation: float = np.inf
+    focal_inliers: int = 0
+    tilt_error: float = 0.0
+    keyframes: tuple[int, ...] = ()
     pixels: NDArray[np.float64] = np.empty((0, 2))
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+
+
+class Recognition(NamedTuple):
+    """The places where keyframes recognize an image.
+
+    Parameters
+    ----------
+    places : tuple of RecognizedPlace
+        None agrees with another one. The one whose points lie in the most cells of the image is
+        first: a poster has many points, but shows only a part of its place.
+    is_complete : bool
+        Whether all keyframes were matched that should be. A search that the deadline cut has no
+        places: it may have missed their rivals.
+    """
+
+    places: tuple[RecognizedPlace, ...] = ()
+    is_complete: bool = True
+
+    @property
+    def rival(self) -> int:
+        """Return the number of inliers of the second place, which may be more; 0 without one."""
+        return self.places[1].inliers if len(self.places) > 1 else 0
 
 
 class _Matched(NamedTuple):
@@ -97,22 +150,24 @@ class _Matched(NamedTuple):
 
 def query_features(image_rgb: NDArray[np.uint8]) -> Features:
     """Return the features of an image (h, w, 3) that is to be localized."""
-    return extract(image_rgb, _QUERY_FEATURES)
+    return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
 
 
 class _Look(NamedTuple):
-    """An image: its features, their bearings (n, 2), the camera."""
+    """An image: its features, their bearings (n, 2), the camera and what is known of it."""
 
     features: Features
     bearings: NDArray[np.float64]
     camera: Camera
+    prior: Prior = NOTHING_KNOWN
 
 
 class _Place(NamedTuple):
-    """A pose, the matches that agree, the number of their features, and that in each cell."""
+    """A pose, the matches it was found among and those that agree, their features and cells."""
 
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    among: _Matched
     inliers: _Matched
     agreed: int
     cells: NDArray[np.int64]
@@ -131,9 +186,9 @@ class KeyframeLocalizer:
         layer.prepare()
 
     def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
-                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                 ) -> Recognized | None:
-        """Find where an image was taken; None where no pose has enough points.
+                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
+                 prior: Prior = NOTHING_KNOWN) -> Recognition:
+        """Find where an image was taken.
 
         Parameters
         ----------
@@ -143,44 +198,54 @@ class KeyframeLocalizer:
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
-            No further keyframe is matched then (monotonic clock) [s], and None is returned: a
-            pose elsewhere might not have been looked for.
+            No further keyframe is matched then (monotonic clock) [s].
+        prior : Prior, optional
+            Poses that its height range or max_tilt excludes are no places.
         """
-        return self.localize_features(query_features(image_rgb), camera, guesses, deadline)
+        return self.localize_features(query_features(image_rgb), camera, guesses, deadline, prior)
 
     def localize_features(self, features: Features, camera: Camera,
-                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf
-                          ) -> Recognized | None:
+                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
+                          prior: Prior = NOTHING_KNOWN) -> Recognition:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features, bearings = _select(features, known), bearings[known]
         if len(features) < LEAST_INLIERS:
-            return None
+            return Recognition()
         descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings, camera)
+        look = _Look(features, bearings, camera, prior)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
-        places = _places(matched, look)
-        if not places or places[0].agreed < _ENOUGH_INLIERS:
-            more = self._more(ranks, chosen, places)
+        first = _place(matched, look)
+        if first is None or first.agreed < _ENOUGH_INLIERS:
+            more = self._more(ranks, chosen, first)
             matched = matched.join(self._match(descriptors, more, deadline))
-            places = _places(matched, look)
-        if not places or time.monotonic() > deadline:
-            return None
-        return self._recognized(places, look)
+            first = _place(matched, look)
+        places = _places(first, matched, look)
+        if time.monotonic() > deadline:
+            return Recognition(is_complete=False)
+        return Recognition(tuple(self._recognized(one, look) for one in places))
 
-    def _recognized(self, places: Sequence['_Place'], look: '_Look') -> Recognized:
-        """Return the first place, with what speaks for and against it."""
-        best, rival = places[0], places[1] if len(places) > 1 else None
-        counts = np.bincount(best.inliers.keyframes, minlength=len(self.layer))
+    def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
+        """Return the share of an image for which the layer knows what a pose (4, 4) sees.
+
+        It counts the cells of the image in which keyframes near the pose expect points. Where it
+        is 0, no keyframe is near: that an image is not recognized says nothing about this place.
+        """
+        near = keyframes_near(self.layer.map_from_camera, map_from_camera)
+        return float(self._expects(near, map_from_camera, camera).mean())
+
+    def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
+        """Return a place with the evidence for and against it."""
+        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
-        return Recognized(
-            best.map_from_camera, best.covariance + self._shared(best.map_from_camera, counts),
-            best.agreed, rival.agreed if rival else 0, rival.map_from_camera if rival else None,
-            *self._confirmed(best, look, used), tuple(used.tolist()),
-            look.features.pixels[best.inliers.features], best.inliers.rows)
+        covariance = place.covariance + self._shared(place.map_from_camera, counts)
+        return RecognizedPlace(
+            place.map_from_camera, covariance, place.agreed, *self._confirmed(place, look, used),
+            *_focal(place, look, used), look.prior.tilt_error(place.map_from_camera, covariance),
+            tuple(used.tolist()), look.features.pixels[place.inliers.features], place.inliers.rows)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""
@@ -190,15 +255,15 @@ class KeyframeLocalizer:
                   if not any(_same_place(poses[one], poses[other]) for other in chosen))
         chosen += islice(others, _ELSEWHERE)
         for guess in guesses:
-            near = _keyframes_near(poses, guess)
-            chosen += [one for one in near[:_PROPOSED].tolist() if one not in chosen]
+            near = keyframes_near(poses, guess)
+            chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
         return chosen
 
-    def _more(self, ranks: Sequence[int], chosen: Sequence[int], places: Sequence['_Place']
+    def _more(self, ranks: Sequence[int], chosen: Sequence[int], first: '_Place | None'
               ) -> list[int]:
         """Return more keyframes: those near the pose so far, and the next similar ones."""
-        near = _keyframes_near(self.layer.map_from_camera, places[0].map_from_camera
-                               )[:_MORE].tolist() if places else []
+        near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
+                               )[:_MORE].tolist() if first else []
         return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                 if one not in chosen]
 
@@ -220,24 +285,34 @@ class KeyframeLocalizer:
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float]:
-        """Return the share of cells with inliers, of those where keyframes expect some.
+                   ) -> tuple[float, float, float, tuple[int, int]]:
+        """Return which part of the image has inliers, of that where keyframes expect some.
 
-        A cell without features, such as one that something covers, says nothing. The second
-        value is the share that is expected of so many inliers, whose density varies much from
-        cell to cell (a geometric distribution).
+        A cell without features, such as one that something covers, says nothing. The values are
+        the share of cells, the one that is expected of so many inliers, whose density varies much
+        from cell to cell (a geometric distribution), the extent, and the numbers of cells.
         """
-        expected = np.zeros(_CELLS[0] * _CELLS[1], dtype=np.int64)
-        for keyframe in used[:_SIMILAR].tolist():
-            pixels = _project(self.layer.points_in_map(keyframe), place.map_from_camera,
-                              look.camera)
-            expected = np.maximum(expected, _count(pixels, look.camera))
         seen = _count(look.features.pixels, look.camera)
-        comparable = (expected >= _LEAST_IN_CELL) & (seen >= _LEAST_IN_CELL)
-        if not comparable.any():
-            return 0.0, 0.0
-        density = place.agreed / comparable.sum()
-        return (float((place.cells[comparable] > 0).mean()), float(density / (1.0 + density)))
+        comparable = (seen >= _LEAST_IN_CELL) & self._expects(used, place.map_from_camera,
+                                                              look.camera)
+        count = int(comparable.sum())
+        if not count:
+            return 0.0, 0.0, 0.0, (0, 0)
+        confirmed = int(np.count_nonzero(place.cells[comparable]))
+        pixels = look.features.pixels
+        reached = np.ptp(np.percentile(pixels[place.inliers.features], _MOST, axis=0), axis=0)
+        there = pixels[comparable[_cells_of(pixels, look.camera)]]
+        extent = float(np.max(reached / np.maximum(
+            np.ptp(np.percentile(there, _MOST, axis=0), axis=0), 1.0)))
+        return (confirmed / count, place.agreed / (count + place.agreed), min(1.0, extent),
+                (confirmed, count))
+
+    def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
+                 ) -> NDArray[np.bool_]:
+        """Return in which cells of an image the first of some keyframes expect points."""
+        counts = [_count(_project(self.layer.points_in_map(one), pose, camera), camera)
+                  for one in keyframes[:_SIMILAR].tolist()]
+        return np.max(counts, axis=0, initial=0) >= _LEAST_IN_CELL
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""
@@ -252,32 +327,45 @@ class KeyframeLocalizer:
         return np.diag(np.repeat([position, rotation], 3))
 
 
-def _places(matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the pose that most matches agree with, and the best one elsewhere if there is one.
+def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
+    """Return the pose that most matches agree with, and the best ones elsewhere.
 
-    The one whose points lie in more parts of the image comes first: a poster has many points, but
-    shows only a part of its place.
+    The one whose points lie in the most parts of the image comes first: a poster has many points,
+    but shows only a part of its place.
     """
-    first = _place(matched, look)
-    if first is None:
-        return []
-    taken = agreeing(matched.points, look.bearings[matched.features],
-                     invert_transform(first.map_from_camera), _RIVAL_TOLERANCE)
-    second = _place(matched.select(np.setdiff1d(np.arange(len(matched.features)), taken)), look)
-    if second is None or second.agreed < LEAST_INLIERS or _same_place(
-            first.map_from_camera, second.map_from_camera):
-        return [first]
-    return sorted([first, second], key=lambda one: -np.count_nonzero(one.cells))
+    place, found, places = first, 0, list[_Place]()
+    while place is not None and (not places or place.agreed >= LEAST_INLIERS):
+        if look.prior.allows(place.map_from_camera):
+            found += 1
+            if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
+                places.append(place)
+        if found == MOST_PLACES:
+            break
+        taken = agreeing(matched.points, look.bearings[matched.features],
+                         invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
+        matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
+        place = _place(matched, look, _RIVAL_ITERATIONS)
+    return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
 
 
-def _place(matched: _Matched, look: _Look) -> _Place | None:
-    found = find_pose(matched.points, look.bearings[matched.features], look.camera)
+def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Place | None:
+    found = find_pose(matched.points, look.bearings[matched.features], iterations)
     if found is None:
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
-    return _Place(found.map_from_camera, found.covariance, inliers, len(features),
+    return _Place(found.map_from_camera, found.covariance, matched, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
+
+
+def _focal(place: _Place, look: _Look, used: NDArray[np.int64]) -> tuple[float, float, int]:
+    """Return the ratio of focal lengths, its deviation, and how many features agree with it."""
+    among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
+    found = free_focal(among.points, look.bearings[among.features],
+                       invert_transform(place.map_from_camera))
+    if found is None:
+        return 1.0, np.inf, 0
+    return *found[:2], len(np.unique(among.features[found[2]]))
 
 
 def _select(features: Features, rows: NDArray[np.bool_]) -> Features:
@@ -290,7 +378,7 @@ def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < _SAME_M and cosine > _SAME_COS)
 
 
-def _keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the keyframes that see what a pose sees, the most similar views first."""
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
@@ -311,9 +399,14 @@ def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Cam
 
 def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
     """Return how many pixels (m, 2) lie in each cell of the image."""
-    columns, rows = _CELLS
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    place = (pixels[inside] * (columns / camera.width, rows / camera.height)).astype(np.int64)
-    place = np.minimum(place, (columns - 1, rows - 1))
-    return np.bincount(place[:, 1] * columns + place[:, 0], minlength=columns * rows)
+    return np.bincount(_cells_of(pixels[inside], camera), minlength=_CELLS[0] * _CELLS[1])
+
+
+def _cells_of(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
+    """Return the number of the cell of each pixel (m, 2) in the image."""
+    last = np.array(_CELLS) - 1
+    place = (pixels * np.array(_CELLS) / (camera.width, camera.height)).astype(np.int64)
+    columns, rows = np.clip(place, 0, last).T
+    return np.asarray(rows * _CELLS[0] + columns)

@@ -9,15 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 
 #: Fewer inliers determine no pose: three fix it, the others agree with it.
 LEAST_INLIERS = 8
 # An inlier's reprojection is no further off, as an angle: 3 px at f = 525 px.
 _MOST_ERROR = 3.0 / 525.0
-_ITERATIONS, _SURE = 1000, 0.9999
-_STEPS = 10
+_SURE = 0.9999
+# Least squares end after some steps, or one that is small [m, rad]; none changes the logarithm of
+# the focal length by more.
+_STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-5, 0.3
+# Tolerances of the inliers, as multiples: for a pose of three points, and for one with a focal
+# length that may be half the true one. None is wrong by more than the ratio.
+_ROUGH, _WRONG_FOCAL, _MOST_RATIO = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), 10.0
+# Points of a keyframe share errors, and several keyframes have the same point: deviations of 570
+# right poses were by so much larger, whatever their size.
+_FOCAL_INFLATION = 4.5
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
 # Of a normal distribution: standard deviation divided by the median of absolute values.
@@ -41,12 +48,12 @@ class PointPose(NamedTuple):
     covariance: NDArray[np.float64]
 
 
-def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera: Camera
+def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000
               ) -> PointPose | None:
     """Return the pose that most points agree with; None where there is none.
 
-    MAGSAC++ of OpenCV finds it (Barath et al., "MAGSAC++, a fast, reliable and accurate robust
-    estimator", 2020), and robust least squares refines it on the inliers.
+    MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
+    optimization, MAGSAC++ and PoseLib took longer at equal success.
 
     Parameters
     ----------
@@ -54,18 +61,18 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera
         In the map [m].
     bearings : ndarray (n, 2)
         Where the image shows them, on the plane z = 1.
-    camera : Camera
-        Its focal length gives the tolerance in pixels.
+    iterations : int
+        Most samples of three points.
     """
     if len(points) < LEAST_INLIERS:
         return None
-    matrix = np.diag([camera.fx, camera.fy, 1.0])
+    options = cv2.UsacParams()
+    options.score, options.loMethod = cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_NULL
+    options.maxIterations, options.confidence, options.threshold = iterations, _SURE, _MOST_ERROR
     middle = points.mean(axis=0)  # OpenCV computes with floats: keep numbers small
     try:
-        found, vector, translation, _ = cv2.solvePnPRansac(
-            points - middle, bearings * (camera.fx, camera.fy), matrix, None,
-            iterationsCount=_ITERATIONS, reprojectionError=_MOST_ERROR * camera.fx,
-            confidence=_SURE, flags=cv2.USAC_MAGSAC)
+        found, _, vector, translation, _ = cv2.solvePnPRansac(
+            points - middle, bearings, np.eye(3), None, params=options)
     except cv2.error:  # degenerate points
         return None
     if not found or not (np.isfinite(vector).all() and np.isfinite(translation).all()):
@@ -78,23 +85,65 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], camera
 def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
            camera_from_map: NDArray[np.float64]) -> PointPose | None:
     """Return a pose after least squares with Cauchy's weights; None with too few inliers."""
-    inliers = agreeing(points, bearings, camera_from_map)
-    for _ in range(2):
+    fit = _fit(points, bearings, _Fit(camera_from_map, 1.0, np.eye(6)), _ROUGH)
+    return fit and PointPose(invert_transform(fit[0].camera_from_map), fit[1],
+                             _about_map_axes(fit[0]))
+
+
+def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
+               camera_from_map: NDArray[np.float64]
+               ) -> tuple[float, float, NDArray[np.int64]] | None:
+    """Return the focal length that fits points best; None with too few of them.
+
+    Points that the given focal length keeps from agreeing count, too: the tolerance falls step by
+    step. Under a focal length that is half or twice the true one, a pose has but a few of them.
+
+    Parameters
+    ----------
+    points : ndarray (n, 3)
+        All that may agree, in the map [m].
+    bearings : ndarray (n, 2)
+        As of find_pose, by the given focal length.
+    camera_from_map : ndarray (4, 4)
+        By the given focal length.
+
+    Returns
+    -------
+    ratio, deviation : float
+        As a multiple of the given one, and its relative standard deviation.
+    inliers : ndarray (k,) of int
+        Rows of the points that agree.
+    """
+    fit = _fit(points, bearings, _Fit(camera_from_map, 1.0, np.eye(7)), _WRONG_FOCAL)
+    return fit and (fit[0].ratio, _FOCAL_INFLATION * float(np.sqrt(
+        np.linalg.inv(fit[0].information)[6, 6])), fit[1])
+
+
+class _Fit(NamedTuple):
+    """A pose, a ratio of focal lengths, and their information.
+
+    It is of translation and rotation of the camera, and of the logarithm of the ratio if it is
+    (7, 7); with (6, 6) the ratio stays.
+    """
+
+    camera_from_map: NDArray[np.float64]
+    ratio: float
+    information: NDArray[np.float64]
+
+
+def _fit(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit,
+         tolerances: tuple[float, ...]) -> tuple[_Fit, NDArray[np.int64]] | None:
+    """Fit again and again, to the points within one tolerance after another; None with too few."""
+    for tolerance in tolerances:
+        inliers = agreeing(points, bearings / fit.ratio, fit.camera_from_map, tolerance)
         if len(inliers) < LEAST_INLIERS:
             return None
-        camera_from_map, information = _least_squares(points[inliers], bearings[inliers],
-                                                      camera_from_map)
-        inliers = agreeing(points, bearings, camera_from_map)
-    if len(inliers) < LEAST_INLIERS:
-        return None
-    try:
-        covariance = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        return None
-    if not np.isfinite(covariance).all():
-        return None
-    return PointPose(invert_transform(camera_from_map), inliers,
-                     _about_map_axes(covariance, camera_from_map))
+        fit = _least_squares(points[inliers], bearings[inliers], fit)
+    inliers = agreeing(points, bearings / fit.ratio, fit.camera_from_map)
+    is_sound = np.isfinite(fit.information).all() and \
+        1.0 / _MOST_RATIO < fit.ratio < _MOST_RATIO and \
+        np.linalg.matrix_rank(fit.information) == len(fit.information)
+    return (fit, inliers) if is_sound and len(inliers) >= LEAST_INLIERS else None
 
 
 def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
@@ -106,41 +155,41 @@ def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
     return np.nonzero((inside[:, 2] > 0.0) & (errors < tolerance * _MOST_ERROR))[0]
 
 
-def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64],
-                   camera_from_map: NDArray[np.float64]
-                   ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the refined pose, and its information (6, 6): translation, rotation of the camera."""
-    information = np.eye(6)
+def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit) -> _Fit:
+    """Return a fit after some steps of Gauss and Newton."""
+    camera_from_map, ratio, information = fit
     for _ in range(_STEPS):
         inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
         x, y, z = inside.T
         z = np.maximum(z, 1e-3)
-        residuals = np.stack([x / z, y / z], axis=1) - bearings
+        residuals = np.stack([x / z, y / z], axis=1) - bearings / ratio
         deviation = max(_LEAST_DEVIATION,
                         _FROM_MEDIAN * float(np.median(np.abs(residuals))))
-        zero, one = np.zeros_like(z), 1.0 / z
-        by_x = np.stack([one, zero, -x / z**2, -x * y / z**2, 1.0 + (x / z)**2, -y / z], axis=1)
-        by_y = np.stack([zero, one, -y / z**2, -1.0 - (y / z)**2, x * y / z**2, x / z], axis=1)
-        jacobian = np.stack([by_x, by_y], axis=1) / deviation
+        zero, one, u, v = np.zeros_like(z), 1.0 / z, x / z, y / z
+        # of the residuals times the ratio: else an endless ratio would fit best
+        by_x = np.stack([one, zero, -u / z, -u * v, 1.0 + u**2, -v, u], axis=1)
+        by_y = np.stack([zero, one, -v / z, -1.0 - v**2, u * v, u, v], axis=1)
+        jacobian = np.stack([by_x, by_y], axis=1)[..., :len(information)] / deviation
         scaled = residuals / deviation
         weights = 1.0 / (1.0 + np.sum(scaled**2, axis=1) / 4.0)
         information = np.einsum('nij,nik,n->jk', jacobian, jacobian, weights)
         gradient = np.einsum('nij,ni,n->j', jacobian, scaled, weights)
         step = -np.linalg.lstsq(information, gradient, rcond=None)[0]
-        turn = Rotation.from_rotvec(step[3:]).as_matrix()
+        step /= max(1.0, np.abs(step[6:]).sum() / _MOST_STEP)
+        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
         camera_from_map = make_transform(turn, step[:3]) @ camera_from_map
-        if np.abs(step).max() < 1e-7:
+        ratio *= float(np.exp(step[6:].sum()))
+        if np.abs(step).max() < _SMALL_STEP:
             break
-    return camera_from_map, information
+    return _Fit(camera_from_map, ratio, information)
 
 
-def _about_map_axes(covariance: NDArray[np.float64], camera_from_map: NDArray[np.float64]
-                    ) -> NDArray[np.float64]:
+def _about_map_axes(fit: _Fit) -> NDArray[np.float64]:
     """Return the covariance of the camera's pose in the map, in ROS order.
 
     A step (v, w) from the left of camera_from_map moves the camera's place by -R^T v, and turns
     it by -R^T w about the map's axes; R is the rotation of camera_from_map.
     """
-    turn = np.kron(np.eye(2), -camera_from_map[:3, :3].T)
-    moved = turn @ covariance @ turn.T
+    turn = np.kron(np.eye(2), -fit.camera_from_map[:3, :3].T)
+    moved = turn @ np.linalg.inv(fit.information) @ turn.T
     return np.asarray((moved + moved.T) / 2)

@@ -5,7 +5,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import comb
+from math import comb, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -112,7 +112,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
-        samples, prior = _draw(scene, options), _prior(vertical, options)
+        samples, prior = _draw(scene, options), prior_of(observation, options)
         if options.algorithm == 'auto':
             try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
                               limit=options.iterations)
@@ -130,6 +130,14 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
             coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
     return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
                          tuple(part.first for part in parts_of(landmark_map)))
+
+
+def prior_of(observation: Observation, options: RelocalizerOptions) -> Prior:
+    """Return what is known of the camera of a frame before anything is searched."""
+    vertical, (low, high) = _vertical(observation, options), options.height_range_m
+    known = _is_known(vertical)
+    return Prior(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
+                 np.radians(options.max_tilt_deg), vertical[6] if known else inf)
 
 
 def coverage_of(frames: Sequence[SearchedFrame]) -> float:
@@ -165,13 +173,6 @@ def _sample_size(vertical: NDArray[np.float64]) -> int:
 def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
     distinct = min(len(np.unique(scene.pairs[:, 0])), len(np.unique(scene.pairs[:, 1])))
     return distinct >= _sample_size(vertical)
-
-
-def _prior(vertical: NDArray[np.float64], options: RelocalizerOptions) -> Prior:
-    """Return what the vertical and the options say about the camera."""
-    up_in_camera = tuple(vertical[:3]) if _is_known(vertical) else _UPRIGHT
-    low, high = options.height_range_m
-    return Prior(up_in_camera, _UP_IN_MAP, low, high, np.radians(options.max_tilt_deg))
 
 
 def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None:

@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.tolerances import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import compiled
 
 MAX_DISTINCT = 8
-# Hypotheses nearer than this to a better one are at the same place.
-DISTINCT_DISTANCE_M = 0.5
-DISTINCT_ANGLE_DEG = 20.0
-# The trace of a rotation is 1 + 2 cos(angle).
-_DISTINCT_TRACE = 1.0 + 2.0 * np.cos(np.radians(DISTINCT_ANGLE_DEG))
+# Plain numbers, for the kernels.
+_PLACE_M, _PLACE_TRACE = SAME_PLACE.distance_m, SAME_PLACE.least_trace
 # Scores nearer than this differ by rounding only: the hypothesis found first stays.
 _TIE = 1e-9
 
@@ -93,8 +91,8 @@ def remember(leaders, score, iteration, sample, rotation, translation):
 @compiled
 def same_place(rotation_a, translation_a, rotation_b, translation_b):
     """Return whether two camera_from_map poses are within the distinct distance and angle."""
-    return are_near(rotation_a, translation_a, rotation_b, translation_b, DISTINCT_DISTANCE_M,
-                    _DISTINCT_TRACE)
+    return are_near(rotation_a, translation_a, rotation_b, translation_b, _PLACE_M,
+                    _PLACE_TRACE)
 
 
 @compiled

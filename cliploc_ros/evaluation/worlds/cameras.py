@@ -16,8 +16,9 @@ GROUP_SIZE = 5
 _FOCAL_PX = (380.0, 620.0)
 # Hands and tripods: 1.28 to 1.64 (fr3), 1.12 to 1.35 (demo). Robots are lower, a guess.
 _HEIGHT_M = (0.3, 1.8)
-# 20 to 39 down (fr3), 2 to 10 (demo). Deviation of the roll: 4.4 (fr3, hand), 1.2 (demo).
-_PITCH_DEG, _ROLL_DEG = (-5.0, 35.0), 3.0
+# 20 to 39 down (fr3), 2 to 10 (demo). Low robots look up, by a guess. Deviation of the roll: 4.4
+# (fr3, hand), 1.2 (demo).
+_PITCH_DEG, _ROLL_DEG = (-20.0, 35.0), 3.0
 # In a second: 5 to 21 degrees and .12 to .36 m (fr3, hand).
 _TURN_DEG, _STEP_M = (5.0, 20.0), 0.15
 _ELBOW_ROOM_M = 0.2

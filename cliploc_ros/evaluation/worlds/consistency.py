@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_difference
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions

@@ -44,6 +44,7 @@ FITTED_KINDS = ('room', 'office', 'shop', 'bare room')
 _MATCHINGS = ('hybrid', 'class')
 # Deviations of the known vertical [deg], drawn for each world.
 _VERTICALS_DEG = (0.5, 1.0, 2.0, 4.0)
+_IN_DOUBT = 0.3
 # The modes in which objects exchange places.
 _ELSEWHERE = (MODES[0], MODES[-1])
 
@@ -64,7 +65,9 @@ def search_world(world: tuple[str, int]) -> list[Searched]:
     vertical_deg = float(rng.choice(_VERTICALS_DEG))
     found = []
     for matching in _MATCHINGS:
-        options = RelocalizerOptions(matching=matching, vertical_deviation_deg=vertical_deg)
+        # so low that what costs time for likely poses only is computed for those in doubt, too
+        options = RelocalizerOptions(matching=matching, vertical_deviation_deg=vertical_deg,
+                                     min_confidence=_IN_DOUBT)
         for one in requests(made, seed, options):
             places = [(made.landmark_map, False)]
             if one.mode in _ELSEWHERE:

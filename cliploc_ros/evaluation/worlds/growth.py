@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.acceptance.agreement import RIGHT_M
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions

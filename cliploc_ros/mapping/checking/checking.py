@@ -112,10 +112,9 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         model = guess_detector(landmark_map, options.mapping)
         overlaps = find_map_overlaps(landmark_map, None, None)
         grid = _check_grid(landmark_map, model, None, options, tell)
-    rng = np.random.default_rng(options.random_seed)
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
-        overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map, rng)),
+        overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
         queries=tuple(try_observations(landmark_map, queries, options,
                                        lambda share: tell('relocalizing queries', share))),

@@ -17,7 +17,12 @@ from rclpy.node import Node
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError, OdometryWindow
+from cliploc_ros.ros.inputs.odometry_window import (
+    LONG_NS,
+    MOMENT_NS,
+    NoOdometryError,
+    OdometryWindow,
+)
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.units import NS_PER_S
 
@@ -27,10 +32,6 @@ _LENGTH_S = 30.0
 _PATIENCE_S = 0.2
 # Odometry that ends or begins this close to an image may cover the next image.
 _NEARLY_NS = 2_000_000_000
-# Over a shorter time the noise of the poses would look like a speed.
-_MOMENT_NS = 300_000_000
-# Over a longer time the mean speed says little about now (a guess): slow sources send at 1 Hz.
-_LONG_NS = 3_000_000_000
 #: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
 #: taking a moving robot on a busy machine for one at rest.
 MOMENT_PATIENCE_S = 2.0
@@ -46,11 +47,14 @@ class BodyPose(NamedTuple):
         The coordinate frame that odometry tracks (child_frame_id).
     run : int
         Poses of one run share their odometry frame; those of different runs do not compare.
+    way_m : float
+        Driven since the run began [m].
     """
 
     odom_from_body: NDArray[np.float64]
     body_frame: str
     run: int
+    way_m: float
 
 
 class OdometrySource:
@@ -178,26 +182,23 @@ class OdometrySource:
             return None
         now_ns = stamp_ns(self._newest.header.stamp)
         step_ns = self._window.since_previous_ns(now_ns)
-        moment_ns = step_ns if _MOMENT_NS < step_ns <= _LONG_NS else _MOMENT_NS
+        moment_ns = step_ns if MOMENT_NS < step_ns <= LONG_NS else MOMENT_NS
         try:
             return (self._window.pose_at(now_ns - moment_ns), self._window.pose_at(now_ns),
                     moment_ns / NS_PER_S)
         except NoOdometryError:
             return None
 
-    def moved_since(self, stamp: Time) -> tuple[float, float] | None:
-        """Return how far the robot is from where it was at an image [m], [degrees].
+    def moved_since(self, stamp: Time, patience_s: float) -> tuple[float, float] | None:
+        """Return how far the robot is from where it was at an image, at most [m], [degrees].
 
-        None where odometry does not cover that time.
+        Waits for the message that follows the image. None where odometry does not cover that
+        time, or has a gap of more than 3 s there.
         """
+        at_ns = stamp_ns(stamp)
         with self._heard:
-            if self._newest is None:
-                return None
-            try:
-                return pose_error(self._window.pose_at(stamp_ns(stamp)),
-                                  self._window.pose_at(stamp_ns(self._newest.header.stamp)))
-            except NoOdometryError:
-                return None
+            self._heard.wait_for(lambda: self._window.spans(at_ns, 0), patience_s)
+            return self._window.moved_since(at_ns)
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers about the time of an image, and so of the next.
@@ -224,6 +225,7 @@ class OdometrySource:
                 self._heard.wait_for(lambda: not self._window.is_ahead(at_ns), _PATIENCE_S)
             odom_from_body = self._window.pose_at(at_ns)
             run, body_frame = self._window.run, self._frames[1]
+            way_m = self._window.way_at(at_ns)
         if not body_frame:
             raise NoOdometryError(f'{self.topic} has no child_frame_id')
-        return BodyPose(odom_from_body, body_frame, run)
+        return BodyPose(odom_from_body, body_frame, run, way_m)

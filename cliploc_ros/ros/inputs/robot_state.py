@@ -33,10 +33,13 @@ class CameraPlace:
     odom_from_camera : ndarray (4, 4)
     run : int
         Places of one run share their odometry frame.
+    way_m : float
+        Driven since the run began [m].
     """
 
     odom_from_camera: NDArray[np.float64]
     run: int
+    way_m: float
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class RobotStateSource:
         try:
             body = self.odometry.pose_at(image.stamp)
             if body.body_frame == image.frame_id:
-                return CameraPlace(body.odom_from_body, body.run)
+                return CameraPlace(body.odom_from_body, body.run, body.way_m)
             camera_from_body = camera_from_base if body.body_frame == values['base_frame'] \
                 else self._camera_from_body(image, body.body_frame, values['tf_timeout_s'])
         except NoOdometryError as error:
@@ -156,7 +159,8 @@ class RobotStateSource:
         except NoTransformError as error:
             self._warn(f'one frame alone: {error}')
             return None
-        return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run)
+        return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run,
+                           body.way_m)
 
     def _camera_from_body(self, image: Header, body_frame: str, timeout_s: float
                           ) -> NDArray[np.float64]:

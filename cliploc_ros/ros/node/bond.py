@@ -23,8 +23,19 @@ def start_bond(node: Node) -> Any:
         from bondpy.bondpy import Bond
     except ImportError:
         return None
-    bond = Bond('bond', node.get_name(), node)
+    bond = Bond(node, 'bond', node.get_name())
     bond.set_heartbeat_period(_HEARTBEAT_PERIOD_S)
     bond.set_heartbeat_timeout(_HEARTBEAT_TIMEOUT_S)
     bond.start()
     return bond
+
+
+def end_bond(node: Node, bond: Any) -> None:
+    """Tell the manager that the node ends its work.
+
+    bondpy destroys its publisher and subscription, but leaves them to the node: its executor
+    would come upon them for ever, and do nothing else.
+    """
+    bond.shutdown()
+    node.destroy_publisher(bond.pub)
+    node.destroy_subscription(bond.sub)

@@ -22,7 +22,7 @@ from rclpy.node import Node
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
-from cliploc_ros.ros.node.bond import start_bond
+from cliploc_ros.ros.node.bond import end_bond, start_bond
 from cliploc_ros.ros.node.callback_group import BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.log import RosLogHandler
@@ -241,7 +241,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def _deactivate(self) -> None:
         self.active = False
         if self._bond is not None:
-            self._bond.shutdown()
+            end_bond(self, self._bond)
             self._bond = None
         self.close()
 

@@ -72,7 +72,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
     for line, text in enumerate(_lines(verdict, canvas.shape[1] // _CHAR_PX)):
         _write(canvas, text, np.array([6, 18 + 20 * line]),
                _ACCEPTED if found.accepted else _REFUSED)
-    if seen.layer is None or found.recognized is None or not found.recognized.keyframes:
+    if seen.layer is None or found.recognized is None:
         return canvas
     return beside_keyframe(canvas, found.recognized, seen.layer)
 

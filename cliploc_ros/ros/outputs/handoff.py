@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from std_srvs.srv import Empty
 
+from cliploc_ros.core.geometry.tolerances import SAME_SPOT
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
@@ -29,10 +30,6 @@ from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
 # Odometry of a robot at rest may be this old (a guess): slow sources send at 1 Hz.
 _MAX_ODOM_AGE_S = 2.0
-# A robot that moved further since its image is not where the pose says (a guess). AMCL moves a
-# pose on by tf; robot_localization's set_pose does not.
-_MAX_MOVE_M = 0.1
-_MAX_MOVE_DEG = 5.0
 # How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
 # How long to wait for a subscriber of initialpose; discovery of a running one takes less.
@@ -124,7 +121,7 @@ class HandOff:
         if values['require_localizer']:
             self._wait_for_localizer(deadline)
         self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
-        self._check_place(pose.header.stamp)
+        self._check_place(pose.header.stamp, deadline)
         if self._jumped_at >= received_at:
             raise TimeJumpError('time jumped back before the hand-over: the pose is from before')
         if self._stopped.is_set():
@@ -172,13 +169,25 @@ class HandOff:
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')
 
-    def _check_place(self, stamp: Stamp) -> None:
-        """Raise if odometry shows that the robot has moved since its image was taken."""
-        distance_m, angle_deg = self._odometry.moved_since(stamp) or (0.0, 0.0)
-        if distance_m > _MAX_MOVE_M or angle_deg > _MAX_MOVE_DEG:
+    def _check_place(self, stamp: Stamp, deadline: float) -> None:
+        """Raise unless odometry shows that the robot is where its image was taken.
+
+        AMCL would move the pose on by tf, robot_localization's set_pose does not.
+        """
+        patience_s = min(_ODOM_PATIENCE_S, _left_s(deadline)) if self._odometry.is_published \
+            else 0.0
+        moved = self._odometry.moved_since(stamp, patience_s)
+        if moved is None:
+            if self._odometry.is_published:
+                raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has '
+                                   'moved since its image: stamp both by one clock, send at 1 Hz '
+                                   'or more; ask again')
+            return
+        distance_m, angle_deg = moved
+        if distance_m > SAME_SPOT.distance_m or angle_deg > SAME_SPOT.angle_deg:
             raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
-                               f'degrees since its image (limits {_MAX_MOVE_M:g} and '
-                               f'{_MAX_MOVE_DEG:g}): ask again while it stands')
+                               f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
+                               f'{SAME_SPOT.angle_deg:g}): ask again while it stands')
 
     def _settle(self, updates: int, deadline: float) -> None:
         """Have AMCL take in some scans though the robot rests, as far as time allows.

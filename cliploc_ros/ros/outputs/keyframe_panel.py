@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
-from cliploc_ros.core.keyframes.localization import Recognized
+from cliploc_ros.core.keyframes.localization import RecognizedPlace
 
 _BLANK, _OTHER, _TEXT = (40, 40, 40), (120, 120, 120), (255, 255, 255)
 _RADIUS_PX = 3
@@ -15,7 +15,7 @@ _RADIUS_PX = 3
 _MOST_LINES = 20
 
 
-def beside_keyframe(canvas: NDArray[np.uint8], seen: Recognized, layer: KeyframeLayer
+def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: KeyframeLayer
                     ) -> NDArray[np.uint8]:
     """Return the image (h, w, 3) with the keyframe that fits it best to the right of it.
 
@@ -26,7 +26,7 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: Recognized, layer: Keyframe
     ----------
     canvas : ndarray (h, w, 3) uint8
         The localized image. It is not changed.
-    seen : Recognized
+    seen : RecognizedPlace
         With one keyframe at least.
     layer : KeyframeLayer
         That it was recognized in.

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers that decide whether a pose is accepted: calibration.yaml, a tuple a section."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+FILE = Path(__file__).with_name('calibration.yaml')
+
+
+class Objects(NamedTuple):
+    """Utility of a pose by its objects."""
+
+    score: float
+    misfit: float
+    likeness: float
+    rarity: float
+    unlabelled: float
+    unexplained: float
+    none_right: float
+    map_size: float
+    vertical: float
+    knee: float
+    slope: float
+
+
+class Keyframes(NamedTuple):
+    """Utility of a pose by the points of keyframes."""
+
+    none: float
+    inliers: float
+    confirmed: float
+    explained: float
+    unexplained: float
+    most_objects: float
+    missed: float
+    good_covariance: float
+
+
+class Genuine(NamedTuple):
+    """Log odds that a recognized place is there, and no picture of it."""
+
+    none: float
+    confirmed: float
+    border: float
+    focal: float
+
+
+class Attitude(NamedTuple):
+    """What an attitude says against a pose."""
+
+    wrong_mount: float
+    not_mirrored: float
+    vertical_sigmas: float
+
+
+class Places(NamedTuple):
+    """Log odds between places that look alike."""
+
+    likeness: float
+    unlabelled: float
+
+
+class Search(NamedTuple):
+    """When a search is enough."""
+
+    least_samples: float
+    missed_is_right: float
+    early_share: float
+
+
+class SuccessiveLooks(NamedTuple):
+    """What successive looks must agree on."""
+
+    mean_confidence: float
+    most: int
+    drift_m: float
+    drift_deg: float
+
+
+class Spread(NamedTuple):
+    """How covariances count."""
+
+    caution: float
+    sharpness: float
+    most_confidence: float
+
+
+class Calibration(NamedTuple):
+    """All sections; calibration.yaml says what each number means."""
+
+    objects: Objects
+    keyframes: Keyframes
+    genuine: Genuine
+    attitude: Attitude
+    places: Places
+    search: Search
+    looks: SuccessiveLooks
+    covariance: Spread
+
+
+def load_calibration(path: Path = FILE) -> Calibration:
+    """Read the numbers; a missing or unknown one is a defect of the installation."""
+    sections: dict[str, Any] = yaml.safe_load(path.read_text())
+    return Calibration(**{
+        name: kind(**{term: entry['value'] for term, entry in sections[name]['terms'].items()})
+        for name, kind in Calibration.__annotations__.items()})
+
+
+#: The installed numbers.
+CALIBRATION = load_calibration()

@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The poses that may be right, of every source, and what the objects say of each."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.attitude import tilt_handicaps
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.confidence import Setting, utilities
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
+from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
+from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.rig import Rig
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.frame_search import SearchedFrame
+
+_NONE = np.empty(0, dtype=np.int64)
+
+
+class JoinedFrames(NamedTuple):
+    """What poses are compared on: searched frames of one camera, in a map.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    options : RelocalizerOptions
+    frames : sequence of F SearchedFrame
+    rig : Rig
+        The same frames.
+    cameras : ndarray (F, 4, 4)
+        Each camera from the last.
+    """
+
+    landmark_map: LandmarkMap
+    options: RelocalizerOptions
+    frames: Sequence[SearchedFrame]
+    rig: Rig
+    cameras: NDArray[np.float64]
+
+    @property
+    def knows_vertical(self) -> bool:
+        """Return whether the vertical of any frame is known."""
+        return bool(self.rig.verticals[:, 6].any())
+
+    @property
+    def setting(self) -> Setting:
+        """Return what the chance of a wrong pose depends on, besides the supports."""
+        return Setting(len(self.landmark_map),
+                       self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
+
+
+class Candidate(NamedTuple):
+    """A pose that may be right, and what supports it.
+
+    Parameters
+    ----------
+    finalist : Finalist
+        Of the search of objects, or the pose of keyframes as one.
+    pose : ndarray (4, 4)
+        map_from_camera.
+    matches : list of F tuple of Match
+        Inliers in each frame.
+    support : Support
+        By objects.
+    is_upright : bool
+        Whether it uses the known vertical, or agrees with it.
+    handicap : float
+        Log odds that its attitude takes from it.
+    odds : float
+        Logarithm of its odds, up to a constant that all candidates share.
+    recognized : RecognizedPlace or None
+        What keyframes show there, where they propose the pose.
+    alone : float
+        The odds of a pose that keyframes propose, without what the search of objects met there.
+    """
+
+    finalist: Finalist
+    pose: NDArray[np.float64]
+    matches: list[tuple[Match, ...]]
+    support: Support
+    is_upright: bool
+    handicap: float
+    odds: float
+    recognized: RecognizedPlace | None = None
+    alone: float = -math.inf
+
+
+def candidates_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
+                ) -> list[Candidate]:
+    """Return poses as candidates, with their odds by objects.
+
+    Parameters
+    ----------
+    joined : JoinedFrames
+    finalists : sequence of m Finalist
+    upright : sequence of m bool
+        See Candidate.is_upright.
+    """
+    poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
+    matches = [matches_of(joined.rig, one) for one in finalists]
+    supports = supports_of(joined, poses, matches)
+    handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
+        if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
+    return list(map(Candidate, finalists, poses, matches, supports, upright, handicaps.tolist(),
+                    (utilities(supports) - handicaps).tolist()))
+
+
+def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
+                matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
+    """Return the support of each pose (m, 4, 4), from its matches in each frame."""
+    used = [one.observation if joined.options.needs_similarities
+            else replace(one.observation, similarities=None) for one in joined.frames]
+    compared = [ComparedFrame(
+        one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
+        seen.similarities, one.scene, seen.similarity_rows)
+        for one, seen in zip(joined.frames, used, strict=True)]
+    last_from_cameras = np.linalg.inv(joined.cameras)
+    return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)
+            for pose, found in zip(poses, matches, strict=True)]
+
+
+def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
+    """Return a pose (4, 4) of another source like those that a search met."""
+    pose = invert_transform(map_from_camera)
+    return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
+
+
+def refined(joined: JoinedFrames, start: Finalist) -> Finalist:
+    """Return a pose that no search met, refined like those that it met."""
+    if not joined.options.refine:
+        return start
+    return start._replace(**refine_rig(joined.rig, start.rotation, start.translation)._asdict())

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether an image may be a mirror image: of a room in a mirror, or of a flipped camera.
+
+A pose may explain a mirror image well. A camera on the other side of a plane sees the points of
+the plane mirrored, at the same distances: objects on a table from below, those along a wall from
+behind. So the image is mirrored back, and the best pose for that competes with the pose found. It
+starts where reflection takes the camera, at planes through the objects that are matched.
+"""
+
+import math
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.candidates import (
+    Candidate,
+    JoinedFrames,
+    refined,
+    supports_of,
+    unrefined,
+)
+from cliploc_ros.core.acceptance.confidence import utilities
+from cliploc_ros.core.association.matching import match_frame
+from cliploc_ros.core.fit.finalists import matches_of
+from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.verification import verify_rig
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.observation import Observation
+
+_FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
+_UP = np.array([0.0, 0.0, 1.0])
+# Planes that are tried, and poses that are refined. Chosen on mirrored images of TUM fr3.
+_MOST_PLANES, _REFINED = 30, 4
+
+
+def chance_not_mirrored(joined: JoinedFrames, best: Candidate) -> float:
+    """Return the probability that no mirror image explains the detections instead."""
+    mirrored = _mirrored(joined)
+    centers = joined.landmark_map.centers[
+        sorted({one.landmark for found in best.matches for one in found})]
+    starts = [unrefined(_reflection(*plane) @ best.pose @ _FLIP) for plane in _planes(centers)]
+    starts.sort(key=lambda one: -verify_rig(mirrored.rig, one.rotation, one.translation).score)
+    found = [refined(mirrored, one) for one in starts[:_REFINED]]
+    supports = supports_of(mirrored, np.array([one.map_from_camera for one in found]),
+                           [matches_of(mirrored.rig, one) for one in found])
+    lead = (CALIBRATION.attitude.not_mirrored + float(utilities([best.support])[0])
+            - float(utilities(supports).max()))
+    return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
+
+
+def _mirrored(joined: JoinedFrames) -> JoinedFrames:
+    """Return frames whose images are mirrored left to right, searched for nothing."""
+    frames = []
+    for one in joined.frames:
+        observation = _mirrored_observation(one.observation)
+        frames.append(one._replace(
+            observation=observation, vertical=one.vertical * (-1, 1, 1, 1, 1, 1, 1),
+            scene=match_frame(joined.landmark_map, observation, joined.options)[0]))
+    cameras = _FLIP @ joined.cameras @ _FLIP
+    rig = make_rig([one.scene for one in frames], cameras,
+                   np.stack([one.vertical for one in frames]), joined.landmark_map.position_sigmas)
+    return joined._replace(frames=frames, rig=rig, cameras=cameras)
+
+
+def _mirrored_observation(observation: Observation) -> Observation:
+    """Return an observation mirrored on the plane z = 1, where a lens distorts nothing."""
+    camera, detections = observation.camera, observation.detections
+    boxes = camera.normalize_bboxes(detections.bboxes_xyxy)
+    return replace(observation, camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
+                   detections=replace(detections,
+                                      bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
+
+
+def _planes(points: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return points on planes with their normals: level, fitted to points, through three each."""
+    middle = points.mean(axis=0)
+    planes = [(middle, _UP), (middle, np.linalg.svd(points - middle)[2][-1])]
+    triples = np.array([*combinations(range(len(points)), 3)], dtype=np.int64).reshape(-1, 3)
+    chosen = np.linspace(0, len(triples) - 1, min(_MOST_PLANES, len(triples))).astype(np.int64)
+    for first, second, third in points[triples[chosen]]:
+        normal = np.cross(second - first, third - first)
+        length = float(np.linalg.norm(normal))
+        if length > 1e-6:
+            planes.append((first, normal / length))
+    return planes
+
+
+def _reflection(point: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the transform (4, 4) that reflects points at a plane."""
+    reflection = np.eye(4)
+    reflection[:3, :3] -= 2.0 * np.outer(normal, normal)
+    reflection[:3, 3] = 2.0 * (point @ normal) * normal
+    return reflection

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One verdict from objects and keyframes: which pose leads, and what either cannot override."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
+from cliploc_ros.core.fit.fusion import fuse
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN, Recognition, RecognizedPlace
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+
+ROUGH, FINE = np.diag([0.01] * 3 + [1e-3] * 3), np.diag([1e-4] * 3 + [1e-5] * 3)
+ROOM = make_room()
+SEEN = see_room(ROOM)
+OPTIONS = RelocalizerOptions(matching='class')
+
+
+class Says:
+    """A keyframe search with a known answer, in a layer that covers a share of every view."""
+
+    def __init__(self, *places, covers=1.0, is_complete=True):
+        self._seen = Recognition(places, is_complete)
+        self._covers = covers
+
+    def recognize(self, guesses, prior=NOTHING_KNOWN):
+        return self._seen
+
+    def coverage(self, map_from_camera):
+        return self._covers if np.isscalar(self._covers) else self._covers(map_from_camera)
+
+
+def moved(x, pose=MAP_FROM_CAMERA):
+    return make_transform(pose[:3, :3], pose[:3, 3] + np.array([x, 0.0, 0.0]))
+
+
+def place(x=0.0, inliers=200, confirmed=0.9, extent=1.0, **fields):
+    return RecognizedPlace(moved(x), FINE, inliers, confirmed, 0.9, extent, (40, 44), **fields)
+
+
+def ask(recognizer=None, objects=12, options=OPTIONS, room=ROOM, **known):
+    seen = Observation(CAMERA, SEEN.select(np.arange(objects)), **known)
+    return Relocalizer(room, options).relocalize([seen], recognizer)
+
+
+def error_m(found, x=0.0):
+    return pose_error(found.map_from_camera, moved(x))[0]
+
+
+def test_keyframes_that_recognize_nothing_leave_the_objects_pose():
+    alone, found = ask(), ask(Says(covers=0.0))
+    assert found.accepted and found.source == 'objects'
+    np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
+    assert found.confidence == alone.confidence
+
+
+def test_many_points_accept_what_objects_could_not():
+    assert ask(objects=0).refusal_kind == RefusalKind.TOO_FEW_OBJECTS
+    found = ask(Says(place(3.0)), objects=0)
+    assert found.accepted and found.source == 'keyframes'
+    assert error_m(found, 3.0) == 0.0
+    np.testing.assert_array_equal(found.covariance, FINE)
+
+
+def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
+    strong, weak = ask(Says(place(0.05))), ask(Says(place(0.05, inliers=9)))
+    assert strong.accepted and weak.accepted
+    assert strong.source == weak.source == 'both'
+    assert error_m(strong, 0.05) == 0.0
+    assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
+
+
+@pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
+def test_a_dozen_points_do_not_override_what_objects_lack(cause):
+    objects, options, looks = 12, OPTIONS, Looks()
+    if cause == 'too few objects':
+        objects = 2
+    elif cause == 'a search cut short':
+        options = replace(OPTIONS, iterations=100, algorithm='bf', time_budget_s=0.0)
+    seen = Observation(CAMERA, SEEN.select(np.arange(objects)), stamp_ns=10,
+                       odom_from_camera=np.eye(4))
+    if cause == 'earlier looks':
+        for stamp_ns in range(6):
+            looks = looks.with_look(Look(replace(seen, stamp_ns=stamp_ns), moved(9.0), 0.3))
+    relocalizer = Relocalizer(ROOM, options)
+    relocalizer.warm_up()
+    frame = relocalizer.search(seen, -1.0 if cause == 'a search cut short' else np.inf)
+    found = relocalizer.locate([frame], looks=looks, recognizer=Says(place(0.0, inliers=12)))
+    assert not found.accepted, found
+
+
+def test_keyframes_alone_must_meet_the_rule_of_successive_looks():
+    seen = Observation(CAMERA, SEEN.select(np.arange(0)), stamp_ns=10, odom_from_camera=np.eye(4))
+    looks = Looks()
+    for stamp_ns in range(4):
+        looks = looks.with_look(Look(replace(seen, stamp_ns=stamp_ns), moved(9.0), 0.1))
+    relocalizer = Relocalizer(ROOM, OPTIONS)
+    found = relocalizer.locate([relocalizer.search(seen)], looks=looks, recognizer=Says(place()))
+    assert found.refusal_kind == RefusalKind.FRAMES_DISAGREE
+
+
+@pytest.mark.parametrize('inliers', [60, 400])
+def test_two_sources_that_contradict_each_other_are_refused(inliers):
+    found = ask(Says(place(5.0, inliers=inliers)), objects=6)
+    assert not found.accepted
+    assert found.refusal_kind in {RefusalKind.CONTRADICTION, RefusalKind.UNEXPLAINED}
+
+
+def test_a_place_that_the_layer_covers_but_does_not_recognize_loses_confidence():
+    covered, elsewhere = ask(Says(covers=1.0), objects=5), ask(Says(covers=0.0), objects=5)
+    assert covered.confidence < elsewhere.confidence
+    cut = ask(Says(covers=1.0, is_complete=False), objects=5)
+    assert cut.confidence == elsewhere.confidence, 'a search that was cut says nothing'
+
+
+@pytest.mark.parametrize(('fields', 'kind'), [
+    ({'inliers': 9, 'confirmed': 0.3}, RefusalKind.TOO_FEW_OBJECTS),
+    ({'confirmed': 0.3, 'extent': 0.5}, RefusalKind.CHANGED),
+    ({'focal_ratio': 0.5, 'focal_deviation': 0.02}, RefusalKind.CHANGED),
+    ({'tilt_error': 9.0}, None)], ids=['few points', 'a picture', 'focal length', 'vertical'])
+def test_weak_features_accept_nothing(fields, kind):
+    known = {'up_in_camera': -MAP_FROM_CAMERA[1, :3] if 'tilt_error' in fields else None}
+    found = ask(Says(place(**fields)), objects=0, **known)
+    assert not found.accepted
+    assert kind is None or found.refusal_kind == kind
+
+
+def test_a_picture_refuses_the_objects_in_it_too():
+    assert ask(objects=8).accepted
+    found = ask(Says(place(confirmed=0.3, extent=0.5)), objects=8)
+    assert not found.accepted
+    assert 'picture' in found.reason
+
+
+def two_rooms(lacking=0):
+    """The room and a copy of it 20 m away, without some of its objects."""
+    twin = ROOM.select(range(len(ROOM) - lacking))
+    return LandmarkMap(
+        'map', ROOM.landmark_ids + tuple(f'{one}_twin' for one in twin.landmark_ids),
+        ROOM.labels + twin.labels, ROOM.class_ids + twin.class_ids,
+        np.concatenate([ROOM.centers, twin.centers + np.array([20.0, 0.0, 0.0])]),
+        np.concatenate([ROOM.semi_axes, twin.semi_axes]),
+        np.concatenate([ROOM.quats_xyzw, twin.quats_xyzw]))
+
+
+@pytest.mark.parametrize('lacking', [0, 3])
+def test_the_twin_of_a_place_without_keyframes_stays_a_rival(lacking):
+    def covers(pose):
+        return float(pose[0, 3] < 10.0)
+
+    found = ask(Says(place(), covers=covers), room=two_rooms(lacking))
+    assert not found.accepted
+    assert found.refusal_kind == RefusalKind.LOOK_ALIKE
+
+
+def test_keyframes_tell_a_twin_that_they_cover_apart():
+    assert ask(Says(place(), covers=1.0), room=two_rooms()).accepted
+    both = ask(Says(place(), place(20.0, inliers=190), covers=1.0), room=two_rooms())
+    assert not both.accepted, 'both rooms are recognized'
+
+
+def test_fusing_takes_the_better_pose_of_each_direction():
+    level, upright = np.diag([0.01, 0.01, 1.0, 1.0, 1.0, 1.0]), np.diag([1.0] * 2 + [0.01] * 4)
+    pose, covariance = fuse(moved(0.0), level, moved(0.1), upright)
+    assert 0.0 < pose[0, 3] - MAP_FROM_CAMERA[0, 3] < 0.02
+    assert covariance[0, 0] < 0.03
+    assert covariance[2, 2] < 0.03
+
+
+def test_fusing_twice_the_same_gains_nothing():
+    pose, covariance = fuse(moved(0.2), ROUGH, moved(0.2), ROUGH)
+    assert np.allclose(pose, moved(0.2))
+    assert np.allclose(covariance, ROUGH)
+    pose, covariance = fuse(moved(0.2), ROUGH, moved(0.0), FINE)
+    assert np.allclose(pose, moved(0.0))
+    assert np.allclose(covariance, FINE)
