@@ -63,7 +63,7 @@ def test_points_tell_the_focal_length_also_where_few_agree_with_the_given_one(ra
     bearings[::4] = rng.permutation(bearings[::4])
     start = invert_transform(find_pose(points, bearings * ratio).map_from_camera)
     found, deviation, inliers = free_focal(points, bearings * ratio, start)
-    assert abs(np.log(found / ratio)) < 2.0 * deviation < 0.03
+    assert abs(np.log(found / ratio)) < 3.0 * deviation < 0.01
     assert len(inliers) > 250
 
 
@@ -73,7 +73,7 @@ def test_a_plane_that_fills_little_of_the_image_tells_no_focal_length():
     points = 2.0 * np.column_stack([bearings, np.ones(100)])
     bearings += rng.normal(0.0, 1.0 / CAMERA.fx, bearings.shape)
     found = free_focal(points, bearings, np.eye(4))
-    assert found is None or found[1] > 0.5
+    assert found is None or found[1] > 0.1
 
 
 def test_few_points_and_points_that_agree_on_nothing_give_no_pose():

@@ -306,7 +306,7 @@ class Says:
 
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
-    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 200, 0.9, 0.9, 1.0))
+    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9))
 
     def localize(seconds, run=0, detections=SEEN, recognizer=keyframes):
         found = session.localize(frame(seconds, detections=detections), run, 5, 5.0,

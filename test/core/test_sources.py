@@ -43,7 +43,8 @@ def moved(x, pose=MAP_FROM_CAMERA):
 
 
 def place(x=0.0, inliers=200, confirmed=0.9, extent=1.0, **fields):
-    return RecognizedPlace(moved(x), FINE, inliers, confirmed, 0.9, extent, (40, 44), **fields)
+    return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, 0.9, extent, (40, 44),
+                           **fields)
 
 
 def ask(recognizer=None, objects=12, options=OPTIONS, room=ROOM, **known):

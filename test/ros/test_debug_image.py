@@ -99,8 +99,8 @@ def layer_of(room, **images):
 def recognized(found):
     """Answer by five of the points, which the image shows 100 px further up."""
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
-    seen = RecognizedPlace(np.eye(4), np.eye(6), 5, 0.8, 0.8, keyframes=(0,), pixels=pixels,
-                           rows=np.arange(5))
+    seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, 0.8, keyframes=(0,),
+                           pixels=pixels, rows=np.arange(5))
     return replace(found, recognized=Recognition((seen,)))
 
 

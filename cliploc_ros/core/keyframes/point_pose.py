@@ -22,9 +22,6 @@ _STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-5, 0.3
 # Tolerances of the inliers, as multiples: for a pose of three points, and for one with a focal
 # length that may be half the true one. None is wrong by more than the ratio.
 _ROUGH, _WRONG_FOCAL, _MOST_RATIO = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), 10.0
-# Points of a keyframe share errors, and several keyframes have the same point: deviations of 570
-# right poses were by so much larger, whatever their size.
-_FOCAL_INFLATION = 4.5
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
 # Of a normal distribution: standard deviation divided by the median of absolute values.
@@ -110,13 +107,13 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
     Returns
     -------
     ratio, deviation : float
-        As a multiple of the given one, and its relative standard deviation.
+        As a multiple of the given one, and its relative standard deviation, from the features'
+        deviations alone.
     inliers : ndarray (k,) of int
         Rows of the points that agree.
     """
     fit = _fit(points, bearings, _Fit(camera_from_map, 1.0, np.eye(7)), _WRONG_FOCAL)
-    return fit and (fit[0].ratio, _FOCAL_INFLATION * float(np.sqrt(
-        np.linalg.inv(fit[0].information)[6, 6])), fit[1])
+    return fit and (fit[0].ratio, float(np.sqrt(np.linalg.inv(fit[0].information)[6, 6])), fit[1])
 
 
 class _Fit(NamedTuple):
