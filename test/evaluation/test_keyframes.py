@@ -7,15 +7,15 @@ import time
 import numpy as np
 import pytest
 
-from cliploc_ros.core.acceptance.recognition import ObjectsThere
-from cliploc_ros.core.combination import combine
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
@@ -24,7 +24,7 @@ from studies.keyframes.cases import IMAGE_CHANGES, World, hang, make_picture, tw
 
 EVERY = LayerOptions(0.0, 0.0)
 OPTIONS = RelocalizerOptions(matching='class')
-NOWHERE = Relocalization(False, 'no objects')
+NO_BOXES = Detections(np.empty((0, 4)), (), np.empty(0))
 MAPPED, ASKED = range(0, 30, 3), range(1, 30, 6)
 
 
@@ -59,11 +59,19 @@ def layer(kitchen, room, tmp_path_factory):
     return load_layer_of_map(path, room)
 
 
-def answer(localizer, image_rgb, camera):
-    return combine(NOWHERE, localizer.localize(image_rgb, camera), ObjectsThere(0, 0), OPTIONS)
+@pytest.fixture(scope='module')
+def answer(room):
+    """Localizes an image without objects."""
+    relocalizer = Relocalizer(room, OPTIONS)
+
+    def locate(localizer, image_rgb, camera):
+        return relocalizer.locate(
+            [relocalizer.search(Observation(camera, NO_BOXES))],
+            recognizer=ImageRecognizer(localizer, query_features(image_rgb), camera))
+    return locate
 
 
-def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
+def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries, answer):
     localizer = KeyframeLocalizer(layer)
     for frame in queries:
         found = answer(localizer, frame.image_rgb, frame.camera)
@@ -73,7 +81,7 @@ def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries):
 
 
 @pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])
-def test_changed_images_are_found(layer, queries, name):
+def test_changed_images_are_found(layer, queries, answer, name):
     localizer, frame = KeyframeLocalizer(layer), queries[0]
     image = IMAGE_CHANGES[name](frame.image_rgb, frame.image_rgb, np.random.default_rng(0))
     found = answer(localizer, np.clip(image, 0, 255).astype(np.uint8), frame.camera)
@@ -81,7 +89,7 @@ def test_changed_images_are_found(layer, queries, name):
     assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.25
 
 
-def test_another_room_is_refused(layer, office):
+def test_another_room_is_refused(layer, office, answer):
     localizer = KeyframeLocalizer(layer)
     for frame in office.select(range(0, 17, 4)).read():
         assert not answer(localizer, frame.image_rgb, frame.camera).accepted
@@ -93,14 +101,14 @@ def twins(layer, room):
     return KeyframeLocalizer(twin(1.0, 0, world, np.random.default_rng(0)).layer)
 
 
-def test_a_second_room_that_looks_the_same_is_refused(twins, queries):
+def test_a_second_room_that_looks_the_same_is_refused(twins, queries, answer):
     for frame in queries[:3]:
         seen = twins.localize(frame.image_rgb, frame.camera)
-        assert seen.rival > 0.5 * seen.inliers
-        assert not combine(NOWHERE, seen, ObjectsThere(0, 0), OPTIONS).accepted
+        assert seen.rival > 0.5 * seen.places[0].inliers
+        assert not answer(twins, frame.image_rgb, frame.camera).accepted
 
 
-def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
+def test_a_poster_of_another_place_is_refused(layer, queries, kitchen, answer):
     elsewhere = next(kitchen.select([27]).read())  # mapped
     frame = queries[0]
     picture = make_picture('crop', 0.3, frame.camera, elsewhere.image_rgb, frame.camera,
@@ -114,15 +122,16 @@ def test_a_poster_of_another_place_is_refused(layer, queries, kitchen):
 def test_a_search_that_time_cuts_short_gives_no_pose(twins, queries):
     """It might have missed the same room elsewhere."""
     localizer, frame = twins, queries[0]
-    features = localization.query_features(frame.image_rgb)
+    features = query_features(frame.image_rgb)
     found = []
     for wait_s in np.linspace(0.0, 0.2, 21):
         seen = localizer.localize_features(features, frame.camera,
                                            deadline=time.monotonic() + wait_s)
-        found.append(seen is not None)
-        assert seen is None or seen.rival > 0.5 * seen.inliers
+        found.append(seen.is_complete)
+        assert seen.is_complete == bool(seen.places)
+        assert not seen.places or seen.rival > 0.5 * seen.places[0].inliers
     assert not found[0]
-    assert localizer.localize_features(features, frame.camera) is not None
+    assert localizer.localize_features(features, frame.camera).is_complete
 
 
 def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
@@ -130,9 +139,9 @@ def test_a_weak_pose_gets_more_keyframes(layer, queries, monkeypatch):
     monkeypatch.setattr(localization, '_SIMILAR', 1)
     monkeypatch.setattr(localization, '_ELSEWHERE', 0)
     monkeypatch.setattr(localization, '_ENOUGH_INLIERS', 0)
-    few = localizer.localize(frame.image_rgb, frame.camera)
+    few = localizer.localize(frame.image_rgb, frame.camera).places[0]
     monkeypatch.setattr(localization, '_ENOUGH_INLIERS', few.inliers + 1)
-    more = localizer.localize(frame.image_rgb, frame.camera)
+    more = localizer.localize(frame.image_rgb, frame.camera).places[0]
     assert len(few.keyframes) == 1 < len(more.keyframes)
     assert more.inliers > few.inliers
 
@@ -142,10 +151,10 @@ def test_a_guess_brings_in_keyframes_that_are_not_similar(layer, queries):
     frame = queries[0]
     with_guess = localizer.localize(frame.image_rgb, frame.camera, [frame.map_from_camera])
     without = localizer.localize(frame.image_rgb, frame.camera)
-    assert with_guess.inliers >= without.inliers
+    assert with_guess.places[0].inliers >= without.places[0].inliers
 
 
-def test_the_office_is_triangulated_without_depth(office, room):
+def test_the_office_is_triangulated_without_depth(office, room, answer):
     layer = build_layer(office.select(range(0, 17, 2)), room, EVERY)
     assert (np.diff(layer.offsets) > 100).all()
     localizer = KeyframeLocalizer(layer)
