@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from cliploc_ros.datasets.queries import Queries
     from cliploc_ros.evaluation.cases import Observe
     from cliploc_ros.evaluation.methods import Method
+    from cliploc_ros.evaluation.trials import Query
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -174,20 +175,28 @@ def evaluate(options: argparse.Namespace) -> int:
     make_folder(options.out)
     recorded = _read_queries(options, landmark_map)
     queries = make_queries(recorded, landmark_map, every_frame=True)
-    if options.gravity:
-        queries = with_vertical(queries, options.gravity_noise_deg, options.seed)
-    if options.fuse:
-        noise_m, noise_deg = options.odometry_noise
-        queries = with_neighbours(queries, [frame.group for frame in recorded], noise_m,
-                                  noise_deg, options.seed)
-    if options.frames == 'main':
-        queries = tuple(query for query in queries if recorded[query.number].is_main)
     if layer is not None:
         queries = with_features(queries, _frames(options))
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
-    evaluation = Evaluation(landmark_map, queries, options.out, options.trials,
-                            options.workers or _cores(), options.scheduler, layer)
+
+    noise_m, noise_deg = options.odometry_noise
+
+    def sensed(seed: int) -> 'tuple[Query, ...]':
+        found = queries
+        if options.gravity:
+            found = with_vertical(found, options.gravity_noise_deg, seed)
+        if options.fuse:
+            found = with_neighbours(found, [frame.group for frame in recorded], noise_m,
+                                    noise_deg, seed)
+        return tuple(one for one in found
+                     if options.frames == 'all' or recorded[one.number].is_main)
+    is_noisy = (options.gravity and options.gravity_noise_deg) or (
+        options.fuse and (noise_m or noise_deg))
+    draws = [sensed(options.seed + trial) for trial in range(options.trials if is_noisy else 1)]
+    evaluation = Evaluation(landmark_map, draws[0], options.out, options.trials,
+                            options.workers or _cores(), options.scheduler, layer,
+                            draws if is_noisy else ())
     evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
                        figures=options.figures, frames=recorded.frames)
     return 0

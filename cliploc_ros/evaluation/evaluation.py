@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from cliploc_ros.evaluation.paper_table import (
     notes,
     table_rows,
 )
-from cliploc_ros.evaluation.run import count_searches, run_methods
+from cliploc_ros.evaluation.run import count_trials, run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trajectories import write_trajectories
 from cliploc_ros.evaluation.trials import Query, Result
@@ -49,7 +50,7 @@ class Evaluation:
     queries : sequence of Query
     out : Path
         An existing folder.
-    trials, workers, scheduler, layer
+    trials, workers, scheduler, layer, noisy
         See run_methods.
     """
 
@@ -60,6 +61,7 @@ class Evaluation:
     workers: int
     scheduler: str = ''
     layer: KeyframeLayer | None = None
+    noisy: Sequence[Sequence[Query]] = ()
 
     def compare(self, methods: Sequence[Method], *, sweep: Sequence[int] = (),
                 resume: bool = False, figures: bool = True, frames: Sequence[QueryFrame] = ()
@@ -113,18 +115,19 @@ class Evaluation:
 
             return run_methods(self.landmark_map, methods, self.queries, trials=self.trials,
                                workers=self.workers, scheduler=self.scheduler, done=done,
-                               layer=self.layer, advance=advance)
+                               layer=self.layer, noisy=self.noisy, advance=advance)
 
     @contextmanager
     def _progress(self, methods: Sequence[Method], done: int) -> Iterator[Any]:
-        total = count_searches(methods, len(self.queries), self.trials)
+        total = len(self.queries) * sum(count_trials(one, self.trials, bool(self.noisy))
+                                        for one in methods)
         with tqdm(total=total, initial=done, unit='search', disable=None) as bar:
             yield bar
 
     def _describe(self, methods: Sequence[Method]) -> dict[str, Any]:
         """Return what identifies this run, as JSON keeps it."""
         digest = hashlib.sha256()
-        for query in self.queries:
+        for query in chain(self.queries, *self.noisy):
             for one in (*query.neighbours, query.observation):
                 for part in (one.similarities, one.detections.bboxes_xyxy):
                     digest.update(np.ascontiguousarray(part).tobytes())

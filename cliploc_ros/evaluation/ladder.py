@@ -22,7 +22,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.paper_table import as_markdown, as_text
-from cliploc_ros.evaluation.run import run_methods
+from cliploc_ros.evaluation.run import count_trials, run_methods
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary, summarize
 from cliploc_ros.evaluation.trials import Query, make_queries
@@ -45,6 +45,11 @@ class Rung:
     options: RelocalizerOptions
     vertical: bool = False
     frames: bool = False
+
+    @property
+    def is_noisy(self) -> bool:
+        """Return whether it has simulated sensors."""
+        return self.vertical or self.frames
 
 
 def rungs(height_range_m: tuple[float, float]) -> tuple[Rung, ...]:
@@ -83,25 +88,11 @@ def climb(landmark_map: LandmarkMap, recorded: Queries, ladder: Sequence[Rung], 
     """
     found = []
     for rung in ladder:
-        method = Method(rung.name, rung.options)
-        results = []
-        for trial, queries in enumerate(_draws(landmark_map, recorded, rung, every_frame)):
-            seeded = replace(method, options=replace(rung.options, random_seed=trial))
-            results += [replace(one, trial=trial) for one in run_methods(
-                landmark_map, [seeded], queries, trials=1,
-                advance=lambda some: advance(len(some)))]
-        found += summarize(results)
+        draws = list(_draws(landmark_map, recorded, rung, every_frame))
+        found += summarize(run_methods(
+            landmark_map, [Method(rung.name, rung.options)], draws[0], trials=_TRIALS,
+            noisy=draws[1:] and draws, advance=lambda some: advance(len(some))))
     return found
-
-
-def count_searches(ladder: Sequence[Rung], queries: int) -> int:
-    """Return the number of searches of climb."""
-    return sum(_trials(rung) for rung in ladder) * queries
-
-
-def _trials(rung: Rung) -> int:
-    draws_nothing = Method(rung.name, rung.options).draws_nothing
-    return 1 if draws_nothing and not (rung.vertical or rung.frames) else _TRIALS
 
 
 def _draws(landmark_map: LandmarkMap, recorded: Queries, rung: Rung, every_frame: bool
@@ -109,7 +100,7 @@ def _draws(landmark_map: LandmarkMap, recorded: Queries, rung: Rung, every_frame
     """Yield the queries with the sensors of a rung, each time with other noise."""
     queries = make_queries(recorded, landmark_map, every_frame=True)
     groups = [frame.group for frame in recorded]
-    for seed in range(_trials(rung)):
+    for seed in range(_TRIALS if rung.is_noisy else 1):
         known = with_vertical(queries, _VERTICAL_NOISE_DEG, seed) if rung.vertical else queries
         if rung.frames:
             known = with_neighbours(known, groups, *_STEP_NOISE, seed)
@@ -144,7 +135,9 @@ def run(arguments: Sequence[str]) -> int:
     ladder = rungs(tuple(options.height_range))
     every_frame = options.frames == 'all'
     count = sum(1 for frame in recorded if every_frame or frame.is_main)
-    with tqdm(total=count_searches(ladder, count), unit='search', disable=None) as bar:
+    total = count * sum(count_trials(Method(one.name, one.options), _TRIALS, one.is_noisy)
+                        for one in ladder)
+    with tqdm(total=total, unit='search', disable=None) as bar:
         rows = table_rows(climb(landmark_map, recorded, ladder, every_frame=every_frame,
                                 advance=bar.update))
     print(as_markdown(rows) if options.markdown else as_text(rows))

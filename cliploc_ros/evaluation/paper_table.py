@@ -69,9 +69,10 @@ def _rate(value: float) -> str:
 def notes(summaries: Sequence[Summary]) -> list[str]:
     """Return sentences that explain the table."""
     best = find_best(summaries)
-    lines = [f'{len(best.queries)} queries, {max(len(one.errors_m) for one in summaries)} trials '
-             '(one of bf and auto, which draw no samples); ± is the standard deviation over '
-             'trials, at 1 m.',
+    counts = [len(one.errors_m) for one in summaries]
+    alone = ' (one of bf and auto, which draw no samples)' if min(counts) < max(counts) else ''
+    over = '; ± is the standard deviation over trials, at 1 m' if max(counts) > 1 else ''
+    lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}{over}.',
              'Confidences are fitted on simulated worlds.']
     lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '

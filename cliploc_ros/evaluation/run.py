@@ -72,6 +72,7 @@ class _Part(NamedTuple):
 def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
                 *, trials: int, workers: int = 1, scheduler: str = '',
                 done: Sequence[Result] = (), layer: KeyframeLayer | None = None,
+                noisy: Sequence[Sequence[Query]] = (),
                 advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
     """Run methods on queries.
 
@@ -79,7 +80,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     ----------
     landmark_map : LandmarkMap
     methods : sequence of Method
-        A method that draws no samples runs one trial.
+        A method that draws no samples runs one trial, unless the trials have noise of their own.
     queries : sequence of Query
     trials : int
     workers, scheduler : int, str
@@ -88,6 +89,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
         Results of an earlier run, which are not run again.
     layer : KeyframeLayer, optional
         Keyframes of the map, for methods that use them and queries with features.
+    noisy : sequence of sequence of Query, optional
+        For each trial the same queries with other noise of simulated sensors.
     advance : callable, optional
         Called with the results of each finished part.
 
@@ -104,12 +107,15 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
         From the workers.
     """
     known = {(result.method, result.trial, result.query) for result in done}
-    parts = list(_parts(methods, queries, trials, known))
+    # those that draw no samples first, since they take longest
+    parts = [part for method in sorted(methods, key=lambda method: not method.draws_nothing)
+             for part in _parts(method, queries, count_trials(method, trials, bool(noisy)),
+                                known)]
     results, lost = list(done), []
     # a few queries are done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
-    with closing(run_tasks(_MakeSearch(landmark_map, queries, layer), parts, workers=workers,
-                           scheduler=scheduler)) as finished:
+    make_search = _MakeSearch(landmark_map, noisy or [queries], layer)
+    with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
         for part, found in finished:
             if found is None:
                 lost.append(part)
@@ -124,20 +130,18 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     return sorted(results, key=lambda one: (order[one.method], one.trial, one.query))
 
 
-def count_searches(methods: Sequence[Method], queries: int, trials: int) -> int:
-    """Return the number of searches of a run."""
-    return sum(1 if method.draws_nothing else trials for method in methods) * queries
+def count_trials(method: Method, trials: int, are_noisy: bool = False) -> int:
+    """Return how many trials of a method differ, where its sensors have noise or not."""
+    return trials if are_noisy or not method.draws_nothing else 1
 
 
-def _parts(methods: Sequence[Method], queries: Sequence[Query], trials: int,
+def _parts(method: Method, queries: Sequence[Query], trials: int,
            known: set[tuple[str, int, int]]) -> Iterator[_Part]:
-    """Yield the parts to run; methods that draw no samples first, since they take longest."""
-    for method in sorted(methods, key=lambda method: not method.draws_nothing):
-        for trial in range(1 if method.draws_nothing else trials):
-            places = [place for place, query in enumerate(queries)
-                      if (method.name, trial, query.number) not in known]
-            for some in batched(places, 1 if method.draws_nothing else _QUERIES_A_PART):
-                yield _Part(method, trial, some)
+    for trial in range(trials):
+        places = [place for place, query in enumerate(queries)
+                  if (method.name, trial, query.number) not in known]
+        for some in batched(places, 1 if method.draws_nothing else _QUERIES_A_PART):
+            yield _Part(method, trial, some)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +149,7 @@ class _MakeSearch:
     """Makes the function that runs a part; holds what all parts share."""
 
     landmark_map: LandmarkMap
-    queries: Sequence[Query]
+    queries: Sequence[Sequence[Query]]  # of each trial, or of all of them
     layer: KeyframeLayer | None = None
 
     def __call__(self) -> Callable[[_Part], list[Result]]:
@@ -155,6 +159,7 @@ class _MakeSearch:
                     RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
 
         def run(part: _Part) -> list[Result]:
+            queries = self.queries[part.trial % len(self.queries)]
             return run_trial(self.landmark_map, part.method, part.trial,
-                             [self.queries[place] for place in part.places], keyframes)
+                             [queries[place] for place in part.places], keyframes)
         return run

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import load_queries
-from cliploc_ros.evaluation.ladder import climb, count_searches, rungs, table_rows
+from cliploc_ros.evaluation.ladder import climb, rungs, table_rows
 
 GROUPS = 12
 
@@ -19,7 +19,8 @@ def test_each_rung_runs_and_the_last_is_the_best(shared_data):
     some = replace(recorded, frames=tuple(one for one in recorded.frames if one.group in groups))
     ladder, done = rungs((0.8, 2.2)), []
     found = climb(landmark_map, some, ladder, advance=done.append)
-    assert sum(done) == count_searches(ladder, GROUPS)
+    # the paper's method draws samples, and three rungs have noise; the other three repeat nothing
+    assert sum(done) == (4 * 3 + 3) * GROUPS
     assert [one.method for one in found] == [rung.name for rung in ladder]
     assert len(table_rows(found)) == 1 + len(ladder)
     success = [one.success(0.5) for one in found]
