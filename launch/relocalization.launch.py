@@ -26,6 +26,7 @@ NAMES = {
     'odom': 'tells whether the robot moves; without it the robot is assumed to stand',
     'imu': 'the vertical, with gravity:=imu',
     'initialpose': 'what AMCL subscribes to',
+    'amcl_pose': 'what AMCL publishes: tells that it has taken the pose',
     'request_nomotion_update': 'what AMCL serves',
     'reinitialize_global_localization': "what Nav2's behaviour tree calls; AMCL serves this name, "
                                         'too',

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.candidates import join_frames
 from cliploc_ros.core.acceptance.comparison import (
     Comparison,
-    JoinedFrames,
     compare,
     evidence_of,
     pose_of,
@@ -20,7 +20,6 @@ from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.association.candidates import check_k
 from cliploc_ros.core.fit.finalists import find_with_rivals
-from cliploc_ros.core.fit.rig import cameras_from_last, make_rig
 from cliploc_ros.core.geometry.tolerances import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
@@ -132,12 +131,9 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        cameras = cameras_from_last([one.observation for one in frames])
-        rig = make_rig([one.scene for one in frames], cameras,
-                       np.stack([one.vertical for one in frames]), self._map.position_sigmas)
-        finalists, is_upright = find_with_rivals(frames, rig, self._options.refine,
+        joined = join_frames(self._map, self._options, frames)
+        finalists, is_upright = find_with_rivals(frames, joined.rig, self._options.refine,
                                                  budget.refinement_end)
-        joined = JoinedFrames(self._map, self._options, frames, rig, cameras)
         compared = compare(joined, finalists, is_upright, recognizer)
         if not compared.candidates:
             return _nothing_found(frames, budget)

@@ -99,12 +99,10 @@ class Session:
             recognizer)
         self._frames = [*earlier, KeptFrame(newest, anchor)]
         self.observation = newest.observation
-        if found.accepted:
-            self._looks = Looks()
-        elif found.map_from_camera is not None:
+        if found.map_from_camera is not None:
             self._looks = self._looks.with_look(Look(
                 replace(observation, similarities=None, compared=None), found.map_from_camera,
-                found.confidence, found.recognized))
+                found.confidence, found.recognized), found.accepted)
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

@@ -199,4 +199,5 @@ def _points_in_color(depth: DepthImage, camera: Camera, step: int
                       axis=1) + own.color_from_depth
     points = points[points[:, 2] > 0.0]
     pixels = camera.project_normalized(points[:, :2] / points[:, 2:])
-    return pixels.T, points[:, 2].astype(np.float32)
+    inside = np.isfinite(pixels).all(axis=1)
+    return pixels[inside].T, points[inside, 2].astype(np.float32)

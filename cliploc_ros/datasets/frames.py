@@ -182,3 +182,15 @@ def _read_depth(path: Path, form: DepthFormat) -> DepthImage:
     if counts is None:
         raise DatasetError(f'{path} cannot be read as a depth image')
     return DepthImage(depth_from_counts(counts, form.unit_m, str(path)), form.camera)
+
+
+def undistorted(image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """Return an image (h, w, 3) as the pinhole of its camera would show it; black outside."""
+    if not any(camera.distortion):
+        return image_rgb
+    columns, rows = np.meshgrid(np.arange(0.0, camera.width), np.arange(0.0, camera.height))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    places = camera.project_normalized(camera.pinhole.normalize_points(pixels))
+    places = np.nan_to_num(places, nan=-1.0).reshape(*columns.shape, 2).astype(np.float32)
+    return np.asarray(cv2.remap(image_rgb, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
+                      dtype=np.uint8)

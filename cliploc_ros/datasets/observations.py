@@ -34,6 +34,7 @@ LAYOUT = {
 OPTIONAL = {
     'depths': (('n',), 'f'),
     'depth_spreads': (('n',), 'f'),
+    'open_edges': (('n', 4), 'b'),
     'embeddings': (('n', 'd'), 'f'),
     'encoder_key': ((), 'U'),
     'odom_from_camera': (('F', 4, 4), 'f'),  # a row without odometry is NaN
@@ -43,7 +44,8 @@ OPTIONAL = {
     'image_counts': ((2,), 'iu'),
     'described': ((), 'U'),
 }
-_KIND_NAMES = {'f': 'floats', 'U': 'a string', 'fiu': 'numbers', 'iu': 'integers', 'US': 'strings'}
+_KIND_NAMES = {'f': 'floats', 'U': 'a string', 'fiu': 'numbers', 'iu': 'integers', 'US': 'strings',
+               'b': 'true or false'}
 _MAX_ROTATION_ERROR = 1e-3
 # These are large, and few of their rows are in use at once.
 _MAPPED = ('embeddings',)
@@ -142,7 +144,7 @@ def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
         'map_from_camera': detections.map_from_camera,
         'timestamps': detections.stamps_s,
     }
-    for name in ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera'):
+    for name in ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges'):
         if (values := getattr(detections, name)) is not None:
             arrays[name] = values
     if detections.encoder_key:
@@ -316,4 +318,5 @@ def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
         depths=arrays.get('depths'), depth_spreads=arrays.get('depth_spreads'),
         embeddings=arrays.get('embeddings'), encoder_key=str(arrays.get('encoder_key', '')),
         odom_from_camera=(arrays['odom_from_camera'].astype(np.float64)
-                          if 'odom_from_camera' in arrays else None))
+                          if 'odom_from_camera' in arrays else None),
+        open_edges=arrays.get('open_edges'))

@@ -3,10 +3,8 @@
 """Query files: recorded boxes and similarities, identical input for every method."""
 
 import math
-import os
 import zipfile
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.replace_file import replace_file
 from cliploc_ros.units import NS_PER_S
 
 #: Arrays of the file by name: shape (F frames, n boxes, L landmarks), and kind of dtype.
@@ -182,7 +181,8 @@ def save_queries(path: str | Path, queries: Queries) -> None:
     except (_ArrayError, ValueError) as error:
         raise DatasetError(f'{path}: cannot be written: {error}') from error
     try:
-        _write_atomically(path, arrays)
+        with replace_file(path) as partial, partial.open('wb') as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     except OSError as error:
         raise DatasetError(
             f'{path}: cannot be written: {error.strerror}; no partial file remains'
@@ -378,14 +378,3 @@ def _make_arrays(queries: Queries) -> dict[str, NDArray[Any]]:
         STAMPS_NS: stamps_ns,
         **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
     }
-
-
-def _write_atomically(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
-    try:
-        with partial.open('wb') as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        partial.replace(path)
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)

@@ -4,10 +4,10 @@
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.replace_file import replace_file
 
 
 def make_folder(folder: Path) -> None:
@@ -35,7 +35,7 @@ def write_text(path: Path, text: str) -> None:
     OptionsError
         The file cannot be written; nothing is left behind.
     """
-    write_file(path, lambda partial: _write(partial, text))
+    write_file(path, lambda partial: partial.write_text(text, encoding='utf-8'))
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -52,16 +52,8 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
     OptionsError
         The file cannot be written; nothing is left behind.
     """
-    partial = path.with_name(f'.{os.getpid()}.{path.name}')
     try:
-        write(partial)
-        partial.replace(path)
+        with replace_file(path) as partial:
+            write(partial)
     except OSError as error:
         raise OptionsError(f'{path}: cannot be written: {error.strerror}') from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding='utf-8')

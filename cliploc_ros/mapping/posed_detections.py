@@ -5,11 +5,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+
+_PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embeddings',
+            'open_edges')
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,10 @@ class PosedDetections:
         Identifies the encoder of the embeddings.
     odom_from_camera : ndarray (F, 4, 4), optional
         The same cameras by odometry, which drifts but does not jump; NaN where unknown.
+    open_edges : ndarray (n, 4) of bool, optional
+        The edge lay at the border of the image, so the object may extend beyond it. For a lens
+        with distortion, whose border is no straight line of the undistorted image; None: an edge
+        is open at the border of that.
     """
 
     camera: Camera
@@ -58,6 +66,7 @@ class PosedDetections:
     embeddings: NDArray[np.float16] | None = None
     encoder_key: str = ''
     odom_from_camera: NDArray[np.float64] | None = None
+    open_edges: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -76,12 +85,7 @@ class PosedDetections:
         boxes = np.concatenate([np.empty(0, dtype=np.int64), *rows])
         return replace(
             self, map_from_camera=self.map_from_camera[frames], stamps_s=self.stamps_s[frames],
-            frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
-            bboxes_xyxy=self.bboxes_xyxy[boxes], classes=self.classes[boxes],
-            scores=self.scores[boxes],
-            depths=None if self.depths is None else self.depths[boxes],
-            depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
-            embeddings=None if self.embeddings is None else self.embeddings[boxes],
+            frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])), **self._of(boxes),
             odom_from_camera=(None if self.odom_from_camera is None
                               else self.odom_from_camera[frames]))
 
@@ -89,12 +93,12 @@ class PosedDetections:
         """Return all frames with some of their boxes: those of a mask (n,)."""
         counts = np.bincount(self.frames[boxes], minlength=len(self))
         return replace(
-            self, frame_offsets=np.cumsum(np.concatenate([[0], counts])),
-            bboxes_xyxy=self.bboxes_xyxy[boxes], classes=self.classes[boxes],
-            scores=self.scores[boxes],
-            depths=None if self.depths is None else self.depths[boxes],
-            depth_spreads=None if self.depth_spreads is None else self.depth_spreads[boxes],
-            embeddings=None if self.embeddings is None else self.embeddings[boxes])
+            self, frame_offsets=np.cumsum(np.concatenate([[0], counts])), **self._of(boxes))
+
+    def _of(self, boxes: NDArray[Any]) -> dict[str, Any]:
+        """Return the arrays that have a row for each box, with some of the rows."""
+        arrays = {name: getattr(self, name) for name in _PER_BOX}
+        return {name: None if array is None else array[boxes] for name, array in arrays.items()}
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
         """Return the same detections with other poses (F, 4, 4)."""

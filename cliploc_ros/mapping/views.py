@@ -76,15 +76,11 @@ class Views(NamedTuple):
 def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
     """Return what the kernels read of posed detections."""
     camera = detections.camera
-    size = np.array([camera.width, camera.height, camera.width, camera.height], dtype=np.float64)
-    boxes_px = np.clip(detections.bboxes_xyxy, 0.0, size)
+    boxes_px, is_open, bounds_px = _at_border(detections, options.border_px)
     focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
     principal = np.array([camera.cx, camera.cy, camera.cx, camera.cy])
     extents_px = np.tile(boxes_px[:, 2:] - boxes_px[:, :2], 2)
     deviations_px = np.hypot(options.edge_sigma_px, options.edge_sigma_share * extents_px)
-    is_open = np.zeros(boxes_px.shape, dtype=np.bool_)
-    is_open[:, :2] = boxes_px[:, :2] <= options.border_px
-    is_open[:, 2:] = boxes_px[:, 2:] >= size[2:] - options.border_px
     rotations, translations = camera_from_map(detections.map_from_camera)
     viewpoints = number_viewpoints(detections.map_from_camera)
     return Views(
@@ -92,8 +88,22 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
         viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints], detections.frame_offsets,
         detections.frames, detections.classes, (boxes_px - principal) / focal,
         focal / deviations_px, is_open,
-        (np.array([0.0, 0.0, camera.width, camera.height]) - principal) / focal,
-        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
+        (bounds_px - principal) / focal, np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
+
+
+def _at_border(detections: PosedDetections, border_px: float
+               ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Return boxes (n, 4) [px], their open edges (n, 4), and the border (4,) of the image."""
+    boxes, is_open = detections.bboxes_xyxy, detections.open_edges
+    size = np.array([detections.camera.width, detections.camera.height], dtype=np.float64)
+    border = np.concatenate([[0.0, 0.0], size])
+    if is_open is None:
+        boxes = np.clip(boxes, 0.0, np.tile(size, 2))
+        return boxes, np.hstack([boxes[:, :2] <= border_px, boxes[:, 2:] >= size - border_px]
+                                ), border
+    reach = np.concatenate([boxes[:, :2].min(axis=0, initial=np.inf),
+                            boxes[:, 2:].max(axis=0, initial=-np.inf)])
+    return boxes, is_open, np.where(is_open.any(axis=0), reach, border)
 
 
 def with_depths(views: Views, depths: NDArray[np.float64], stiffness: NDArray[np.float64]

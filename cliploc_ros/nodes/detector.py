@@ -24,7 +24,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.parameters import Value
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
-from cliploc_ros.ros.parameter_tables import DETECTOR
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
 
 _LOG_PERIOD_S = 5.0
 
@@ -33,7 +33,7 @@ class DetectorNode(ManagedNode):
     """Publishes what a YOLO network detects in the newest image."""
 
     def __init__(self) -> None:
-        super().__init__('detector', DETECTOR, detector_options)
+        super().__init__('detector', DETECTOR, detector_options, RELOCALIZER)
         self._detector: YoloDetector | None = None
         self._newest: LatestOnly[TimedImage] = LatestOnly(self.worker, self._detect)
         self._images = ImageSource(self, self.settings['image_transport'], self._newest.offer)

@@ -26,7 +26,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
 from cliploc_ros.ros.pipeline import Pipeline
 from cliploc_ros.ros.requests import Requests
 
@@ -37,7 +37,7 @@ class RelocalizerNode(ManagedNode):
     """Answers where the robot is: on request, or with every frame."""
 
     def __init__(self) -> None:
-        super().__init__('relocalizer', RELOCALIZER, relocalizer_options)
+        super().__init__('relocalizer', RELOCALIZER, relocalizer_options, DETECTOR)
         continuous = self.settings['mode'] == 'continuous'
         self._robot = RobotStateSource(self)
         self._jumps = TimeJumps(self, self._forget)
@@ -48,8 +48,8 @@ class RelocalizerNode(ManagedNode):
                                    self._newest.offer if continuous else lambda frame: None,
                                    self.settings['detections_type'])
         self._handoff = HandOff(self, self._robot.odometry)
-        self._requests = Requests(self, self._frames, self._robot, self._jumps,
-                                  self._localize_and_keep, self._handoff)
+        self._requests = Requests(self, self._frames, self._robot, self._localize_and_keep,
+                                  self._handoff)
         self._cases = CaseRecorder(bool(self.settings['record_folder']))
         self._counters = RequestCounters()
         self._last_verdict = 'none yet'
@@ -73,7 +73,7 @@ class RelocalizerNode(ManagedNode):
 
     def open(self) -> None:
         """Accept requests; in continuous mode subscribe to frames."""
-        self._handoff.open()
+        self._handoff.open(self.settings['localizer_pose'])
         self._robot.open()
         self._pipeline.open()
         self._frames.open()
@@ -85,7 +85,7 @@ class RelocalizerNode(ManagedNode):
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
-        self._handoff.stop()
+        self._handoff.close()
         self._frames.close('the node was deactivated')
         self._pipeline.close()
         self._robot.close()

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import extract, unit_rows
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
@@ -24,7 +24,7 @@ from cliploc_ros.core.keyframes.layer import (
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import depths_of_points
-from cliploc_ros.datasets.frames import Frame, Frames
+from cliploc_ros.datasets.frames import Frame, Frames, undistorted
 from cliploc_ros.errors import MappingError, OptionsError
 
 # Features that are found in an image, before those without a point are left out.
@@ -94,7 +94,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     """
     camera, seen = None, []
     for frame in _chosen(frames, options):
-        camera = camera or _pinhole(frame.camera)
+        camera = camera or frame.camera.pinhole
         seen.append(_look(frame, options))
     images = [one.posed for one in seen]
     points = [_points(images, row, one.depths)
@@ -114,24 +114,25 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
     """Yield the images whose view no earlier one of them has, decoded."""
-    poses: list[NDArray[np.float64]] = []
+    size = options.distance_m or 1.0  # of the cells that poses lie in; no pose is nearer than 0
+    cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
 
     def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
         if pose is None:
             return False
-        for other in reversed(poses):
-            distance, angle = pose_error(pose, other)
-            if distance < options.distance_m and angle < options.angle_deg:
-                return False
-        poses.append(pose)
+        cell = np.floor(pose[:3, 3] / size).astype(np.int64)
+        near = np.array([other for step in np.ndindex(3, 3, 3)
+                         for other in cells.get(tuple((cell + step - 1).tolist()), ())]
+                        ).reshape(-1, 4, 4)
+        near = near[np.linalg.norm(near[:, :3, 3] - pose[:3, 3], axis=1) < options.distance_m]
+        turns = pose[:3, :3].T @ near[:, :3, :3]
+        if len(near) and (np.degrees(Rotation.from_matrix(turns).magnitude())
+                          < options.angle_deg).any():
+            return False
+        cells.setdefault(tuple(cell.tolist()), []).append(pose)
         return True
     for raw in frames.read_raw(is_new):
         yield raw.decode()
-
-
-def _pinhole(camera: Camera) -> Camera:
-    """Return the camera of the undistorted images."""
-    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _look(frame: Frame, options: LayerOptions) -> _Seen:
@@ -155,14 +156,8 @@ def _small_jpeg(frame: Frame) -> bytes:
     camera = frame.camera
     scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-    scales = np.array([width / camera.width, height / camera.height])
-    image = cv2.resize(frame.image_rgb, (width, height), interpolation=cv2.INTER_AREA)
-    if any(camera.distortion):
-        columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-        pixels = (np.column_stack([columns.ravel(), rows.ravel()]) + 0.5) / scales - 0.5
-        seen = camera.project_normalized(_pinhole(camera).normalize_points(pixels))
-        maps = ((seen + 0.5) * scales - 0.5).reshape(height, width, 2).astype(np.float32)
-        image = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+    image = cv2.resize(undistorted(frame.image_rgb, camera), (width, height),
+                       interpolation=cv2.INTER_AREA)
     _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
                               [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(content)

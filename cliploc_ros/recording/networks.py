@@ -15,6 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.depth import depths_of_boxes
 from cliploc_ros.datasets.frames import RawFrame
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
@@ -38,6 +39,8 @@ class SeenFrame:
         Width and height, and fx, fy, cx, cy of the undistorted image [px].
     bboxes_xyxy : ndarray (n, 4)
         Undistorted [px].
+    open_edges : ndarray (n, 4) or (0, 4) of bool
+        See PosedDetections; without rows for a lens without distortion.
     class_ids, scores : ndarray (n,)
     embeddings : ndarray (n, d) float16
         Of the crops; d is 0 without CLIP.
@@ -53,6 +56,7 @@ class SeenFrame:
     image_size: NDArray[np.int64]
     intrinsics: NDArray[np.float64]
     bboxes_xyxy: NDArray[np.float64]
+    open_edges: NDArray[np.bool_]
     class_ids: NDArray[np.str_]
     scores: NDArray[np.float64]
     embeddings: NDArray[np.float16]
@@ -132,7 +136,7 @@ class Look:
         detections = self.detector.detect(frame.image_rgb).usable(camera.width, camera.height,
                                                                   MAX_DETECTIONS)
         detected = time.perf_counter()
-        bboxes = _undistorted(detections, camera)
+        bboxes, open_edges = _undistorted(detections, camera)
         rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
         sound = detections.select(rows)
         embeddings = (np.empty((len(rows), 0)) if self.encoder is None
@@ -145,13 +149,20 @@ class Look:
             raw.place, raw.stamp_ns, frame.map_from_camera,
             np.array([camera.width, camera.height]),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
+            open_edges[rows] if any(camera.distortion) else open_edges,
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)
 
 
-def _undistorted(detections: Detections, camera: Camera) -> NDArray[np.float64]:
+def _undistorted(detections: Detections, camera: Camera
+                 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return undistorted boxes (n, 4) [px], and which edges lay at the border of the image."""
+    boxes = detections.bboxes_xyxy
     if not any(camera.distortion):
-        return detections.bboxes_xyxy
-    bboxes = camera.normalize_bboxes(detections.bboxes_xyxy)
-    return np.asarray(bboxes * ([camera.fx, camera.fy] * 2) + [camera.cx, camera.cy] * 2)
+        return boxes, np.empty((0, 4), dtype=np.bool_)
+    border_px = MappingOptions.border_px
+    is_open = np.hstack([boxes[:, :2] <= border_px, boxes[:, 2:] >= np.array(
+        [camera.width, camera.height]) - border_px])
+    undistorted = camera.normalize_bboxes(boxes)
+    return undistorted * ([camera.fx, camera.fy] * 2) + [camera.cx, camera.cy] * 2, is_open

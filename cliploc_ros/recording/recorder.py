@@ -134,7 +134,9 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             logger.warning('recording again, with other options: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
-    with Journal(file.with_name(f'.{file.name}.unfinished'), described.encode()) as journal:
+    frame_fields = ' '.join(SeenFrame.__dataclass_fields__)  # another release may have others
+    with Journal(file.with_name(f'.{file.name}.unfinished'),
+                 f'{described} {frame_fields}'.encode()) as journal:
         recorded = _with_odometry(_record(frames, options, journal), odometry)
         save_recorded(file, recorded)
         journal.remove()
@@ -224,6 +226,7 @@ def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, en
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([one.depths for one in seen])
     has_depth = bool(np.isfinite(depths).any())
+    open_edges = np.concatenate([one.open_edges for one in seen])
     detections = PosedDetections(
         camera=_camera(first),
         map_from_camera=np.array([one.map_from_camera for one in seen]),
@@ -237,7 +240,7 @@ def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, en
                        else None),
         embeddings=(np.concatenate([one.embeddings for one in seen])
                     if any(one.embeddings.shape[1] for one in seen) else None),
-        encoder_key=encoder_key)
+        encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None)
     return Recorded(
         detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
         np.array([one.detector_ms for one in seen]), np.array([one.clip_ms for one in seen]),

@@ -4,14 +4,16 @@
 
 import importlib
 import threading
+from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.map_urls import path_of
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.pipeline import Pipeline
 
@@ -90,5 +92,13 @@ class MapServices:
             response.result = response.RESULT_SUCCESS
         except CliplocError as error:
             self._node.get_logger().error(f'map not loaded: {error}')
-            response.result = response.RESULT_INVALID_MAP_DATA
+            response.result = response.RESULT_INVALID_MAP_DATA if _is_there(request.map_url) \
+                else response.RESULT_MAP_DOES_NOT_EXIST
         return response
+
+
+def _is_there(map_url: str) -> bool:
+    try:
+        return Path(path_of(map_url)).exists()
+    except MapError:
+        return False

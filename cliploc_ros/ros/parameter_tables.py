@@ -164,12 +164,16 @@ RELOCALIZER = (
                  "initialpose, where it is served, so that AMCL's particles converge.",
                  low=0, high=100),
     ParameterRow('require_localizer', True, 'A request succeeds only if a localizer such as AMCL '
-                 'subscribes to initialpose; false: without one, for ~/pose or publish_tf.'),
+                 'takes its pose; false: without one, for ~/pose or publish_tf.'),
+    ParameterRow('localizer_pose', 'amcl_pose', 'Topic where the localizer shows its pose: it has '
+                 'to agree with the one on initialpose. Empty: any subscriber of initialpose will '
+                 'do.', read_only=True),
     ParameterRow('publish_tf', False, 'Broadcast map -> odom_frame (REP 105) after an accepted '
                  'pose; only where no other localizer does.',
                  read_only=True),
     ParameterRow('odom_frame', 'odom', 'Coordinate frame of odometry, for publish_tf.'),
-    ParameterRow('tf_timeout_s', 0.5, "Wait this long for a transform at the image's stamp.",
+    ParameterRow('tf_timeout_s', 0.5, "Wait this long for a transform at the image's stamp. A "
+                 "request waits for the camera's mount on base_frame until timeout_s.",
                  unit='s', low=0.0, high=60.0),
 )
 

@@ -23,8 +23,6 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
 
-_LOG_PERIOD_S = 5.0
-
 
 class Pipeline:
     """Localizes with one frame at a time and publishes the result.
@@ -91,7 +89,8 @@ class Pipeline:
         Raises
         ------
         TimeJumpError
-            Time jumped back since the frame arrived; nothing was published.
+            Time jumped back since the frame arrived, or odometry restarted where its frame is
+            broadcast; nothing was published.
         CliplocError
             Names what to fix in the frame or in the parameters.
         """
@@ -104,7 +103,7 @@ class Pipeline:
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, values)
+        state = self._robot.at(image, values, deadline)
         localized = localizer.localize(frame, values, state, times, deadline)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
@@ -137,16 +136,17 @@ class Pipeline:
         lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
         pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
             covariance, lever)) for covariance in (found.covariance, localized.for_filter))
-        self._pose.publish(for_filter)
+        x, y, z = map_from_base[:3, 3]
+        answer = Answer(Verdict.ACCEPTED, f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
+                                          f'{summary}', pose, received_at, state)
         try:
             self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
                                      received_at)
         except NoTransformError as error:
-            self._node.get_logger().warning(f'publish_tf: {error}',
-                                            throttle_duration_sec=_LOG_PERIOD_S)
-        x, y, z = map_from_base[:3, 3]
-        return Answer(Verdict.ACCEPTED, f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} '
-                                        f'{summary}', pose, received_at, state)
+            answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                             detail=f'publish_tf: {error} ({answer.message})')
+        self._pose.publish(for_filter)
+        return answer
 
     def _show(self, image: Header, header: Header, localized: Localized, state: RobotState,
               answer: Answer) -> None:

@@ -16,7 +16,7 @@ from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
@@ -29,10 +29,11 @@ _GRACE_S = 0.2
 
 _SMALLER = 'choose a faster profile or a smaller'
 # Of each stage its name in a message, and what makes it faster.
-_STAGES = {'image': 'waiting for an image', 'detection': 'the detector',
-           'waiting': 'waiting for earlier work', 'decoding': 'reading the image',
+_STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
+           'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
            'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
-_REMEDIES = {'image': "raise the camera's rate", 'detection': f'{_SMALLER} detector',
+_REMEDIES = {'image': 'raise the rate of the camera or of the detector',
+             'detection': f'{_SMALLER} detector',
              'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
              'search': 'lower iterations or time_budget_ms',
              'keyframes': "set keyframes_file to ''"}
@@ -57,7 +58,6 @@ class Requests:
     node : ManagedNode
     frames : FrameSource
     robot : RobotStateSource
-    jumps : TimeJumps
     localize : callable
         Takes a frame, its StageTimes and the deadline (monotonic clock) [s]; returns its Answer.
         Called in the worker's thread.
@@ -65,12 +65,10 @@ class Requests:
     """
 
     def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
-                 jumps: TimeJumps, localize: Callable[[Frame, StageTimes, float], Answer],
-                 handoff: HandOff) -> None:
+                 localize: Callable[[Frame, StageTimes, float], Answer], handoff: HandOff) -> None:
         self._node = node
         self._frames = frames
         self._robot = robot
-        self._jumps = jumps
         self._localize = localize
         self._handoff = handoff
         self._turn = threading.Lock()
@@ -107,15 +105,15 @@ class Requests:
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
         """Look at one frame after another while another frame can change the answer."""
         try:
-            look, looks = self._look_past_jumps(arrived_at, deadline), 1
+            look, looks = self._look_past_problems(arrived_at, deadline), 1
         except TimeUpError as error:
             return Answer(Verdict.REFUSED, str(error), kind=RefusalKind.TIME_UP)
         stages_ms, unlinked = Counter(look.answer.stages_ms), int(not look.answer.is_linked)
         is_up = look.answer.is_cut
         while look.may_go_on and unlinked < _MAX_UNLINKED:
             try:
-                look = self._look_past_jumps(time.monotonic(), deadline)
-            except (NoFrameError, TimeUpError, TimeJumpError):
+                look = self._look_past_problems(time.monotonic(), deadline)
+            except (NoFrameError, TimeUpError, TimeJumpError, NoTransformError):
                 is_up = True
                 break
             looks += 1
@@ -123,7 +121,9 @@ class Requests:
             unlinked += not look.answer.is_linked
             is_up = look.answer.is_cut
         answer = look.answer
-        if is_up and answer.verdict is Verdict.REFUSED:
+        # more images of a place without objects are no remedy
+        if is_up and answer.verdict is Verdict.REFUSED and (
+                answer.is_cut or answer.kind is not RefusalKind.TOO_FEW_OBJECTS):
             answer = replace(answer, detail=f'{answer.detail}; {_time_is_up(stages_ms)}')
         if looks == 1:
             return answer
@@ -153,19 +153,18 @@ class Requests:
         return _Look(answer, may_go_on
                      and self._robot.is_linked_soon(frame.image.header.stamp, deadline))
 
-    def _look_past_jumps(self, after: float, deadline: float) -> _Look:
-        """Look at the next frame, and again after each jump in time until the deadline."""
-        jump: CliplocError | None = None
+    def _look_past_problems(self, after: float, deadline: float) -> _Look:
+        """Look at the next frame; at newer ones after a jump in time or without its transform."""
+        problem: CliplocError | None = None
         while True:
             try:
                 return self._look(after, deadline)
             except NoFrameError as error:
-                raise jump or error from error
+                raise problem or error from error
             except (TimeJumpError, NoTransformError) as error:
-                # right after a jump, transforms may be missing
-                if isinstance(error, NoTransformError) and not self._jumps.is_settling:
+                problem, after = error, time.monotonic()
+                if after > deadline - _GRACE_S:
                     raise
-                jump, after = error, time.monotonic()
 
 
 def _time_is_up(stages_ms: Mapping[str, float]) -> str:

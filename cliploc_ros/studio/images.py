@@ -6,14 +6,13 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.frames import read_color
+from cliploc_ros.datasets.frames import read_color, undistorted
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.poses import TrajectoryPoses
 from cliploc_ros.datasets.tum import read_tum
@@ -41,7 +40,7 @@ class Images:
                  read: Callable[[int], tuple[NDArray[np.uint8], Camera]]):
         self._stamps_ns = stamps_ns
         self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
-            lambda place: _undistorted(*read(place)))
+            lambda place: undistorted(*read(place)))
 
     def near(self, stamp_s: float) -> NDArray[np.uint8] | None:
         """Return the undistorted image (h, w, 3) of a time [s], red first; None without one."""
@@ -50,18 +49,6 @@ class Images:
         offsets = np.abs(self._stamps_ns - round(stamp_s * NS_PER_S))
         place = int(np.argmin(offsets))
         return self._read(place) if offsets[place] <= _MAX_DELAY_NS else None
-
-
-def _undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    if not any(camera.distortion):
-        return image
-    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    points = np.asarray((pixels.reshape(-1, 2) - (camera.cx, camera.cy))
-                        / (camera.fx, camera.fy), dtype=np.float64)
-    places = camera.project_normalized(points).astype(np.float32)
-    places = places.reshape(camera.height, camera.width, 2)
-    return np.asarray(cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
-                      dtype=np.uint8)
 
 
 def open_images(path: Path, topics: BagTopics) -> Images:
@@ -101,7 +88,7 @@ def views_of_folder(path: Path) -> PosedDetections:
         raise DatasetError(f'{path}: no image has a pose')
     none = np.empty(0, dtype=np.int64)
     return PosedDetections(
-        camera=camera, map_from_camera=np.array([pose for _, pose in posed]),
+        camera=camera.pinhole, map_from_camera=np.array([pose for _, pose in posed]),
         stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
         class_names=(), classes=none, scores=np.empty(0))

@@ -51,7 +51,8 @@ def _judge(options: argparse.Namespace) -> int:
         raise OptionsError(f'{options.out}: no such records here; collect them first')
     order = list(cases())
     found.sort(key=lambda one: (order.index(one.case), one.place, one.number))
-    print('\n'.join(table(found, options.by)))
+    for by in options.by or [['family'], ['case']]:
+        print('\n'.join([*table(found, by), '']))
     if options.json:
         write_text(options.json, json.dumps([one._asdict() for one in found], indent=0))
     if options.figure:
@@ -85,9 +86,9 @@ def main() -> int:
                           help='the most of each case but the plain one (%(default)s)')
     judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     judges.set_defaults(command=_judge)
-    judges.add_argument('--by', nargs='+', default=['case'],
+    judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
-                        help='what a line of the table is about (case)')
+                        help='what a line of a table is about (a table by family, one by case)')
     judges.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
     judges.add_argument('--figure', type=Path, metavar='FILE.png',
                         help='draw the reliability of the confidence')

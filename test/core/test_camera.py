@@ -42,6 +42,9 @@ def test_beyond_the_fold_of_a_lens_is_nan():
     folded = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 'plumb_bob', (-2.0, 0.0, 0.0, 0.0))
     assert np.isnan(folded.normalize_points(np.array([[0.0, 0.0]]))).all()
     assert np.isfinite(folded.normalize_points(np.array([[300.0, 200.0]]))).all()
+    # it would show these points in the middle of the image
+    sides = np.array([[0.69, 0.0], [0.0, -0.7], [0.2, 0.2]])
+    assert np.isnan(folded.project_normalized(sides)).all(axis=1).tolist() == [True, True, False]
 
 
 def test_box_edges_go_where_their_midpoints_go():

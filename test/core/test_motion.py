@@ -9,16 +9,11 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.motion import compare_motion
 from cliploc_ros.core.fit.covariance import odometry_deviations
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.keyframes.layer import FROM_DEPTH, KeyframeLayer
+from cliploc_ros.core.keyframes.layer import FROM_DEPTH
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
-LAYER = KeyframeLayer(
-    'map', ('lamp',), np.zeros((1, 3), np.float32), Camera(640, 480, 525.0, 525.0, 320.0, 240.0),
-    np.eye(4)[None], np.array([0, 1]), np.zeros((1, 2), np.uint16), np.ones((1, 3), np.float32),
-    np.ones((1, 128), np.uint8), np.zeros(1, np.uint16), np.ones((1, 128), np.uint8), FROM_DEPTH)
 #: What a pose of keyframes has at least.
 SHARED = np.diag([0.012**2] * 3 + [np.radians(0.45)**2] * 3)
 SURE = chi2.isf(1e-3, 6)
@@ -83,12 +78,12 @@ def test_a_room_moves_as_odometry_says_and_a_picture_does_not(room, name):
                                            deviations[:3])
         first = look(points, bearings, rng)
         second = look(points, seen_from(points, pose @ motion), rng)
-        found = compare_motion(LAYER, first, second, odometry)
+        found = compare_motion(FROM_DEPTH, first, second, odometry)
         squares.append(found.square)
         assert found.picture > SURE
         for away_m in (1.0, 2.0, 3.0):
             second = look(points, on_picture(bearings, motion, away_m), rng)
-            assert compare_motion(LAYER, first, second, odometry).square > SURE
+            assert compare_motion(FROM_DEPTH, first, second, odometry).square > SURE
     assert max(squares) < SURE
     assert np.mean(squares) < 8.0
 
@@ -101,7 +96,7 @@ def test_where_a_picture_moves_like_the_room_nothing_is_claimed(room, motion):
     bearings = seen_from(points, pose)
     first = look(points, bearings, rng)
     for second in (seen_from(points, pose @ motion), on_picture(bearings, motion, 2.0)):
-        found = compare_motion(LAYER, first, look(points, second, rng), motion)
+        found = compare_motion(FROM_DEPTH, first, look(points, second, rng), motion)
         assert found.picture < chi2.isf(0.05, 6)
         assert found.square < SURE
 
@@ -110,7 +105,8 @@ def test_a_picture_that_the_camera_passes_is_not_seen_again(room):
     pose, points = room
     rng, motion = np.random.default_rng(5), driven(z=5.0)
     first = look(points, seen_from(points, pose), rng)
-    found = compare_motion(LAYER, first, first._replace(map_from_camera=pose @ motion), motion)
+    found = compare_motion(FROM_DEPTH, first, first._replace(map_from_camera=pose @ motion),
+                           motion)
     assert found.picture == np.inf
     assert found.square < SURE
 
@@ -123,10 +119,11 @@ def test_what_looks_at_the_same_keyframes_share_does_not_count(room):
                            np.array([0.04, 0.0, 0.0]))
     bearings, moved = seen_from(points, pose), seen_from(points, pose @ motion)
     first = look(points, bearings, rng)
-    same, other = (compare_motion(LAYER, first, look(points, moved, rng, keyframe, wrong), motion)
+    same, other = (compare_motion(FROM_DEPTH, first,
+                                  look(points, moved, rng, keyframe, wrong), motion)
                    for keyframe in (0, 1))
     assert other.square < SURE < same.square
     assert other.picture < 0.7 * same.picture
     first = look(points, bearings, rng, wrong=wrong)
-    both = compare_motion(LAYER, first, look(points, moved, rng, wrong=wrong), motion)
+    both = compare_motion(FROM_DEPTH, first, look(points, moved, rng, wrong=wrong), motion)
     assert both.square < SURE

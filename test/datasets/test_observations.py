@@ -178,7 +178,7 @@ def test_a_full_disk_is_named(tmp_path):
     good = load_observations(save(tmp_path / 'o.npz', make_arrays()))
     path = tmp_path / 'full.npz'
     # the temporary file of this process, on a disk without room
-    (tmp_path / f'.full.npz.{os.getpid()}.partial').symlink_to('/dev/full')
+    (tmp_path / f'.{os.getpid()}.full.npz').symlink_to('/dev/full')
     with pytest.raises(DatasetError, match='No space left on device; nothing was changed'):
         save_observations(path, good)
     assert not path.exists()

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for."""
 
+import re
 import time
 from itertools import count
 
@@ -56,6 +57,20 @@ def test_the_mount_is_the_one_at_the_images_stamp(own_relocalizer, tester, lift)
     truth = MAP_FROM_CAMERA @ invert_transform(base_from_camera(1.5))
     for pose in (tester.poses[0], tester.initial_poses[0]):
         assert pose_error(transform_of(pose.pose.pose), truth) < (0.08, 1.0)
+    assert process.alive
+
+
+def test_a_request_waits_for_a_late_transform(own_relocalizer, tester, lift):
+    process = own_relocalizer(expect='', base_frame='base_link', timeout_s=6.0)
+    frame, begin = make_frame(stamp_s=100.5), time.monotonic()
+    future = tester.ask()
+
+    def answered():
+        late = time.monotonic() > begin + 2.0
+        lift({100.0: 1.0} | ({101.0: 2.0} if late else {}))
+        return future.done()
+    tester.feed_until(answered, frame)
+    assert future.result().success, future.result().message
     # no transform covers that time
     answer = tester.relocalize(make_frame(stamp_s=104.0))
     assert not answer.success
@@ -101,6 +116,19 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     tester.destroy_subscription(subscription)
 
 
+def test_an_odom_frame_that_nobody_knows_withholds_the_pose(own_relocalizer, tester, lift):
+    """Nothing could be broadcast."""
+    own_relocalizer(expect='', base_frame='base_link', publish_tf=True, odom_frame='odomm',
+                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]', tf_timeout_s=0.1)
+    lift({100.0: 1.0})
+    answer = tester.relocalize(make_frame())
+    assert not answer.success
+    assert re.match(r"withheld: publish_tf: no transform from 'odomm' to 'base_link': .*; publish "
+                    r'it, or correct odom_frame \(accepted: x ', answer.message), answer.message
+    tester.wait(lambda: tester.poses, 'the pose itself')
+    assert not tester.initial_poses
+
+
 def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
     """With frames kept apart as well, and without a clock that jumps."""
     process = own_relocalizer(expect='', base_frame='base_link', publish_tf=True, fuse_frames=1,
@@ -111,6 +139,7 @@ def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
         one for one in msg.transforms if one.header.frame_id == 'map'), 100)
     wheels, odometry = tester.create_publisher(Odometry, 'odom', 10), Odometry()
     odometry.header.frame_id, odometry.child_frame_id = 'odom', 'base_link'
+    tester.wait(wheels.get_subscription_count, 'odometry to be heard')
 
     def accept(at_s):
         frame = make_frame(stamp_s=at_s)
@@ -120,7 +149,8 @@ def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
 
         def answered():
             publisher.publish(TFMessage(transforms=[standing]))
-            odometry.header.stamp = make_frame(stamp_s=at_s + 0.1 * next(ticks))[0].header.stamp
+            odometry.header.stamp = make_frame(
+                stamp_s=at_s - 0.5 + 0.1 * next(ticks))[0].header.stamp
             wheels.publish(odometry)
             return future.done()
         tester.feed_until(answered, frame)

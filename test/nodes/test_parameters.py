@@ -69,6 +69,16 @@ def test_a_dump_starts_the_same_detector(start, tester, tmp_path):
     assert dumped['conf'] == 0.25
 
 
+def test_one_file_serves_both_nodes(start, tester, tmp_path):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
+        'autostart': False, 'iou_threshold': 0.3, 'conf': 0.25, 'imgs': 320}}}))
+    for name in ('detector', 'relocalizer'):
+        node = start(f'nodes.{name}', '--ros-args', '--params-file', path)
+        node.wait_for_output("unknown parameter 'imgs' has no effect")
+        assert node.output().count('unknown parameter') == 1, node.output()
+
+
 def test_tools_see_what_a_parameter_allows(own_relocalizer, tester):
     own_relocalizer()
     described = tester.call(

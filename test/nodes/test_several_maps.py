@@ -85,7 +85,7 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
 
 
 @pytest.mark.needs('nav2_msgs')
-def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors):
+def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, tmp_path):
     srv = importlib.import_module('nav2_msgs.srv')
     first, second = floors(ROOM, other_room())
     own_relocalizer(map_file="''", map_files=listed([first, second]))
@@ -93,7 +93,10 @@ def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors):
     def load(url):
         return tester.call(srv.LoadMap, '/relocalizer/load_map',
                            srv.LoadMap.Request(map_url=url)).result
-    assert load('/nowhere.yaml') == srv.LoadMap.Response.RESULT_INVALID_MAP_DATA
+    for url in ('/nowhere.yaml', 'package://nowhere/map.yaml'):
+        assert load(url) == srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    (tmp_path / 'broken.yaml').write_text('no map')
+    assert load(str(tmp_path / 'broken.yaml')) == srv.LoadMap.Response.RESULT_INVALID_MAP_DATA
     assert tester.relocalize(make_frame(see_room(other_room()))).success
     assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
@@ -112,9 +115,9 @@ def test_maps_that_are_loaded_at_once_take_turns(own_relocalizer, tester, floors
         urls = [good, '/nowhere.yaml', good, '/nowhere.yaml']
         futures = [client.call_async(srv.LoadMap.Request(map_url=url)) for url in urls]
         results = [tester.answer(future).result for future in futures]
-        success, invalid = (srv.LoadMap.Response.RESULT_SUCCESS,
-                            srv.LoadMap.Response.RESULT_INVALID_MAP_DATA)
-        assert results == [success, invalid, success, invalid]
+        success, missing = (srv.LoadMap.Response.RESULT_SUCCESS,
+                            srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST)
+        assert results == [success, missing, success, missing]
     assert reload_map(tester).success
     assert tester.relocalize(make_frame()).success
     tester.destroy_client(client)

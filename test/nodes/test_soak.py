@@ -21,7 +21,7 @@ from rclpy.node import Node
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
-from tester import RELIABLE, transform_of
+from tester import RELIABLE, TakingLocalizer, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.bag_messages import (
@@ -122,12 +122,13 @@ class Client:
 
 
 class Witness:
-    """Hears when each frame was published, and every pose that a localizer was told."""
+    """Hears when each frame was published; a localizer that keeps every pose that it was told."""
 
     def __init__(self, executor):
         self.node = Node('soak_witness')
         executor.add_node(self.node)
         self.published_ns, self.poses = defaultdict(list), []
+        self.localizer = TakingLocalizer(self.node)
         self.node.create_subscription(CameraInfo, 'camera_info', self._hear, RELIABLE)
         self.node.create_subscription(PoseWithCovarianceStamped, 'initialpose',
                                       lambda msg, info: self.poses.append(

@@ -7,7 +7,9 @@ import time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from tester import class_matching, make_frame
+from tester import TakingLocalizer, class_matching, make_frame
+
+from cliploc_ros.ros.conversions import stamp_ns
 
 
 def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_map, tmp_path):
@@ -16,6 +18,7 @@ def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_ma
     frame = make_frame()
     heard, publishers, subscriptions, clients = {}, {}, [], {}
     for robot, path in (('robot_1', room_map), ('robot_2', other_map)):
+        TakingLocalizer(tester, f'/{robot}/')
         start('nodes.relocalizer', '--ros-args', '-r', f'__ns:=/{robot}',
               parameters=class_matching(path)).wait_for_output('ready after')
         heard[robot] = []
@@ -53,15 +56,14 @@ def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_ma
 
 def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tester, room_map):
     """Each in a namespace of its own, and the robot's names given back (doc/nav2.md)."""
-    remaps = [argument for name in ('odom', 'initialpose', 'request_nomotion_update')
+    remaps = [argument for name in ('odom', 'initialpose', 'amcl_pose', 'request_nomotion_update')
               for argument in ('-r', f'{name}:=/{name}')]
     for camera in ('front', 'rear'):
         start('nodes.relocalizer', '--ros-args', '-r', f'__ns:=/{camera}', *remaps,
               parameters=class_matching(room_map)).wait_for_output('ready after')
-    frame = make_frame()
     publishers = {camera: [tester.create_publisher(type(message), f'/{camera}/{name}', 10)
                            for message, name in zip(
-                               frame, ('image', 'camera_info', 'detections'), strict=True)]
+                               make_frame(), ('image', 'camera_info', 'detections'), strict=True)]
                   for camera in ('front', 'rear')}
     odom, odometry = tester.create_publisher(Odometry, '/odom', 10), Odometry()
 
@@ -73,6 +75,7 @@ def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tes
         client = tester.create_client(Trigger, f'/{camera}/relocalizer/relocalize')
         tester.wait(client.service_is_ready, client.srv_name)
         future = client.call_async(Trigger.Request())
+        frame = make_frame(stamp_s=time.time() + 0.3)  # odometry begins before it
 
         def answered():
             publish_odometry()
@@ -92,7 +95,8 @@ def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tes
         for camera in publishers:
             answer = ask(camera)
             assert answer.success, answer.message
-        tester.wait(lambda: len(tester.initial_poses) == 2, 'a pose by each camera')
+        tester.wait(lambda: len({stamp_ns(pose.header.stamp) for pose in tester.initial_poses})
+                    == 2, 'a pose by each camera')
     finally:
         for publisher in (odom, *publishers['front'], *publishers['rear']):
             tester.destroy_publisher(publisher)

@@ -14,7 +14,7 @@ from processes import wait_for
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 from scene import make_room, see_room
-from tester import RELIABLE, class_matching, make_frame
+from tester import RELIABLE, TakingLocalizer, class_matching, make_frame
 
 from cliploc_ros.cli.wake_up import main
 
@@ -194,6 +194,8 @@ def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map
         process.wait_for_output('waiting: nobody subscribes /bare/initialpose: start the localiz')
         made.append(tester.create_subscription(
             PoseWithCovarianceStamped, '/bare/initialpose', lambda _: None, RELIABLE))
+        process.wait_for_output('waiting: nobody publishes /bare/amcl_pose: start the localizer')
+        TakingLocalizer(tester, '/bare/')
 
         def publish():
             for topic, message in zip(publishers, (image, info, detections), strict=True):

@@ -22,8 +22,25 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
+from cliploc_ros.ros.qos import LATCHED
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class TakingLocalizer:
+    """Shows each initial pose as its own at once, while it is on."""
+
+    def __init__(self, node, namespace=''):
+        self.is_on, self.frame = True, None
+        self._publisher = node.create_publisher(
+            PoseWithCovarianceStamped, f'{namespace}amcl_pose', LATCHED)
+        self._subscription = node.create_subscription(
+            PoseWithCovarianceStamped, f'{namespace}initialpose', self._show, RELIABLE)
+
+    def _show(self, pose):
+        pose.header.frame_id = self.frame or pose.header.frame_id
+        if self.is_on:
+            self._publisher.publish(pose)
 
 
 class Tester(Node):
@@ -44,6 +61,7 @@ class Tester(Node):
                 (PoseWithCovarianceStamped, 'initialpose', self.initial_poses),
                 (PoseArray, 'relocalizer/hypotheses', self.hypotheses)):
             self.create_subscription(message, topic, self._keeper(kept), RELIABLE)
+        self.localizer = TakingLocalizer(self)
         self._relocalize = self.create_client(Trigger, 'relocalizer/relocalize')
         self._reinitialize = self.create_client(Empty, 'reinitialize_global_localization')
 

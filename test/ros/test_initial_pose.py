@@ -19,7 +19,12 @@ from std_srvs.srv import Empty
 
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
-from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
+from cliploc_ros.ros.outputs.handoff import (
+    HandOff,
+    HandOffError,
+    NoLocalizerError,
+    is_taken,
+)
 
 VALUES = {'base_frame': 'base_link', 'max_speed_m_s': 0.1, 'max_turn_rad_s': 0.2,
           'nomotion_updates': 10, 'require_localizer': True}
@@ -392,6 +397,84 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
         robot.wait(handing_over.done, 'the next hand-over', lambda: rest(wheels))
         assert handing_over.exception() is None
     robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.fixture
+def silent(robot):
+    """A localizer that has a topic for its pose, but shows none."""
+    robot.localizer.node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+    robot.localizer.subscribe()
+    robot.handoff.open('amcl_pose')
+    robot.wait(lambda: not robot.handoff.missing(), 'the localizer')
+    yield robot
+    robot.handoff.close()
+
+
+def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
+    """Such as ros2 topic echo."""
+    robot.localizer.subscribe()
+    robot.handoff.open('amcl_pose')
+    robot.meet()
+    with pytest.raises(NoLocalizerError, match=r'^nobody publishes /amcl_pose: start the '
+                       r'localizer \(AMCL\), or name the topic of its pose by localizer_pose$'):
+        robot.hand_over()
+    assert not robot.localizer.poses
+    robot.handoff.close()
+
+
+def test_the_pose_comes_again_until_time_is_up(silent):
+    with pytest.raises(NoLocalizerError, match=r'^the localizer did not take the pose: /amcl_pose '
+                       r'shows nothing since initialpose was published 3 times in 3 s: see '):
+        silent.hand_over(3.2)
+    assert len(silent.localizer.poses) == 3
+
+
+def test_a_pose_is_not_given_without_time_to_see_it_taken(silent):
+    with pytest.raises(NoLocalizerError, match=r'^too little time is left to see whether'):
+        silent.hand_over(0.3)
+    assert not silent.localizer.poses
+
+
+def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):
+    tell(silent, wheels, TEN_HZ)
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(silent.hand_over)
+        silent.wait(lambda: silent.localizer.poses, 'the pose')
+        tell(silent, wheels, (1.0, 1.1, 1.2), twist_m_s=0.5)
+        with pytest.raises(HandOffError, match=r'^the robot moves at 0\.50 m/s'):
+            handing_over.result()
+    assert len(silent.localizer.poses) == 1
+
+
+@pytest.mark.parametrize(('what', 'error'), [('forget', TimeJumpError), ('stop', HandOffError)])
+def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, what, error):
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(silent.hand_over)
+        silent.wait(lambda: silent.localizer.poses, 'the pose')
+        start = time.monotonic()
+        getattr(silent.handoff, what)()
+        with pytest.raises(error, match=r'time jumped|was deactivated'):
+            handing_over.result()
+    assert time.monotonic() - start < 3.0
+    assert len(silent.localizer.poses) == 1
+
+
+@pytest.mark.parametrize(('x_m', 'yaw_deg', 'frame', 'is_taken_over'), [
+    (0.0, 0.0, 'map', True), (0.55, 0.0, '/map', True), (0.0, 24.0, 'map', True),
+    (0.65, 0.0, 'map', False), (0.0, 26.0, 'map', False), (0.0, 0.0, 'floor_2', False),
+    (math.nan, 0.0, 'map', False), (0.0, math.nan, 'map', False)])
+def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
+    """.3 m and three deviations of .1 m, 10 degrees and three of 5."""
+    given, shown = make_pose(), make_pose()
+    given.pose.pose.orientation.w = 1.0
+    given.pose.covariance[0], given.pose.covariance[7] = 0.1**2, 0.02**2
+    given.pose.covariance[35] = math.radians(5.0)**2
+    shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
+    shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
+    shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
+    assert is_taken(given, shown) == is_taken_over
+    shown.pose.pose.orientation.y = 1e200
+    assert not is_taken(given, shown)
 
 
 def test_a_hand_over_ends_with_the_node(robot):

@@ -14,6 +14,7 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom, transform_msg
 from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
 
@@ -132,8 +133,8 @@ def test_a_jump_ends_the_broadcast_until_the_next_pose(robot):
     robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     robot.map_to_odom.forget()
-    # an image from before whose search ends after the jump
-    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    with pytest.raises(TimeJumpError):  # an image from before whose search ends after the jump
+        robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
     robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods
@@ -156,10 +157,10 @@ def test_odometry_that_restarts_ends_the_broadcast_until_the_next_pose(robot, re
     robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     robot.tell_odometry(restart_s, x_m)
-    # an image from before whose search ends after the restart
-    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
-    if restart_s > 100.0:  # one that arrives after the restart
-        robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, time.monotonic())
+    # images from before: its search ends after the restart, or it arrives after it
+    for at in (received_at, time.monotonic())[:1 if restart_s < 100.0 else 2]:
+        with pytest.raises(TimeJumpError, match=r'^odometry restarted or time jumped since'):
+            robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, at)
     robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods

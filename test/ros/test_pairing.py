@@ -148,7 +148,8 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
 
 @given(ADDITIONS)
 def test_memory_is_bounded_whatever_comes(additions):
-    pairing, largest = ExactPairing(LIMITS, MAX_COUNT), dict.fromkeys(TOPICS, 0)
+    pairing = ExactPairing(LIMITS, MAX_COUNT, 'image', 'detections')
+    largest = dict.fromkeys(TOPICS, 0)
     for topic, stamp, size in additions:
         pairing.add(topic, stamp, None, size)
         largest[topic] = max(largest[topic], size)
@@ -157,9 +158,36 @@ def test_memory_is_bounded_whatever_comes(additions):
             max(LIMITS[name], largest[name]) for name in TOPICS)
 
 
+def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
+    """Return the images that pair, of a camera whose detections come so many images later.
+
+    A detector takes the newest image when it is done with one, or all of them from a queue.
+    """
+    pairing = ExactPairing({'image': 100 * room, 'detections': 10**9}, 2000, 'image', 'detections')
+    paired, taken, done_at = [], 0, begin
+    for number in range(1, images + 1):
+        pairing.add('image', number, number, 100)
+        assert pairing.waiting_bytes() <= 100 * room
+        stamp = number - behind if queue else taken
+        if queue or number >= done_at:
+            if stamp and pairing.add('detections', stamp, 'boxes', 0):
+                paired.append(stamp)
+            taken, done_at = number, number + behind
+    return paired
+
+
+@pytest.mark.parametrize(('behind', 'room'), [(12, 10), (60, 43), (60, 10), (300, 10), (5, 43)])
+def test_images_pair_however_slow_the_detector_is(behind, room):
+    """4K images at 30 Hz, of which 10 fit into memory, and 1080p: .4, 2 and 10 s late."""
+    for begin in (0, behind // 2):  # it begins with the first image, or was at work before
+        paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin=begin)
+        assert len(paired) >= 8, paired
+    assert len(paired_by_a_slow_detector(behind, room, 10 * behind, queue=True)) >= 6
+
+
 @given(st.lists(st.tuples(st.sampled_from(TOPICS), st.integers()), max_size=80))
 def test_count_is_bounded_whatever_comes(additions):
-    pairing = ExactPairing(dict.fromkeys(TOPICS, 10**9), MAX_COUNT)
+    pairing = ExactPairing(dict.fromkeys(TOPICS, 10**9), MAX_COUNT, 'image', 'detections')
     for topic, stamp in additions:
         pairing.add(topic, stamp, None, 1)
         assert pairing.waiting_bytes() <= MAX_COUNT * len(TOPICS)

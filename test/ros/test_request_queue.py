@@ -2,24 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests in a real node with a real frame source; the localizer is the test's own function."""
 
+import array
 import logging
+import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import FrameSource
-from cliploc_ros.ros.inputs.robot_state import RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
@@ -36,7 +40,7 @@ class Answering(ManagedNode):
                                              received_at=frame.received_at)
         self.robot = RobotStateSource(self)
         self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
-        self.requests = Requests(self, self.frames, self.robot, TimeJumps(self, lambda: None),
+        self.requests = Requests(self, self.frames, self.robot,
                                  lambda frame, times, deadline: self.localize(frame),
                                  HandOff(self, self.robot.odometry))
 
@@ -149,6 +153,56 @@ def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, cl
     assert took_s < 1.0
 
 
+def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
+    """Ten of them fit into memory; the boxes of the first one come after twelve, or never."""
+    infos, boxes, images = camera.publishers
+    data = array.array('B', bytes(3840 * 2160 * 3))
+
+    def take(number):
+        """Publish an image, and wait until the node has it."""
+        header = Header(stamp=Time(sec=number))
+        before = node.frames._pairing.received['image']
+        infos.publish(CameraInfo(header=header))
+        images.publish(Image(header=header, height=2160, width=3840, step=3840 * 3,
+                             encoding='rgb8', data=data))
+        wait(lambda: node.frames._pairing.received['image'] > before, 'the image')
+
+    request = clients.submit(node.requests.answer)
+    wait(lambda: all(one.get_subscription_count() for one in camera.publishers), 'the node')
+    for number in range(1, 13):
+        take(number)
+    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
+    wait(request.done, 'the answer')
+    assert request.result().message == 'refused: nothing known'
+    node.settings._values = node.settings._values | {'timeout_s': 3.0}
+    request = clients.submit(node.requests.answer)
+    for number in range(13, 27):
+        take(number)
+    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=15))))
+    wait(request.done, 'the answer')
+    assert re.search('no fresh frame within 3 s: detections come 12 images late, and memory '
+                     'holds 256 MiB of images: use smaller images', request.result().message)
+
+
+@pytest.mark.parametrize(('kind', 'advice'), [
+    (RefusalKind.TOO_FEW_OBJECTS, 'turn the camera'),
+    (RefusalKind.AMBIGUOUS, 'turn the camera; time is up: waiting for an image with detections '
+     'took [0-9.]+ of [0-9.]+ s; raise the rate of the camera or of the detector, or raise '
+     'timeout_s')])
+def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clients, wait, kind,
+                                                             advice):
+    node.settings._values = node.settings._values | {'timeout_s': 0.6}
+    node.robot.is_linked_soon = lambda stamp, deadline: True
+    node.localize = lambda frame: Answer(
+        Verdict.REFUSED, 'turn the camera', received_at=frame.received_at, kind=kind,
+        state=RobotState(np.eye(4), place=object()),
+        stages_ms={'image': 200.0, 'search': 1.0})
+    request = clients.submit(node.requests.answer)
+    shoot_until(camera, wait, request)
+    assert re.fullmatch(rf'refused: {advice} \[\d+ frames in 0\.[567] s\]; kind {kind}',
+                        request.result().message)
+
+
 def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     node.settings._values = node.settings._values | {'timeout_s': 0.3}
     start = time.monotonic()
@@ -156,6 +210,38 @@ def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     wait(lambda: all(request.done() for request in requests), 'the answers')
     assert time.monotonic() - start < 0.9, 'they wait side by side'
     assert all('nobody publishes /image' in request.result().message for request in requests)
+
+
+class LateTransforms:
+    """In the place of tf2's buffer: it knows the images that are old enough."""
+
+    def __init__(self, late_s):
+        self.late_s, self.asked_at = late_s, {}
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        first = self.asked_at.setdefault(stamp.nanoseconds, time.monotonic())
+        if time.monotonic() < first + self.late_s:
+            raise LookupError('extrapolation into the future')
+        return TransformStamped()
+
+
+@pytest.mark.parametrize('late_s', [1.2, 60.0])
+def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
+    values = {'base_frame': 'base_link', 'timeout_s': 4.0, 'tf_timeout_s': 0.0}
+    node.settings._values = node.settings._values | values
+    node.robot.transforms._buffer = LateTransforms(late_s)
+    node.localize = lambda frame: Answer(
+        Verdict.REFUSED, 'seen', received_at=frame.received_at,
+        state=node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline))
+    begin = time.monotonic()
+    node.deadline = begin + 4.0
+    request = clients.submit(node.requests.answer)
+    shoot_until(camera, wait, request)
+    answer, took_s = request.result(), time.monotonic() - begin
+    if late_s < 4.0:
+        assert answer.message.startswith('refused: seen') and 1.2 < took_s < 4.0
+    else:
+        assert "no transform from 'base_link' to" in answer.message and 3.0 < took_s < 4.3
 
 
 def test_an_answer_keeps_to_the_time_out_while_the_map_loads(node, clients, wait):

@@ -75,7 +75,7 @@ def is_refused(jumps, stamp_s, received_at):
 def test_time_that_goes_on_is_no_jump(simulation, jumps):
     start = time.monotonic()
     simulation.set_time(5.0, 5.1, 6.0, 600.0)
-    assert not jumps.forgot and not jumps.is_settling
+    assert not jumps.forgot
     for stamp_s in (0.0, 5.0, 1e6):
         assert not is_refused(jumps, stamp_s, start)
 
@@ -84,7 +84,6 @@ def test_time_that_goes_on_is_no_jump(simulation, jumps):
 def test_a_jump_back_is_seen_once(simulation, jumps, before_s, after_s):
     simulation.set_time(before_s, after_s, after_s + 0.01, after_s + 1.0)
     assert [one.nanoseconds for one in jumps.forgot] == [round(after_s * S)]
-    assert jumps.is_settling
 
 
 def test_each_jump_of_a_bag_that_loops_is_seen(simulation, jumps):
@@ -131,12 +130,6 @@ def test_closed_it_watches_no_longer(simulation, jumps):
     jumps.close()
     simulation.set_time(5.0, 2.0)
     assert not jumps.forgot
-
-
-def test_a_jump_is_over_after_some_seconds(simulation, jumps, wait):
-    simulation.set_time(5.0, 2.0)
-    assert jumps.is_settling
-    wait(lambda: not jumps.is_settling, 'transforms to be there again')
 
 
 VALUES = {'base_frame': 'base_link', 'tf_timeout_s': 0.0, 'gravity': 'imu'}

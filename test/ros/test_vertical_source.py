@@ -139,6 +139,15 @@ def test_a_right_orientation_is_kept_when_the_robot_starts(source):
     np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
 
 
+def test_a_message_out_of_order_costs_nothing(source):
+    """Drivers stamp in several threads; one that is more than a second late is a jump."""
+    for seconds in (49.92, 49.93, 49.929, 49.94, 50.05, 50.02):
+        source.take(imu((5.0 if seconds < 50 else -5.0, 0.0, 9.81), seconds=seconds))
+    assert len(source._samples) == 6
+    source.take(imu(seconds=49.0))
+    assert len(source._samples) == 1
+
+
 def test_an_imu_in_the_camera_needs_no_transform(source):
     source.take(imu((0.0, -9.81, 0.0), frame_id='camera'))
     np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)

@@ -32,6 +32,7 @@ class Keyframes(NamedTuple):
     none: float
     inliers: float
     confirmed: float
+    most: float
     explained: float
     unexplained: float
     most_objects: float
@@ -44,8 +45,9 @@ class Genuine(NamedTuple):
 
     none: float
     confirmed: float
-    border: float
+    extent: float
     focal: float
+    most_motion: float
 
 
 class Attitude(NamedTuple):

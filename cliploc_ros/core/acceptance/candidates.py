@@ -16,7 +16,7 @@ from cliploc_ros.core.acceptance.confidence import Setting, utilities
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import Rig
+from cliploc_ros.core.fit.rig import Rig, cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -56,6 +56,21 @@ class JoinedFrames(NamedTuple):
         """Return what the chance of a wrong pose depends on, besides the supports."""
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
+
+
+def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
+                frames: Sequence[SearchedFrame]) -> JoinedFrames:
+    """Return some searched frames, the last one of which is to be localized.
+
+    Raises
+    ------
+    OptionsError
+        odom_from_camera is missing or no rigid transform; there are no frames or too many.
+    """
+    cameras = cameras_from_last([one.observation for one in frames])
+    rig = make_rig([one.scene for one in frames], cameras,
+                   np.stack([one.vertical for one in frames]), landmark_map.position_sigmas)
+    return JoinedFrames(landmark_map, options, frames, rig, cameras)
 
 
 class Candidate(NamedTuple):

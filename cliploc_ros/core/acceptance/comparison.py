@@ -33,6 +33,7 @@ from cliploc_ros.core.acceptance.confidence import (
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
+from cliploc_ros.core.acceptance.motion import compare_motion
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import share_within
@@ -45,9 +46,10 @@ from cliploc_ros.core.fit.finalists import (
 )
 from cliploc_ros.core.fit.fusion import fuse
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
-from cliploc_ros.core.keyframes.places import Recognition
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.joined_map import Place, place_of
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.search.frame_search import coverage_of, prior_of
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
@@ -222,10 +224,22 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         sum(one.known_tried for one in joined.frames),
         math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        best.support.unexplained, chance_genuine(recognized) if recognized else 1.0,
+        best.support.unexplained, _genuine(recognized, last, looks, recognizer),
         _not_mirrored(joined, compared), recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
+
+
+def _genuine(recognized: RecognizedPlace | None, observation: Observation, looks: Looks,
+             recognizer: ImageRecognizer | None) -> float:
+    """Return the probability that a recognized place is no picture, by what moved since."""
+    if recognized is None or recognizer is None:
+        return 1.0
+    passed, motion = looks.passed(observation), None
+    if passed is not None and passed[0].recognized is not None:
+        motion = compare_motion(recognizer.deviation_per_metre, passed[0].recognized, recognized,
+                                passed[1])
+    return chance_genuine(recognized, motion)
 
 
 def _not_mirrored(joined: JoinedFrames, compared: Comparison) -> float:

@@ -20,14 +20,19 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.acceptance.motion import Motion
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
+# Motions of right poses are no further off, in squared deviations (95 %, dof 6).
+_SURE_MOTION = float(chi2.ppf(0.95, 6))
+_FOCAL_DEVIATIONS = 2.0
 
 
 class Setting(NamedTuple):
@@ -110,8 +115,8 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
     """Return what the points of a place say for it: log odds, against a place by chance."""
     terms = calibration.keyframes
-    return (terms.none + terms.inliers * math.log(max(1, place.inliers))
-            + terms.confirmed * place.confirmed)
+    return min(terms.most, terms.none + terms.inliers * math.log(max(1, place.inliers))
+               + terms.confirmed * place.confirmed)
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
@@ -121,12 +126,34 @@ def objects_utility(support: Support, calibration: Calibration = CALIBRATION) ->
             + terms.unexplained * min(terms.most_objects, support.unexplained))
 
 
-def chance_genuine(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+def chance_genuine(place: RecognizedPlace, motion: Motion | None = None,
+                   calibration: Calibration = CALIBRATION) -> float:
     """Return the probability that a recognized place is there, not its picture, and unchanged.
 
     Objects and points that lie in a picture of a place agree on where it was taken. Neither
-    judges the other: they see the same pixels. Only what is around the picture tells.
+    judges the other: they see the same pixels. What tells is the image around the picture, its
+    size, which another focal length would explain, and how it moves.
+
+    Parameters
+    ----------
+    place : RecognizedPlace
+    motion : Motion, optional
+        Since an earlier look.
     """
     terms = calibration.genuine
-    odds = (terms.none + terms.confirmed * place.confirmed)
-    return 1.0 / (1.0 + math.exp(-min(odds, 50.0)))
+    odds = (terms.none + terms.confirmed * place.confirmed + terms.extent * place.extent
+            + terms.focal * focal_error(place))
+    if motion is not None:
+        odds -= 0.5 * max(0.0, motion.square - _SURE_MOTION)
+        if motion.square < _SURE_MOTION:
+            odds += min(terms.most_motion, 0.5 * max(0.0, motion.picture - _SURE_MOTION))
+    return 1.0 / (1.0 + math.exp(-min(max(odds, -50.0), 50.0)))
+
+
+def focal_error(place: RecognizedPlace) -> float:
+    """Return how far the focal length that the points suggest is from the camera's: 0 to 1.
+
+    It is the logarithm of their ratio beyond what its deviation explains.
+    """
+    beyond = abs(math.log(place.focal_ratio)) - _FOCAL_DEVIATIONS * place.focal_deviation
+    return min(max(beyond, 0.0), 1.0)

@@ -11,7 +11,8 @@ exchangeable improvements of Markov's, Chebyshev's and Chernoff's inequalities",
 limit of .5, a robot that is nowhere in the map ever accepts a pose with at most twice the mean
 confidence of its looks.
 
-An accepted pose ends a series of looks: the next request begins another one.
+An accepted pose ends a series of looks: the next request begins another one. What keyframes
+recognized stays for a while, since a picture of a place is told from it by how both move.
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from cliploc_ros.core.geometry.tolerances import SAME_LOOK
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.observation import Observation
+
+_MOST_RECOGNIZED = 3
 
 
 class Look(NamedTuple):
@@ -48,22 +51,34 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True)
 class Looks:
-    """The last looks of one run of odometry that led to no accepted pose, oldest first."""
+    """The last looks of one run of odometry, oldest first.
+
+    Parameters
+    ----------
+    past : tuple of Look
+        Those that led to no accepted pose.
+    recognized : tuple of Look
+        The last ones by keyframes, accepted or not.
+    """
 
     past: tuple[Look, ...] = ()
+    recognized: tuple[Look, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of looks."""
         return len(self.past)
 
-    def with_look(self, look: Look) -> 'Looks':
+    def with_look(self, look: Look, accepted: bool = False) -> 'Looks':
         """Return these looks and a new one; those at the same or a later stamp are dropped.
 
         An observation without odometry links to no look, so it counts as the only one.
         """
-        before = () if look.observation.odom_from_camera is None else self._before(
-            look.observation)
-        return Looks((*before, look)[-CALIBRATION.looks.most:])
+        is_linked = look.observation.odom_from_camera is not None
+        past, recognized = (_before(some, look.observation) if is_linked else ()
+                            for some in (self.past, self.recognized))
+        if look.recognized is not None:
+            recognized = (*recognized, look)[-_MOST_RECOGNIZED:]
+        return Looks(() if accepted else (*past, look)[-CALIBRATION.looks.most:], recognized)
 
     def confidences_in(self, observation: Observation, map_from_camera: NDArray[np.float64]
                        ) -> tuple[float, ...]:
@@ -76,7 +91,7 @@ class Looks:
         if odom_from_camera is None:
             return ()
         found = []
-        for one in self._before(observation)[1 - terms.most:]:
+        for one in _before(self.past, observation)[1 - terms.most:]:
             assert one.observation.odom_from_camera is not None
             carried = one.map_from_camera @ invert_transform(
                 one.observation.odom_from_camera) @ odom_from_camera
@@ -86,6 +101,20 @@ class Looks:
             found.append(one.confidence if near.agree(carried, map_from_camera) else 0.0)
         return tuple(found)
 
-    def _before(self, observation: Observation) -> tuple[Look, ...]:
-        return tuple(one for one in self.past
-                     if one.observation.stamp_ns < observation.stamp_ns)
+    def passed(self, observation: Observation) -> tuple[Look, NDArray[np.float64]] | None:
+        """Return the look by keyframes that odometry takes furthest away, and the motion since.
+
+        The motion (4, 4) takes coordinates of the camera now to those of then.
+        """
+        odom_from_camera, found = observation.odom_from_camera, []
+        if odom_from_camera is None:
+            return None
+        for one in _before(self.recognized, observation):
+            assert one.observation.odom_from_camera is not None
+            found.append((one, invert_transform(one.observation.odom_from_camera)
+                          @ odom_from_camera))
+        return max(found, key=lambda pair: float(np.linalg.norm(pair[1][:3, 3])), default=None)
+
+
+def _before(looks: tuple[Look, ...], observation: Observation) -> tuple[Look, ...]:
+    return tuple(one for one in looks if one.observation.stamp_ns < observation.stamp_ns)

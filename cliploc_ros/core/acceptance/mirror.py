@@ -19,6 +19,7 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.candidates import (
     Candidate,
     JoinedFrames,
+    join_frames,
     refined,
     supports_of,
     unrefined,
@@ -26,7 +27,6 @@ from cliploc_ros.core.acceptance.candidates import (
 from cliploc_ros.core.acceptance.confidence import utilities
 from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.fit.finalists import matches_of
-from cliploc_ros.core.fit.rig import make_rig
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Observation
@@ -60,17 +60,16 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
         frames.append(one._replace(
             observation=observation, vertical=one.vertical * (-1, 1, 1, 1, 1, 1, 1),
             scene=match_frame(joined.landmark_map, observation, joined.options)[0]))
-    cameras = _FLIP @ joined.cameras @ _FLIP
-    rig = make_rig([one.scene for one in frames], cameras,
-                   np.stack([one.vertical for one in frames]), joined.landmark_map.position_sigmas)
-    return joined._replace(frames=frames, rig=rig, cameras=cameras)
+    return join_frames(joined.landmark_map, joined.options, frames)
 
 
 def _mirrored_observation(observation: Observation) -> Observation:
     """Return an observation mirrored on the plane z = 1, where a lens distorts nothing."""
     camera, detections = observation.camera, observation.detections
     boxes = camera.normalize_bboxes(detections.bboxes_xyxy)
-    return replace(observation, camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
+    odom = observation.odom_from_camera
+    return replace(observation, odom_from_camera=None if odom is None else _FLIP @ odom @ _FLIP,
+                   camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
                    detections=replace(detections,
                                       bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
 

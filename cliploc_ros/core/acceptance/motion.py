@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import PER_RADIAN
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
@@ -42,20 +41,20 @@ class Motion(NamedTuple):
     picture: float
 
 
-def compare_motion(layer: KeyframeLayer, first: RecognizedPlace, second: RecognizedPlace,
+def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
                    first_from_second: NDArray[np.float64]) -> Motion:
     """Compare the poses of two looks with odometry.
 
     Parameters
     ----------
-    layer : KeyframeLayer
-        That both were recognized in.
+    deviation_per_metre : float
+        Of the layer that both were recognized in.
     first, second : RecognizedPlace
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """
     expected = first.map_from_camera @ first_from_second
-    information = np.linalg.inv(_covariance(layer, first, second, first_from_second))
+    information = np.linalg.inv(_covariance(deviation_per_metre, first, second, first_from_second))
 
     def square(pose: NDArray[np.float64]) -> float:
         step = pose_difference(expected, pose)
@@ -65,7 +64,7 @@ def compare_motion(layer: KeyframeLayer, first: RecognizedPlace, second: Recogni
         np.inf if one is None else square(one.map_from_camera) for one in pictures))
 
 
-def _covariance(layer: KeyframeLayer, first: RecognizedPlace, second: RecognizedPlace,
+def _covariance(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
                 first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of the second pose about the one that odometry expects.
 
@@ -76,7 +75,7 @@ def _covariance(layer: KeyframeLayer, first: RecognizedPlace, second: Recognized
     same = sum(min(share, shares.get(keyframe, 0.0))
                for keyframe, share in zip(first.keyframes, first.shares, strict=True))
     way, turn = first_from_second[:3, 3], Rotation.from_matrix(first_from_second[:3, :3])
-    grown = (layer.deviation_per_metre * np.linalg.norm(way), PER_RADIAN * turn.magnitude())
+    grown = (deviation_per_metre * np.linalg.norm(way), PER_RADIAN * turn.magnitude())
     before, after = (one.covariance - same * one.shared for one in (first, second))
     return move_covariance(before, first.map_from_camera[:3, :3] @ way) + after + np.diag(
         odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2)

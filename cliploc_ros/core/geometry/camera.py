@@ -3,6 +3,7 @@
 """The camera: intrinsics, distortion, and the projection between pixels and the plane z = 1."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ _COEFFICIENT_COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14),
                        'equidistant': (4,)}
 _NEWTON_STEPS = 20
 _NEWTON_DIFFERENCE = 1e-6
+_FOLD_STEP_DEG = 0.1
 # A larger error after undistorting and distorting again means that the model has no inverse.
 _MAX_ROUND_TRIP_PX = 0.1
 
@@ -74,6 +76,11 @@ class Camera:
                               f'not {len(self.distortion)}')
 
     @property
+    def pinhole(self) -> 'Camera':
+        """Return the camera of the undistorted images."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
     def matrix(self) -> NDArray[np.float64]:
         """Return the intrinsic matrix K (3, 3) [px]."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
@@ -95,31 +102,25 @@ class Camera:
             for _ in range(_NEWTON_STEPS):
                 normalized -= self._newton_step(normalized, points_px)
             missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
-            # Beyond its fold, a lens model has roots that belong to no ray.
-            sound = (missed <= _MAX_ROUND_TRIP_PX) & self._keeps_sides(normalized)
-        normalized[~sound] = np.nan
+        normalized[~(missed <= _MAX_ROUND_TRIP_PX)] = np.nan
         return normalized
 
-    def _keeps_sides(self, normalized: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points (n, 2) the lens neither mirrors nor moves across the centre."""
-        projected, along_x, along_y = self._linearized(normalized)
-        determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
-        distorted = (projected - (self.cx, self.cy)) / (self.fx, self.fy)
-        square = np.sum(normalized**2, axis=1)
-        return (determinant > 0) & (np.sum(normalized * distorted, axis=1) >= 0.01 * square)
-
-    def _linearized(self, normalized: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the pixels (n, 2) of points (n, 2) and their derivatives by x and y."""
-        projected = self.project_normalized(normalized)
-        along_x, along_y = (
-            (self.project_normalized(normalized + step) - projected) / _NEWTON_DIFFERENCE
-            for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
-        return projected, along_x, along_y
+    @cached_property
+    def _reach(self) -> float:
+        """Return how far from the axis the lens model holds on the plane z = 1: to its fold."""
+        distances = np.tan(np.radians(np.arange(0.0, 90.0, _FOLD_STEP_DEG)))
+        with np.errstate(all='ignore'):
+            columns = self._distorted(np.stack([distances, 0.0 * distances], axis=1))[:, 0]
+            folds = np.nonzero(~(np.diff(columns) > 0.0))[0]
+        return float(distances[folds[0]]) if len(folds) else np.inf
 
     def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
                      ) -> NDArray[np.float64]:
         """Return the Newton step (n, 2) to subtract from points that should project to pixels."""
-        projected, along_x, along_y = self._linearized(normalized)
+        projected = self._distorted(normalized)
+        along_x, along_y = (
+            (self._distorted(normalized + step) - projected) / _NEWTON_DIFFERENCE
+            for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
         missed = projected - points_px
         determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
         step = np.stack([missed[:, 0] * along_y[:, 1] - missed[:, 1] * along_y[:, 0],
@@ -127,10 +128,19 @@ class Camera:
         return step / determinant[:, None]
 
     def project_normalized(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (distorted) pixels (n, 2) of points (n, 2) of the plane z = 1."""
+        """Return the (distorted) pixels (n, 2) of points (n, 2) of the plane z = 1.
+
+        Rows beyond the fold of the distortion model are NaN: it would put them into the image.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if not any(self.distortion) or len(points) == 0:
             return points * (self.fx, self.fy) + (self.cx, self.cy)
+        pixels = self._distorted(points)
+        pixels[~(np.linalg.norm(points, axis=1) <= self._reach)] = np.nan
+        return pixels
+
+    def _distorted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pixels (n, 2) of points (n, 2), beyond the fold as well."""
         coefficients, zero = np.array(self.distortion), np.zeros(3)
         if self.distortion_model == 'equidistant':
             pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(points[:, None]),

@@ -52,5 +52,8 @@ SAME_VIEW = Tolerance(0.05, 3.0)
 SAME_SIGHT = Tolerance(2.0, 40.0)
 #: A robot that moved less since its image is still where its pose says.
 SAME_SPOT = Tolerance(0.1, 5.0)
+#: A localizer that shows a pose so near to the given one has taken it. Its particles scatter by
+#: the given covariance, so the tolerance is wider by three standard deviations.
+TAKEN = Tolerance(0.3, 10.0)
 #: Moves of a place onto another one that differ by less are one move, about the vertical.
 SAME_MOVE = Tolerance(1.0, 30.0)

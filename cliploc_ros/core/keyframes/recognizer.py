@@ -63,6 +63,11 @@ class ImageRecognizer:
             self._begin_stage('search')
         return self._known[1]
 
+    @property
+    def deviation_per_metre(self) -> float:
+        """Return the layer's, see KeyframeLayer."""
+        return self._keyframes.layer.deviation_per_metre
+
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
         """Return KeyframeLocalizer.coverage for the camera of the image."""
         return self._keyframes.coverage(map_from_camera, self._camera)

@@ -84,8 +84,8 @@ class CoordinateFrames:
                                                         np.array(mount[3:])))
         return self.lookup(camera_frame, base_frame, stamp, timeout_s)
 
-    def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float
-               ) -> NDArray[np.float64]:
+    def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float,
+               remedy: str = 'set base_from_camera') -> NDArray[np.float64]:
         """Return target_from_source (4, 4) by tf2 at a stamp.
 
         Parameters
@@ -94,6 +94,8 @@ class CoordinateFrames:
         stamp : Time
         timeout_s : float
             How long to wait for it [s].
+        remedy : str
+            What helps besides publishing it.
 
         Raises
         ------
@@ -107,7 +109,7 @@ class CoordinateFrames:
         except Exception as error:  # tf2 has a type for each cause
             raise NoTransformError(
                 f"no transform from '{source_frame}' to '{target_frame}': {error}; publish it, or "
-                'set base_from_camera') from error
+                f'{remedy}') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 

@@ -29,7 +29,7 @@ from cliploc_ros.units import NS_PER_S
 LINGER_S = 1.0
 _CHECK_PERIOD_S = 0.5
 # Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
-# detector.
+# detector, and every n-th of larger ones.
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
@@ -91,7 +91,8 @@ class FrameSource:
         self._linger_s = linger_s
         self._on_frame = on_frame
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
-                                      'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING)
+                                      'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
+                                     'image', 'detections')
         self._changed = threading.Condition()
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
@@ -251,11 +252,19 @@ class FrameSource:
                    if self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
+        if self._pairing.outrun:
+            return (f'detections come {self._pairing.outrun} images late, and memory holds '
+                    f'{_MAX_IMAGE_BYTES // 2**20} MiB of images: use smaller images, '
+                    'image_transport compressed, or a faster detector')
+        newest = self._newest
+        if newest is not None and newest.detected_at >= since:
+            late_s = newest.detected_at - newest.received_at
+            return (f'detections come {late_s:.1f} s after their image: choose a faster profile '
+                    'or a smaller detector, or raise timeout_s')
         stamps = ', '.join(f'{self._resolved(name)} {stamp / NS_PER_S:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
         return (f'stamps never match (last: {stamps}): camera_info and detections must carry '
-                "their image's header; if detections are late, the detector is too slow for "
-                'timeout_s')
+                "their image's header, and within timeout_s")
 
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)

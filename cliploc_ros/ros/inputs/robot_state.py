@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the robot knows besides its image: the camera's mount, the vertical and odometry."""
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _LOG_PERIOD_S = 5.0
+_RETRY_S = 0.02
 # Time for a publisher of odometry that has just been discovered to deliver its first message.
 _DISCOVERY_S = 1.0
 
@@ -111,7 +113,8 @@ class RobotStateSource:
         return (self._node.settings['fuse_frames'] > 1
                 and self.odometry.covers_soon(stamp, patience_s))
 
-    def at(self, image: Header, values: Mapping[str, Any]) -> RobotState:
+    def at(self, image: Header, values: Mapping[str, Any], deadline: float = math.inf
+           ) -> RobotState:
         """Return the robot's state at the stamp of an image.
 
         Without a vertical, or without odometry, the search does without.
@@ -122,17 +125,35 @@ class RobotStateSource:
             Of the image.
         values : mapping
             The relocalizer's parameters.
+        deadline : float
+            Of the request (monotonic clock) [s]; half of the time until then may pass while the
+            mount is not known, and half remains for a newer image.
 
         Raises
         ------
         NoTransformError
             The mount is not known.
         """
-        camera_from_base = self.transforms.camera_from_base(
-            values['base_frame'], values['base_from_camera'], image.frame_id, image.stamp,
-            values['tf_timeout_s'])
+        camera_from_base = self._mount(image, values, deadline)
         return RobotState(camera_from_base, self._up(image, values, camera_from_base),
                           self._place(image, values, camera_from_base))
+
+    def _mount(self, image: Header, values: Mapping[str, Any], deadline: float
+               ) -> NDArray[np.float64]:
+        now = time.monotonic()
+        slice_s: float = values['tf_timeout_s']
+        until = now + slice_s if math.isinf(deadline) else 0.5 * (now + deadline)
+        while True:
+            wait_s = min(slice_s, max(0.0, until - time.monotonic()))
+            try:
+                return self.transforms.camera_from_base(
+                    values['base_frame'], values['base_from_camera'], image.frame_id, image.stamp,
+                    wait_s)
+            except NoTransformError:
+                if time.monotonic() + _RETRY_S > until:
+                    raise
+                self._node.check_active()
+                time.sleep(_RETRY_S)
 
     def _up(self, image: Header, values: Mapping[str, Any],
             camera_from_base: NDArray[np.float64]) -> NDArray[np.float64] | None:

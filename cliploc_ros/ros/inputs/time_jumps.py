@@ -18,8 +18,6 @@ from cliploc_ros.units import NS_PER_S
 
 # Stamps may be so much ahead of /clock, which comes at 10 Hz or more (a guess).
 _MAX_AHEAD_NS = NS_PER_S // 5
-# After a jump, transforms may take this long to cover the stamp of an image (a guess).
-_SETTLING_S = 2.0
 # DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
 _MAX_DISORDER_NS = NS_PER_S
 
@@ -77,11 +75,6 @@ class TimeJumps:
         if received_at <= jump.seen_at or (self._clock.ros_time_is_active
                                            and ahead_ns > _MAX_AHEAD_NS):
             raise TimeJumpError(f'{jump.name}: the frame is from before')
-
-    @property
-    def is_settling(self) -> bool:
-        """Return whether a jump is so recent that transforms may still be missing."""
-        return time.monotonic() < self._last.seen_at + _SETTLING_S
 
     def close(self) -> None:
         """Watch the clock no longer."""

@@ -19,6 +19,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.time_jumps import StampOrder
 
 SOURCES = ('none', 'base_frame', 'imu')
 _UP = np.array([0.0, 0.0, 1.0])
@@ -112,6 +113,7 @@ class VerticalSource:
         self._transforms = transforms
         self._lock = threading.Lock()
         self._samples: deque[Sample] = deque(maxlen=_MAX_SAMPLES)
+        self._stamps = StampOrder()
         self._imu_frame = ''
         self._newest_is_empty = False
         self._subscription: AdaptiveSubscription | None = None
@@ -132,6 +134,7 @@ class VerticalSource:
         """Forget all samples: time jumped."""
         with self._lock:
             self._samples.clear()
+            self._stamps.clear()
 
     def take(self, msg: Imu) -> None:
         """Take in a message of the IMU."""
@@ -140,8 +143,8 @@ class VerticalSource:
             self._newest_is_empty = sample is None
             if sample is None:
                 return
-            if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns:
-                self._samples.clear()  # time jumped back
+            if self._stamps.goes_back('imu', sample.stamp_ns):
+                self._samples.clear()
             self._samples.append(sample)
             self._imu_frame = msg.header.frame_id
 

@@ -56,10 +56,13 @@ class ManagedNode(LifecycleNodeMixin, Node):
         Its parameters, `autostart` among them.
     check : callable
         Takes all values by name; raises OptionsError where they do not fit together.
+    others : iterable of ParameterRow
+        Of the nodes that may be given the same file.
     """
 
     def __init__(self, name: str, table: Iterable[ParameterRow],
-                 check: Callable[[Mapping[str, Value]], object]) -> None:
+                 check: Callable[[Mapping[str, Value]], object],
+                 others: Iterable[ParameterRow] = ()) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         LifecycleNodeMixin.__init__(
             self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
@@ -67,7 +70,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         _PACKAGE_LOGGER.setLevel(logging.INFO)
         _PACKAGE_LOGGER.addHandler(self._log_handler)
         self.worker = Worker(self.report)
-        self.settings = NodeParameters(self, table, check)
+        self.settings = NodeParameters(self, table, check, others)
         self.active = False
         self._transition = threading.Lock()
         self._failure = ''

@@ -140,17 +140,20 @@ class NodeParameters:
     table : iterable of ParameterRow
     check : callable
         Takes all values by name; raises OptionsError where they do not fit together.
+    others : iterable of ParameterRow
+        Of the nodes that may be given the same file.
     """
 
     def __init__(self, node: Node, table: Iterable[ParameterRow],
-                 check: Callable[[Mapping[str, Value]], object]) -> None:
+                 check: Callable[[Mapping[str, Value]], object],
+                 others: Iterable[ParameterRow] = ()) -> None:
         self._node = node
         self._rows = {row.name: row for row in table}
         self._check = check
         self._problems: dict[str, str] = {}
         for row in self._rows.values():
             self._declare(row)
-        self._report_unknown()
+        self._report_unknown({row.name for row in others})
         # Replaced as a whole: a reader sees all of a change or none of it.
         self._values: dict[str, Value] = {
             name: node.get_parameter(name).value for name in self._rows}
@@ -189,10 +192,10 @@ class NodeParameters:
                 self._problems[row.name] = f'{error}; {remedy}'
         self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
 
-    def _report_unknown(self) -> None:
-        """Warn of parameters that no row declares: most are typing errors."""
+    def _report_unknown(self, others: set[str]) -> None:
+        """Warn of parameters that no row of any node declares: most are typing errors."""
         for name in self._node.get_parameters_by_prefix(''):
-            if (name in self._rows or name in _FOREIGN_NAMES
+            if (name in self._rows or name in others or name in _FOREIGN_NAMES
                     or name.startswith(_FOREIGN_PREFIXES)):
                 continue
             nearest = difflib.get_close_matches(name, self._rows, 1)

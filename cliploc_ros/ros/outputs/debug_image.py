@@ -63,6 +63,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
         for match, outline in zip(found.matches, outlines, strict=True):
             if np.isfinite(outline).all():
                 points = seen.observation.camera.project_normalized(outline_points(outline))
+                points = points[np.isfinite(points).all(axis=1)]
                 cv2.polylines(canvas, [_pixels(points).reshape(-1, 1, 2)], True, _ELLIPSE, 2,
                               cv2.LINE_AA)
             label = landmark_map.labels[match.landmark][:_LABEL_CHARS]

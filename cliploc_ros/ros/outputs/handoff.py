@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Handing an accepted pose over to a running localizer: AMCL, or another with `initialpose`."""
+"""Handing an accepted pose over to a running localizer: AMCL, or another with `initialpose`.
+
+`initialpose` is volatile, so the publisher may have met a subscription that has not met it yet,
+and DDS takes a localizer that was killed or hangs for alive. So only the pose that the localizer
+shows tells whether it has taken one.
+"""
 
 import math
 import threading
@@ -13,16 +18,19 @@ import numpy as np
 from builtin_interfaces.msg import Time as Stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.time import Time
 from std_srvs.srv import Empty
 
-from cliploc_ros.core.geometry.tolerances import SAME_SPOT
+from cliploc_ros.core.geometry.tolerances import SAME_SPOT, TAKEN, Tolerance
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
@@ -32,8 +40,13 @@ _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
 _MAX_ODOM_AGE_S = 2.0
 # How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
-# How long to wait for a subscriber of initialpose; discovery of a running one takes less.
-_SUBSCRIBER_PATIENCE_S = 2.0
+# How long to wait for a localizer; discovery of a running one takes less.
+_LOCALIZER_PATIENCE_S = 2.0
+_POLL_S = 0.1
+# AMCL shows a new pose after its next scan. One that it does not show by then was lost.
+_REPEAT_S = 1.0
+# With less time left, a pose that the localizer takes could not be told from one that it does not.
+_LEAST_S = 0.5
 # AMCL updates with its next scan; two calls before that count as one. Scans come at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
 _UPDATE_PATIENCE_S = 2.0
@@ -44,7 +57,7 @@ class HandOffError(CliplocError):
 
 
 class NoLocalizerError(HandOffError):
-    """Nobody subscribes `initialpose`: another pose would not help."""
+    """There is no localizer, or it does not take the pose: another pose would not help."""
 
 
 class HandOff:
@@ -63,18 +76,40 @@ class HandOff:
         self._changed = threading.Condition()
         self._stopped = threading.Event()
         self._jumped_at = -math.inf
+        # What the localizer shows since the pose was last published.
+        self._shown: PoseWithCovarianceStamped | None = None
+        self._pose_topic = ''
+        self._subscription: AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
             PoseWithCovarianceStamped, 'initialpose', qos.POSE,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self._wake()))
         self._updater = node.create_client(Empty, 'request_nomotion_update',
                                            callback_group=ReentrantCallbackGroup())
 
-    def open(self) -> None:
-        """Allow hand-overs."""
+    def open(self, pose_topic: str) -> None:
+        """Allow hand-overs.
+
+        Parameters
+        ----------
+        pose_topic : str
+            Where the localizer shows its pose; empty: nowhere.
+        """
         self._stopped.clear()
+        if pose_topic:
+            self._pose_topic = str(self._node.resolve_topic_name(pose_topic))
+            # Volatile: what a localizer showed before does not come late.
+            self._subscription = AdaptiveSubscription(
+                self._node, PoseWithCovarianceStamped, pose_topic, self._hear, qos.POSE)
+
+    def close(self) -> None:
+        """End the hand-over under way, and listen no more."""
+        self.stop()
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
 
     def stop(self) -> None:
-        """End the hand-over under way: the node is deactivated."""
+        """End the hand-over under way."""
         self._stopped.set()
         self._wake()
 
@@ -84,14 +119,19 @@ class HandOff:
 
     def missing(self) -> str:
         """Return that there is no localizer, and what to do; empty if there is one."""
-        if self._publisher.get_subscription_count():
-            return ''
-        return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL), or '
-                'set require_localizer: false')
+        if not self._publisher.get_subscription_count():
+            return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL), '
+                    'or set require_localizer: false')
+        if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
+            return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL), or name '
+                    'the topic of its pose by localizer_pose')
+        return ''
 
     def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
                   deadline: float, received_at: float) -> None:
-        """Publish a pose on `initialpose`, and return when the localizer had time to settle.
+        """Publish a pose on `initialpose` until the localizer shows it, and let it settle.
+
+        A localizer that shows the pose is not reset again.
 
         Parameters
         ----------
@@ -108,11 +148,11 @@ class HandOff:
         Raises
         ------
         HandOffError
-            The robot moves or may do so, or has moved since its image; nothing was published.
+            The robot moves or may do so, or has moved since its image.
         NoLocalizerError
-            Nobody subscribes `initialpose`; nothing was published.
+            There is no localizer, or it does not show the pose.
         TimeJumpError
-            Time has jumped back since; nothing was published.
+            Time has jumped back since.
         """
         if not values['base_frame']:
             self._node.get_logger().warning(
@@ -120,26 +160,68 @@ class HandOff:
                 "AMCL's base_frame_id", once=True)
         if values['require_localizer']:
             self._wait_for_localizer(deadline)
-        self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
-        self._check_place(pose.header.stamp, deadline)
-        if self._jumped_at >= received_at:
-            raise TimeJumpError('time jumped back before the hand-over: the pose is from before')
-        if self._stopped.is_set():
-            raise HandOffError('the node was deactivated during the hand-over')
-        self._publisher.publish(usable_pose(pose, self._node.get_clock().now()))
+        must_show = values['require_localizer'] and self._subscription is not None
+        given, times, begun_at = pose, 0, time.monotonic()
+        while not times or (must_show and not self._shows(given, deadline)):
+            if must_show and _left_s(deadline) < _LEAST_S:
+                raise NoLocalizerError(self._not_taken(given, times, begun_at))
+            self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
+            self._check_place(pose.header.stamp, deadline)
+            if self._jumped_at >= received_at:
+                raise TimeJumpError('time jumped back before the hand-over: the pose is from '
+                                    'before')
+            if self._stopped.is_set():
+                raise HandOffError('the node was deactivated during the hand-over')
+            given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
+            self._shown = None
+            self._publisher.publish(given)
         self._settle(values['nomotion_updates'], deadline)
+        if must_show and not is_taken(given, self._shown):
+            raise NoLocalizerError(self._not_taken(given, times, begun_at))
 
     def _wake(self) -> None:
         with self._changed:
             self._changed.notify_all()
 
-    def _wait_for_localizer(self, deadline: float) -> None:
-        """Raise unless somebody subscribes `initialpose`, or soon does."""
+    def _hear(self, shown: PoseWithCovarianceStamped) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._stopped.is_set() or not self.missing(),
-                                   min(_SUBSCRIBER_PATIENCE_S, _left_s(deadline)))
-        if missing := self.missing():
-            raise NoLocalizerError(missing)
+            self._shown = shown
+            self._changed.notify_all()
+
+    def _wait_for_localizer(self, deadline: float) -> None:
+        """Raise unless there is a localizer, or soon is."""
+        until = min(time.monotonic() + _LOCALIZER_PATIENCE_S, deadline)
+        while (missing := self.missing()) and not self._stopped.is_set():
+            if not _left_s(until):
+                raise NoLocalizerError(missing)
+            with self._changed:
+                self._changed.wait(min(_POLL_S, _left_s(until)))
+
+    def _shows(self, given: PoseWithCovarianceStamped, deadline: float) -> bool:
+        """Return whether the localizer shows a pose, or soon does."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._stopped.is_set() or is_taken(given, self._shown),
+                min(_REPEAT_S, _left_s(deadline)))
+            return is_taken(given, self._shown)
+
+    def _not_taken(self, given: PoseWithCovarianceStamped, times: int, begun_at: float) -> str:
+        """Return what the localizer shows in place of a pose."""
+        shown, why = self._shown, 'the localizer did not take the pose: '
+        if not times:
+            return 'too little time is left to see whether the localizer takes the pose: ask again'
+        if shown is None:
+            return (f'{why}{self._pose_topic} shows nothing since initialpose was published '
+                    f'{times} times in {time.monotonic() - begun_at:.0f} s: see whether the '
+                    'localizer is active and hears scans')
+        frames = [one.header.frame_id.lstrip('/') for one in (shown, given)]
+        if frames[0] != frames[1]:
+            return (f"{why}{self._pose_topic} is in frame '{frames[0]}', the pose in "
+                    f"'{frames[1]}': correct the map's frame_id")
+        distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
+        near = tolerance_of(given)
+        return (f'{why}{self._pose_topic} shows a pose {distance_m:.2f} m and {angle_deg:.0f} '
+                f'degrees from it (limits {near.distance_m:.2f} and {near.angle_deg:.0f})')
 
     def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""
@@ -174,16 +256,14 @@ class HandOff:
 
         AMCL would move the pose on by tf, robot_localization's set_pose does not.
         """
-        patience_s = min(_ODOM_PATIENCE_S, _left_s(deadline)) if self._odometry.is_published \
-            else 0.0
-        moved = self._odometry.moved_since(stamp, patience_s)
-        if moved is None:
-            if self._odometry.is_published:
-                raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has '
-                                   'moved since its image: stamp both by one clock, send at 1 Hz '
-                                   'or more; ask again')
-            return
-        distance_m, angle_deg = moved
+        is_published = self._odometry.is_published
+        moved = self._odometry.moved_since(
+            stamp, min(_ODOM_PATIENCE_S, _left_s(deadline)) if is_published else 0.0)
+        if moved is None and is_published:
+            raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has moved '
+                               'since its image: stamp both by one clock, send at 1 Hz or more; '
+                               'ask again')
+        distance_m, angle_deg = moved or (0.0, 0.0)
         if distance_m > SAME_SPOT.distance_m or angle_deg > SAME_SPOT.angle_deg:
             raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
                                f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
@@ -196,9 +276,8 @@ class HandOff:
         """
         for _ in range(updates):
             if (not self._updater.service_is_ready() or _left_s(deadline) < _UPDATE_PERIOD_S
+                    or not self._update(min(_UPDATE_PATIENCE_S, _left_s(deadline)))
                     or self._stopped.wait(_UPDATE_PERIOD_S)):
-                return
-            if not self._update(min(_UPDATE_PATIENCE_S, _left_s(deadline))):
                 return
 
     def _update(self, timeout_s: float) -> bool:
@@ -219,6 +298,30 @@ class HandOff:
 def _left_s(deadline: float) -> float:
     """Return how long it is until a moment of the monotonic clock, at least 0 [s]."""
     return max(0.0, deadline - time.monotonic())
+
+
+def is_taken(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped | None) -> bool:
+    """Return whether a localizer that shows a pose has taken a given one."""
+    return (shown is not None
+            and shown.header.frame_id.lstrip('/') == given.header.frame_id.lstrip('/')
+            and tolerance_of(given).agree(_planar(given), _planar(shown)))
+
+
+def tolerance_of(given: PoseWithCovarianceStamped) -> Tolerance:
+    """Return how far from a given pose a localizer may show it."""
+    covariance = np.array(given.pose.covariance).reshape(6, 6)
+    variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return TAKEN.wider(3.0 * math.sqrt(variance), math.degrees(3.0 * math.sqrt(covariance[5, 5])))
+
+
+def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
+    """Return x, y and yaw of a pose as a transform (4, 4), which is all that AMCL takes of it."""
+    p, q = msg.pose.pose.position, msg.pose.pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    planar = np.eye(4)
+    planar[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    planar[:2, 3] = p.x, p.y
+    return planar
 
 
 def speeds(odometry: Odometry) -> tuple[float, float]:

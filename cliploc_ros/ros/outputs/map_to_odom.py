@@ -19,6 +19,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 
 # Between broadcasts. Each is dated ahead to the next one, so that a lookup at now need not wait.
 _PERIOD_S = 0.1
@@ -89,8 +90,6 @@ class MapToOdom:
                received_at: float) -> None:
         """Take in where the robot was; does nothing while closed.
 
-        Nor does it if time has jumped or odometry has restarted since.
-
         Parameters
         ----------
         header : Header
@@ -105,16 +104,20 @@ class MapToOdom:
         ------
         NoTransformError
             The robot's place by odometry is unknown; the former transform stays.
+        TimeJumpError
+            Time has jumped or odometry has restarted since the image.
         """
         if self._timer is None:
             return
         base_from_odom = self._transforms.lookup(values['base_frame'], values['odom_frame'],
-                                                 header.stamp, values['tf_timeout_s'])
+                                                 header.stamp, values['tf_timeout_s'],
+                                                 'correct odom_frame')
         transform = transform_msg(header, values['odom_frame'], map_from_base @ base_from_odom)
         with self._lock:
-            if (received_at > self._jumped_at
-                    and stamp_ns(header.stamp) >= self._began_ns):
-                self._transform = transform
+            if received_at <= self._jumped_at or stamp_ns(header.stamp) < self._began_ns:
+                raise TimeJumpError('odometry restarted or time jumped since the image: the pose '
+                                    'is from before')
+            self._transform = transform
 
     def _broadcast(self) -> None:
         with self._lock:

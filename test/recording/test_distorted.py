@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's walks through a lens with strong distortion: the programs, from recording to pose."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.build_map import main as build_map
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_recorded
+from cliploc_ros.demo.truth import read_objects
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.views import make_views
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
+# That of the TUM sequences fr1.
+LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
+              (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+
+
+def bend(source, folder):
+    """Write a walk of the demo as a camera with the lens takes it."""
+    shutil.copytree(source, folder)
+    pixels = np.stack(np.meshgrid(np.arange(LENS.width), np.arange(LENS.height)), axis=-1)
+    straight = json.loads((folder / 'camera.json').read_text())
+    places = Camera(**straight).project_normalized(LENS.normalize_points(pixels.reshape(-1, 2)))
+    places = places.reshape(LENS.height, LENS.width, 2).astype(np.float32)
+    for file in (folder / 'rgb').iterdir():
+        image = cv2.remap(cv2.imread(str(file)), places, None, cv2.INTER_LINEAR)
+        assert cv2.imwrite(str(file), image)
+    (folder / 'camera.json').write_text(json.dumps({
+        'width': 640, 'height': 480, 'fx': LENS.fx, 'fy': LENS.fy, 'cx': LENS.cx, 'cy': LENS.cy,
+        'distortion_model': LENS.distortion_model, 'd': LENS.distortion}))
+    return folder
+
+
+def arguments(*parts):
+    return [*map(str, parts)]
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('bent')
+
+
+@pytest.fixture(scope='module')
+def recorded(folder):
+    """The observations of the walk for mapping; its map lies next to them."""
+    bend(ASSETS / 'mapping', folder / 'mapping')
+    assert build_map(arguments('--tum', folder / 'mapping', *NETWORKS, '--no-clip', '--out',
+                               folder / 'map.yaml', '--record-to', folder / 'mapping.npz')) == 0
+    return load_recorded(folder / 'mapping.npz').detections
+
+
+def landmarks_off(file):
+    """Return how far the landmarks of a map lie from the nearest object of their class [m]."""
+    objects, built = read_objects(ASSETS / 'mapping'), LandmarkMap.from_file(file)
+    return np.array([min(np.linalg.norm(one.center - center) for one in objects
+                         if one.class_id == class_id)
+                     for center, class_id in zip(built.centers, built.class_ids, strict=True)])
+
+
+def test_a_folder_gives_the_map_of_the_room(recorded, folder):
+    off = landmarks_off(folder / 'map.yaml')
+    assert len(off) > 50 and (off < 0.1).mean() > 0.95, off
+    assert recorded.camera == Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+
+
+def test_an_edge_at_the_border_of_the_image_is_open(recorded):
+    """The lens moves the border inwards: such an edge measures no object."""
+    views = make_views(recorded, MappingOptions())
+    assert views.is_open.any(axis=0).all() and 0.02 < views.is_open.mean() < 0.1
+    left, top, right, bottom = views.bounds * LENS.fx + (319.5, 239.5, 319.5, 239.5)
+    assert 5 < left < 30 and 3 < top < 30 and 610 < right < 635 and 450 < bottom < 477
+    again = make_views(recorded.select_frames(range(5)), MappingOptions())
+    assert (again.is_open == views.is_open[:len(again.is_open)]).all()
+
+
+def test_a_recording_is_localized_in_the_map_of_the_room(folder):
+    bend(ASSETS / 'sequence', folder / 'sequence')
+    assert tum_to_bag(arguments(folder / 'sequence', folder / 'bag')) == 0
+    assert evaluate(arguments(
+        '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-model',
+        ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods',
+        'auto', '--trials', 1, '--workers', 1, '--no-figures', '--out', folder / 'out')) == 0
+    results = json.loads((folder / 'out/results.json').read_text())
+    right = [one['solved'] and one['error_m'] < 0.5 for one in results]
+    accepted = [one['accepted'] for one in results]
+    assert np.mean(right) > 0.9 and np.mean(accepted) > 0.9
+    assert all(one['error_m'] < 1.0 for one in results if one['accepted'])
