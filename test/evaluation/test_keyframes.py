@@ -215,6 +215,17 @@ def test_a_smaller_picture_of_the_place_shows_by_its_focal_length(layer, kitchen
     assert abs(np.log(place.focal_ratio)) > 3.0 * place.focal_deviation
 
 
+def test_a_picture_seen_from_the_side_shows_by_its_aspect(layer, kitchen, queries):
+    frame, mapped = queries[0], next(kitchen.select([27]).read())
+    picture = make_picture('warped', 0.3, frame.camera, mapped.image_rgb, frame.camera,
+                           np.random.default_rng(1))
+    image = hang(np.full_like(frame.image_rgb, 128), picture, frame.camera, np.eye(4))
+    place = KeyframeLocalizer(layer).localize(image, frame.camera).places[0]
+    assert place.inliers > 20
+    assert place.aspect_ratio < 0.95
+    assert abs(np.log(place.aspect_ratio)) > 3.0 * place.aspect_deviation
+
+
 def test_the_office_is_triangulated_without_depth(office, room, answer):
     layer = build_layer(office.select(range(0, 17, 2)), room, EVERY)
     assert (np.diff(layer.offsets) > 100).all()

@@ -42,15 +42,19 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
 NOTHING_KNOWN = Prior()
-# Cells of the image (columns, rows), and how many points and features make one comparable.
+# Cells of the image (columns, rows), and how many points of keyframes and features of the image make
+# one comparable: it has half of the features of a keyframe.
 _CELLS = (8, 6)
-_LEAST_IN_CELL = 4
+_LEAST_EXPECTED, _LEAST_SEEN = 4, 2
 # Of what lies across an image, the part that counts: a few wrong matches lie anywhere [%].
 _MOST = (5.0, 95.0)
 # Points near each other share errors, and several keyframes have the same point: so many times as
 # large as those of as many independent points are the errors of poses and focal lengths. Of 570
 # right poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
 _MUCH_ALIKE = 4.5
+# A rolling shutter stretches the image of a camera that turns: deviations of the logarithms of the
+# focal length and its aspect.
+_STRETCHED = (0.005, 0.01)
 # Errors that all points of a keyframe share: of its pose, and of its points, which matter the
 # more the further the image is from the keyframe. Chosen on the kitchen, see the study.
 _KEYFRAME_M, _KEYFRAME_RAD, PER_RADIAN = 0.012, np.radians(0.45), 0.04
@@ -134,11 +138,12 @@ class KeyframeLocalizer:
         """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
-        features, bearings = _select(features, known), bearings[known]
+        features = Features(features.pixels[known], features.descriptors[known],
+                            features.strengths[known])
         if len(features) < LEAST_INLIERS:
             return Recognition()
         descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings, camera, prior)
+        look = _Look(features, bearings[known], camera, prior)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
@@ -167,12 +172,12 @@ class KeyframeLocalizer:
         used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
+        evidence = (*self._confirmed(place, look, used), *_focal(place, look, used))
         return RecognizedPlace(
-            pose, covariance, shared, place.agreed, *self._confirmed(place, look, used),
-            *_focal(place, look, used), look.prior.tilt_error(pose, covariance),
-            tuple(used.tolist()), tuple((counts[used] / counts.sum()).tolist()),
-            look.features.pixels[place.inliers.features], place.inliers.rows,
-            place.inliers.points)
+            pose, covariance, shared, place.agreed, *evidence,
+            look.prior.tilt_error(pose, covariance), tuple(used.tolist()),
+            tuple((counts[used] / counts.sum()).tolist()),
+            look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""
@@ -220,7 +225,7 @@ class KeyframeLocalizer:
         from cell to cell (a geometric distribution), the extent, and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)
-        comparable = (seen >= _LEAST_IN_CELL) & self._expects(used, place.map_from_camera,
+        comparable = (seen >= _LEAST_SEEN) & self._expects(used, place.map_from_camera,
                                                               look.camera)
         count = int(comparable.sum())
         if not count:
@@ -239,7 +244,7 @@ class KeyframeLocalizer:
         """Return in which cells of an image the first of some keyframes expect points."""
         counts = [_count(_project(self.layer.points_in_map(one), pose, camera), camera)
                   for one in keyframes[:_SIMILAR].tolist()]
-        return np.max(counts, axis=0, initial=0) >= _LEAST_IN_CELL
+        return np.max(counts, axis=0, initial=0) >= _LEAST_EXPECTED
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the errors that points of a keyframe share."""
@@ -285,19 +290,17 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Pl
                   _count(look.features.pixels[features], look.camera))
 
 
-def _focal(place: _Place, look: _Look, used: NDArray[np.int64]) -> tuple[float, float, int]:
-    """Return the ratio of focal lengths, its deviation, and how many features agree with it."""
+def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
+           ) -> tuple[float, float, float, float, int]:
+    """Return focal length and aspect, with deviations, and how many features agree with them."""
     among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
     found = free_focal(among.points, look.bearings[among.features],
                        invert_transform(place.map_from_camera))
     if found is None:
-        return 1.0, np.inf, 0
-    ratio, deviation, inliers = found
-    return ratio, _MUCH_ALIKE * deviation, len(np.unique(among.features[inliers]))
-
-
-def _select(features: Features, rows: NDArray[np.bool_]) -> Features:
-    return Features(features.pixels[rows], features.descriptors[rows], features.strengths[rows])
+        return 1.0, np.inf, 1.0, np.inf, 0
+    (ratio, aspect), inliers = np.exp(found[0]), found[2]
+    deviation, of_aspect = np.hypot(_MUCH_ALIKE * found[1], _STRETCHED)
+    return ratio, deviation, aspect, of_aspect, len(np.unique(among.features[inliers]))
 
 
 def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:

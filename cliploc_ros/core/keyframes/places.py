@@ -34,8 +34,10 @@ class RecognizedPlace(NamedTuple):
         The focal length that the points suggest as a multiple of the camera's, and its relative
         standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
         wrong intrinsics, and a picture of the place of another size, suggest another one.
+    aspect_ratio, aspect_deviation : float
+        The same of the root of its aspect, x to y: a picture that is seen from the side is narrow.
     focal_inliers : int
-        Number of features that agree under that focal length.
+        Number of features that agree under that focal length and aspect.
     tilt_error : float
         Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
         place: the vertical may be wrong, as with a wrong camera mount.
@@ -59,6 +61,8 @@ class RecognizedPlace(NamedTuple):
     cells: tuple[int, int] = (0, 0)
     focal_ratio: float = 1.0
     focal_deviation: float = np.inf
+    aspect_ratio: float = 1.0
+    aspect_deviation: float = np.inf
     focal_inliers: int = 0
     tilt_error: float = 0.0
     keyframes: tuple[int, ...] = ()

@@ -20,8 +20,10 @@ _SURE = 0.9999
 # the focal length by more.
 _STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-5, 0.3
 # Tolerances of the inliers, as multiples: for a pose of three points, and for one with a focal
-# length that may be half the true one. None is wrong by more than the ratio.
-_ROUGH, _WRONG_FOCAL, _MOST_RATIO = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), 10.0
+# length that may be half the true one. None is wrong by more than the logarithm.
+_ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.log(10.0)
+# Logarithms of the focal lengths of x and y, from those of both and of the aspect.
+_OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
 # Of a normal distribution: standard deviation divided by the median of absolute values.
@@ -82,15 +84,15 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
 def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
            camera_from_map: NDArray[np.float64]) -> PointPose | None:
     """Return a pose after least squares with Cauchy's weights; None with too few inliers."""
-    fit = _fit(points, bearings, _Fit(camera_from_map, 1.0, np.eye(6)), _ROUGH)
+    fit = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(6)), _ROUGH)
     return fit and PointPose(invert_transform(fit[0].camera_from_map), fit[1],
                              _about_map_axes(fit[0]))
 
 
 def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
                camera_from_map: NDArray[np.float64]
-               ) -> tuple[float, float, NDArray[np.int64]] | None:
-    """Return the focal length that fits points best; None with too few of them.
+               ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]] | None:
+    """Return the focal lengths that fit points best; None with too few of them.
 
     Points that the given focal length keeps from agreeing count, too: the tolerance falls step by
     step. Under a focal length that is half or twice the true one, a pose has but a few of them.
@@ -106,39 +108,45 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
     Returns
     -------
-    ratio, deviation : float
-        As a multiple of the given one, and its relative standard deviation, from the features'
-        deviations alone.
+    logarithms, deviations : ndarray (2,)
+        Of the focal length as a multiple of the given one and of its aspect, x to y: the root of
+        the quotient. Their standard deviations, from those of the features alone.
     inliers : ndarray (k,) of int
         Rows of the points that agree.
     """
-    fit = _fit(points, bearings, _Fit(camera_from_map, 1.0, np.eye(7)), _WRONG_FOCAL)
-    return fit and (fit[0].ratio, float(np.sqrt(np.linalg.inv(fit[0].information)[6, 6])), fit[1])
+    fit = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(8)), _WRONG_FOCAL)
+    return fit and (fit[0].logarithms,
+                    np.sqrt(np.diag(np.linalg.inv(fit[0].information))[6:]), fit[1])
 
 
 class _Fit(NamedTuple):
-    """A pose, a ratio of focal lengths, and their information.
+    """A pose, logarithms of the focal length and its aspect (2,), and the information.
 
-    It is of translation and rotation of the camera, and of the logarithm of the ratio if it is
-    (7, 7); with (6, 6) the ratio stays.
+    It is of translation and rotation of the camera, and of the logarithms if it is (8, 8); with
+    (6, 6) they stay.
     """
 
     camera_from_map: NDArray[np.float64]
-    ratio: float
+    logarithms: NDArray[np.float64]
     information: NDArray[np.float64]
+
+    @property
+    def ratios(self) -> NDArray[np.float64]:
+        """Return the focal lengths (2,) of x and y as multiples of the given ones."""
+        return np.exp(_OF_X_AND_Y @ self.logarithms)
 
 
 def _fit(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit,
          tolerances: tuple[float, ...]) -> tuple[_Fit, NDArray[np.int64]] | None:
     """Fit again and again, to the points within one tolerance after another; None with too few."""
     for tolerance in tolerances:
-        inliers = agreeing(points, bearings / fit.ratio, fit.camera_from_map, tolerance)
+        inliers = agreeing(points, bearings / fit.ratios, fit.camera_from_map, tolerance)
         if len(inliers) < LEAST_INLIERS:
             return None
         fit = _least_squares(points[inliers], bearings[inliers], fit)
-    inliers = agreeing(points, bearings / fit.ratio, fit.camera_from_map)
+    inliers = agreeing(points, bearings / fit.ratios, fit.camera_from_map)
     is_sound = np.isfinite(fit.information).all() and \
-        1.0 / _MOST_RATIO < fit.ratio < _MOST_RATIO and \
+        np.abs(fit.logarithms).max() < _MOST_LOGARITHM and \
         np.linalg.matrix_rank(fit.information) == len(fit.information)
     return (fit, inliers) if is_sound and len(inliers) >= LEAST_INLIERS else None
 
@@ -154,31 +162,29 @@ def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit) -> _Fit:
     """Return a fit after some steps of Gauss and Newton."""
-    camera_from_map, ratio, information = fit
     for _ in range(_STEPS):
-        inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+        inside = points @ fit.camera_from_map[:3, :3].T + fit.camera_from_map[:3, 3]
         x, y, z = inside.T
         z = np.maximum(z, 1e-3)
-        residuals = np.stack([x / z, y / z], axis=1) - bearings / ratio
-        deviation = max(_LEAST_DEVIATION,
-                        _FROM_MEDIAN * float(np.median(np.abs(residuals))))
         zero, one, u, v = np.zeros_like(z), 1.0 / z, x / z, y / z
-        # of the residuals times the ratio: else an endless ratio would fit best
-        by_x = np.stack([one, zero, -u / z, -u * v, 1.0 + u**2, -v, u], axis=1)
-        by_y = np.stack([zero, one, -v / z, -1.0 - v**2, u * v, u, v], axis=1)
-        jacobian = np.concatenate([by_x, by_y])[:, :len(information)] / deviation
+        residuals = np.stack([u, v], axis=1) - bearings / fit.ratios
+        deviation = max(_LEAST_DEVIATION, _FROM_MEDIAN * np.median(np.abs(residuals)))
+        # of the residuals times the focal length: else an endless one would fit best
+        by_x = np.stack([one, zero, -u / z, -u * v, 1.0 + u**2, -v, u, u], axis=1)
+        by_y = np.stack([zero, one, -v / z, -1.0 - v**2, u * v, u, v, -v], axis=1)
+        jacobian = np.concatenate([by_x, by_y])[:, :len(fit.information)] / deviation
         scaled = residuals / deviation
         weights = 1.0 / (1.0 + np.sum(scaled**2, axis=1) / 4.0)
         weighted = jacobian.T * np.tile(weights, 2)
         information = weighted @ jacobian
         step = -np.linalg.lstsq(information, weighted @ scaled.T.ravel(), rcond=None)[0]
-        step /= max(1.0, np.abs(step[6:]).sum() / _MOST_STEP)
-        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
-        camera_from_map = make_transform(turn, step[:3]) @ camera_from_map
-        ratio *= float(np.exp(step[6:].sum()))
+        step /= max(1.0, np.abs(step[6:]).max(initial=0.0) / _MOST_STEP)
+        moved = make_transform(Rotation.from_rotvec(step[3:6]).as_matrix(), step[:3])
+        fit = _Fit(moved @ fit.camera_from_map,
+                   fit.logarithms + np.append(step[6:], [0.0, 0.0])[:2], information)
         if np.abs(step).max() < _SMALL_STEP:
             break
-    return _Fit(camera_from_map, ratio, information)
+    return fit
 
 
 def _about_map_axes(fit: _Fit) -> NDArray[np.float64]:
