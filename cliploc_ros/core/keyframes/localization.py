@@ -46,8 +46,6 @@ NOTHING_KNOWN = Prior()
 # one comparable: it has half of the features of a keyframe.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
-# Of what lies across an image, the part that counts: a few wrong matches lie anywhere [%].
-_MOST = (5.0, 95.0)
 # Points near each other share errors, and several keyframes have the same point: so many times as
 # large as those of as many independent points are the errors of poses and focal lengths. Of 570
 # right poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
@@ -217,27 +215,21 @@ class KeyframeLocalizer:
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float, float, tuple[int, int]]:
-        """Return which part of the image has inliers, of that where keyframes expect some.
+                   ) -> tuple[float, float, tuple[int, int]]:
+        """Return which cells have inliers, of those where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The values are
-        the share of cells, the one that is expected of so many inliers, whose density varies much
-        from cell to cell (a geometric distribution), the extent, and the numbers of cells.
+        the share, the one that is expected of so many inliers, whose density varies much from
+        cell to cell (a geometric distribution), and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_SEEN) & self._expects(used, place.map_from_camera,
                                                               look.camera)
         count = int(comparable.sum())
         if not count:
-            return 0.0, 0.0, 0.0, (0, 0)
+            return 0.0, 0.0, (0, 0)
         confirmed = int(np.count_nonzero(place.cells[comparable]))
-        pixels = look.features.pixels
-        reached = np.ptp(np.percentile(pixels[place.inliers.features], _MOST, axis=0), axis=0)
-        there = pixels[comparable[_cells_of(pixels, look.camera)]]
-        extent = float(np.max(reached / np.maximum(
-            np.ptp(np.percentile(there, _MOST, axis=0), axis=0), 1.0)))
-        return (confirmed / count, place.agreed / (count + place.agreed), min(1.0, extent),
-                (confirmed, count))
+        return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
@@ -332,12 +324,7 @@ def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
     """Return how many pixels (m, 2) lie in each cell of the image."""
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    return np.bincount(_cells_of(pixels[inside], camera), minlength=_CELLS[0] * _CELLS[1])
-
-
-def _cells_of(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
-    """Return the number of the cell of each pixel (m, 2) in the image."""
-    last = np.array(_CELLS) - 1
-    place = (pixels * np.array(_CELLS) / (camera.width, camera.height)).astype(np.int64)
-    columns, rows = np.clip(place, 0, last).T
-    return np.asarray(rows * _CELLS[0] + columns)
+    columns, rows = _CELLS
+    place = (pixels[inside] * (columns / camera.width, rows / camera.height)).astype(np.int64)
+    place = np.minimum(place, (columns - 1, rows - 1))
+    return np.bincount(place[:, 1] * columns + place[:, 0], minlength=columns * rows)

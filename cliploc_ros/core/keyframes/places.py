@@ -23,10 +23,6 @@ class RecognizedPlace(NamedTuple):
         Share of the comparable cells of the image that show what the keyframes have there.
     expected : float
         The share that so many inliers would confirm if they were spread as usual: 0 to 1.
-    extent : float
-        How far the inliers reach across the image, as a share of what is comparable: 0 to 1, in
-        width or in height, whichever is more. Those in a picture of the place end with it, those
-        beside something that covers the place do not.
     cells : tuple of int
         Number of cells that confirm, and of those that are comparable: the keyframes expect points
         there, and the image has features.
@@ -57,7 +53,6 @@ class RecognizedPlace(NamedTuple):
     inliers: int
     confirmed: float
     expected: float
-    extent: float = 1.0
     cells: tuple[int, int] = (0, 0)
     focal_ratio: float = 1.0
     focal_deviation: float = np.inf
