@@ -44,9 +44,13 @@ class Genuine(NamedTuple):
     """Log odds that a recognized place is there, and no picture of it."""
 
     none: float
+    points: float
     confirmed: float
-    extent: float
     focal: float
+    aspect: float
+    reach: float
+    unexplained: float
+    rival: float
     most_motion: float
 
 

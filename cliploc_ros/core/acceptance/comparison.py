@@ -24,12 +24,12 @@ from cliploc_ros.core.acceptance.candidates import (
     unrefined,
 )
 from cliploc_ros.core.acceptance.confidence import (
-    chance_genuine,
     confidences,
     none_right,
     objects_utility,
     points_utility,
 )
+from cliploc_ros.core.acceptance.genuine import Signs, chance_genuine, signs_of
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
@@ -46,10 +46,9 @@ from cliploc_ros.core.fit.finalists import (
 )
 from cliploc_ros.core.fit.fusion import fuse
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
-from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.joined_map import Place, place_of
-from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.search.frame_search import coverage_of, prior_of
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
@@ -224,22 +223,40 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         sum(one.known_tried for one in joined.frames),
         math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        best.support.unexplained, _genuine(recognized, last, looks, recognizer),
+        best.support.unexplained, _genuine(joined, compared, looks, recognizer),
         _not_mirrored(joined, compared), recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
 
 
-def _genuine(recognized: RecognizedPlace | None, observation: Observation, looks: Looks,
+def _genuine(joined: JoinedFrames, compared: Comparison, looks: Looks,
              recognizer: ImageRecognizer | None) -> float:
-    """Return the probability that a recognized place is no picture, by what moved since."""
-    if recognized is None or recognizer is None:
+    """Return the probability that the leading place is no picture, by what moved since."""
+    signs = signs_in(joined, compared)
+    if signs is None or recognizer is None:
         return 1.0
-    passed, motion = looks.passed(observation), None
-    if passed is not None and passed[0].recognized is not None:
+    assert compared.by_keyframes is not None
+    recognized = compared.by_keyframes.recognized
+    passed, motion = looks.passed(joined.frames[-1].observation), None
+    if passed is not None and passed[0].recognized is not None and recognized is not None:
         motion = compare_motion(recognizer.deviation_per_metre, passed[0].recognized, recognized,
                                 passed[1])
-    return chance_genuine(recognized, motion)
+    return chance_genuine(signs, motion)
+
+
+def signs_in(joined: JoinedFrames, compared: Comparison) -> Signs | None:
+    """Return the signs that the leading place is no picture; None if keyframes do not propose it.
+
+    In the last frame: it is the one that keyframes are recognized in.
+    """
+    place, last = compared.by_keyframes, joined.frames[-1].observation
+    if place is None or place.recognized is None or compared.recognition is None:
+        return None
+    best = compared.by_objects or place
+    boxes = last.detections.bboxes_xyxy[[one.detection for one in best.matches[-1]]]
+    return signs_of(place.recognized, best.support, boxes, last.camera, max(
+        (one.inliers for one in compared.recognition.places if one is not place.recognized),
+        default=0))
 
 
 def _not_mirrored(joined: JoinedFrames, compared: Comparison) -> float:

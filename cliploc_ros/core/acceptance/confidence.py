@@ -11,7 +11,8 @@ ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up
 The search of objects chooses its poses among many by their support. Keyframes propose theirs by
 points: what the objects say of such a pose counts from the utility of none being right, whatever
 the size of the map. Points and objects that lead to one place add up theirs: by chance, features
-and boxes do so independently. Where they see one picture, see chance_genuine.
+and boxes do so independently. Where they see one picture, see
+cliploc_ros.core.acceptance.genuine.
 """
 
 import math
@@ -20,19 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.acceptance.motion import Motion
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.tolerances import SAME_ANSWER
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
-# Motions of right poses are no further off, in squared deviations (95 %, dof 6).
-_SURE_MOTION = float(chi2.ppf(0.95, 6))
-_FOCAL_DEVIATIONS = 2.0
 
 
 class Setting(NamedTuple):
@@ -124,36 +120,3 @@ def objects_utility(support: Support, calibration: Calibration = CALIBRATION) ->
     terms = calibration.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))
-
-
-def chance_genuine(place: RecognizedPlace, motion: Motion | None = None,
-                   calibration: Calibration = CALIBRATION) -> float:
-    """Return the probability that a recognized place is there, not its picture, and unchanged.
-
-    Objects and points that lie in a picture of a place agree on where it was taken. Neither
-    judges the other: they see the same pixels. What tells is the image around the picture, its
-    size, which another focal length would explain, and how it moves.
-
-    Parameters
-    ----------
-    place : RecognizedPlace
-    motion : Motion, optional
-        Since an earlier look.
-    """
-    terms = calibration.genuine
-    odds = (terms.none + terms.confirmed * place.confirmed + terms.extent * place.extent
-            + terms.focal * focal_error(place))
-    if motion is not None:
-        odds -= 0.5 * max(0.0, motion.square - _SURE_MOTION)
-        if motion.square < _SURE_MOTION:
-            odds += min(terms.most_motion, 0.5 * max(0.0, motion.picture - _SURE_MOTION))
-    return 1.0 / (1.0 + math.exp(-min(max(odds, -50.0), 50.0)))
-
-
-def focal_error(place: RecognizedPlace) -> float:
-    """Return how far the focal length that the points suggest is from the camera's: 0 to 1.
-
-    It is the logarithm of their ratio beyond what its deviation explains.
-    """
-    beyond = abs(math.log(place.focal_ratio)) - _FOCAL_DEVIATIONS * place.focal_deviation
-    return min(max(beyond, 0.0), 1.0)

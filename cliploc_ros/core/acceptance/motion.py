@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
@@ -18,6 +19,8 @@ from cliploc_ros.core.keyframes.localization import PER_RADIAN
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
 
+#: Motions of right poses are no further off, in squared deviations (95 %, dof 6).
+SURE_MOTION = float(chi2.ppf(0.95, 6))
 # Distances of pictures from the first camera [m], and how many points are tried on them.
 _PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
 # A camera sees what is further ahead than this [m].

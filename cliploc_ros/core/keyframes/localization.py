@@ -42,8 +42,8 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
 NOTHING_KNOWN = Prior()
-# Cells of the image (columns, rows), and how many points of keyframes and features of the image make
-# one comparable: it has half of the features of a keyframe.
+# Cells of the image (columns, rows), and how many points of keyframes and features of the image,
+# which has half as many as a keyframe, make one comparable.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
 # Points near each other share errors, and several keyframes have the same point: so many times as
