@@ -4,7 +4,9 @@
 
 ``collect`` makes maps and layers of a part of each site, changes queries, map or layer, and stores
 what objects and keyframes say about each query. A run that was stopped goes on. ``judge`` decides
-about the stored records as the package does now, and prints what each way accepts.
+about the stored records as the package does now, and prints what each way accepts. ``fit`` fits
+the sections keyframes and genuine of core/acceptance/calibration.yaml to them, and prints what
+each room would accept by what the others fit.
 """
 
 import argparse
@@ -21,6 +23,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.output import write_text
 from cliploc_ros.parallel import run_tasks
 from studies.keyframes.cases import cases
+from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
 from studies.keyframes.judge import draw, make_judge, table
 from studies.keyframes.records import make_collect, read_places
 
@@ -39,6 +42,21 @@ def _collect(options: argparse.Namespace) -> int:
                   ((place, name) for name, place in product(names, chosen))):
         for _ in tqdm(run_tasks(work, tasks, workers=options.workers), unit='case', disable=None):
             pass
+    return 0
+
+
+def _fit(options: argparse.Namespace) -> int:
+    paths = [path for path in sorted(options.out.glob('cases/*/*.pickle'))
+             if path.stem.partition(':')[0] in options.families]
+    found = [result for _, result in run_tasks(make_rows, paths, workers=options.workers)
+             if result]
+    places, signs = ([row for rows in found for row in rows[part]] for part in range(2))
+    if len({one.site for one in places}) < 2:
+        raise OptionsError(f'{options.out}: records of two rooms are needed; collect them first')
+    for rows in (places, signs):
+        print('\n'.join([*report(rows, left_out(rows)), '']))
+    print('\n'.join([*paste('keyframes', POINTS, fit(places)),
+                     *paste('genuine', GENUINE, fit(signs))]))
     return 0
 
 
@@ -84,6 +102,8 @@ def main() -> int:
                           help='map and ask blocks of N images in turn, too')
     collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
                           help='the most of each case but the plain one (%(default)s)')
+    fits = commands.add_parser('fit', parents=[common], help='fit the verdict, and print numbers')
+    fits.set_defaults(command=_fit)
     judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     judges.set_defaults(command=_judge)
     judges.add_argument('--by', nargs='+', action='append',

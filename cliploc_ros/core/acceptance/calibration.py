@@ -67,6 +67,7 @@ class Places(NamedTuple):
 
     likeness: float
     unlabelled: float
+    room_share: float
 
 
 class Search(NamedTuple):

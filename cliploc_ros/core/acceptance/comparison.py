@@ -29,11 +29,11 @@ from cliploc_ros.core.acceptance.confidence import (
     objects_utility,
     points_utility,
 )
-from cliploc_ros.core.acceptance.genuine import Signs, chance_genuine, signs_of
+from cliploc_ros.core.acceptance.genuine import Signs, signs_of
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
-from cliploc_ros.core.acceptance.motion import compare_motion
+from cliploc_ros.core.acceptance.motion import Motion, compare_motion
 from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import share_within
@@ -210,9 +210,9 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
     coverage, last = coverage_of(joined.frames), joined.frames[-1].observation
     distinct, twin = _distinct(joined, compared, recognizer)
-    recognized = place and place.recognized
+    by_points = _by_points(joined, compared)
     return Evidence(
-        best.support.inliers, float(compared.likely[0]), _by_points(joined, compared),
+        best.support.inliers, float(compared.likely[0]), by_points,
         _rival(joined, compared), distinct,
         place_of(joined.landmark_map, compared.poses[0]).position, twin and twin.position,
         twin.name if twin else '',
@@ -223,28 +223,14 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         sum(one.known_tried for one in joined.frames),
         math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        best.support.unexplained, _genuine(joined, compared, looks, recognizer),
-        _not_mirrored(joined, compared), recognized,
+        best.support.unexplained, _signs(joined, compared),
+        _motion(joined, compared, looks, recognizer), _not_mirrored(joined, compared, by_points),
+        place and place.recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
 
 
-def _genuine(joined: JoinedFrames, compared: Comparison, looks: Looks,
-             recognizer: ImageRecognizer | None) -> float:
-    """Return the probability that the leading place is no picture, by what moved since."""
-    signs = signs_in(joined, compared)
-    if signs is None or recognizer is None:
-        return 1.0
-    assert compared.by_keyframes is not None
-    recognized = compared.by_keyframes.recognized
-    passed, motion = looks.passed(joined.frames[-1].observation), None
-    if passed is not None and passed[0].recognized is not None and recognized is not None:
-        motion = compare_motion(recognizer.deviation_per_metre, passed[0].recognized, recognized,
-                                passed[1])
-    return chance_genuine(signs, motion)
-
-
-def signs_in(joined: JoinedFrames, compared: Comparison) -> Signs | None:
+def _signs(joined: JoinedFrames, compared: Comparison) -> Signs | None:
     """Return the signs that the leading place is no picture; None if keyframes do not propose it.
 
     In the last frame: it is the one that keyframes are recognized in.
@@ -259,17 +245,29 @@ def signs_in(joined: JoinedFrames, compared: Comparison) -> Signs | None:
         default=0))
 
 
-def _not_mirrored(joined: JoinedFrames, compared: Comparison) -> float:
+def _motion(joined: JoinedFrames, compared: Comparison, looks: Looks,
+            recognizer: ImageRecognizer | None) -> Motion | None:
+    """Return the motion since an earlier look by keyframes, if there was one."""
+    place, passed = compared.by_keyframes, looks.passed(joined.frames[-1].observation)
+    if (place is None or place.recognized is None or recognizer is None
+            or passed is None or passed[0].recognized is None):
+        return None
+    return compare_motion(recognizer.deviation_per_metre, passed[0].recognized, place.recognized,
+                          passed[1])
+
+
+def _not_mirrored(joined: JoinedFrames, compared: Comparison, by_points: float) -> float:
     """Return the probability that the image is no mirror image.
 
-    Features of a mirror image match nothing, so keyframes exclude it. A pose that is refused
-    anyway is not worth the time.
+    Features of a mirror image match nothing, so keyframes exclude it, where they are sure. A pose
+    that is refused anyway is not worth the time.
     """
-    if (compared.by_keyframes is not None or not joined.options.refine
-            or compared.likely[0] < joined.options.min_confidence
-            or compared.candidates[0].support.inliers < joined.options.min_inliers):
+    best, options = compared.by_objects, joined.options
+    if (best is None or not options.refine or by_points >= options.min_confidence
+            or compared.likely[0] < options.min_confidence
+            or best.support.inliers < options.min_inliers):
         return 1.0
-    return chance_not_mirrored(joined, compared.candidates[0])
+    return chance_not_mirrored(joined, best)
 
 
 def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
@@ -308,9 +306,10 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     best, (low, high) = compared.candidates[0], joined.options.height_range_m
     matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
                        dtype=np.int64)
-    found = find_twins(joined.landmark_map, best.pose, matched,
-                       compared.poses[~compared.leading])
-    twins = [refined(joined, unrefined(pose)) for pose in found if low <= pose[2, 3] <= high]
+    found, are_rooms = find_twins(joined.landmark_map, best.pose, matched,
+                                  compared.poses[~compared.leading])
+    inside = (low <= found[:, 2, 3]) & (found[:, 2, 3] <= high)
+    twins = [refined(joined, unrefined(pose)) for pose in found[inside]]
     poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
     # a twin that refinement moved back to the leading pose is no other place
     others = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
@@ -319,24 +318,23 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     supports = supports_of(joined, poses[others],
                            [matches_of(joined.rig, twins[row - 1]) for row in others])
     chance, likeliest = chance_distinct(best.support, supports, _leads_of_points(
-        compared, poses[others], recognizer))
+        compared, poses[others], are_rooms[inside][others - 1], recognizer))
     return chance, place_of(joined.landmark_map, poses[others][likeliest])
 
 
 def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
-                     recognizer: ImageRecognizer | None) -> NDArray[np.float64]:
+                     are_rooms: NDArray[np.bool_], recognizer: ImageRecognizer | None
+                     ) -> NDArray[np.float64]:
     """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
 
-    They say nothing about a twin that they do not cover.
+    They say nothing about a room of its own that they do not cover: it may show the same points.
     """
     leading = compared.by_keyframes
     if recognizer is None or leading is None or leading.recognized is None:
         return np.zeros(len(twins))
     covered = np.array([recognizer.coverage(pose) for pose in [leading.pose, *twins]])
-    own = max(0.0, points_utility(leading.recognized))
+    known = np.where(are_rooms, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)), 1.0)
     theirs = np.array([max([0.0] + [
         points_utility(one.recognized) for one in compared.candidates
         if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)]) for pose in twins])
-    return np.maximum(0.0, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)) * own - theirs)
-
-
+    return np.maximum(0.0, known * max(0.0, points_utility(leading.recognized)) - theirs)

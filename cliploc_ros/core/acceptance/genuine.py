@@ -23,6 +23,9 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 _SURE_DEVIATIONS, _MOST_ERROR = 2.0, 1.0
 # Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
 _CENTRAL = (5.0, 95.0)
+# Pictures that are recognized show many features, places also a few. More than these say no more:
+# the rooms of the fit have few features.
+_MANY = 40
 
 
 class Signs(NamedTuple):
@@ -31,7 +34,7 @@ class Signs(NamedTuple):
     Parameters
     ----------
     points : float
-        Logarithm of the number of features that agree.
+        Logarithm of the number of features that agree, of 40 at most.
     confirmed : float
         See RecognizedPlace.
     focal, aspect : float
@@ -76,7 +79,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
     ends = np.vstack([corners, np.percentile(place.pixels, _CENTRAL, axis=0)]) \
         if len(place.pixels) else corners
     return Signs(
-        math.log(max(1, place.inliers)), place.confirmed,
+        math.log(min(max(1, place.inliers), _MANY)), place.confirmed,
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,

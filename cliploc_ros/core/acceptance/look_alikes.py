@@ -64,6 +64,16 @@ class Alike(NamedTuple):
     others: NDArray[np.int64]
     found: NDArray[np.bool_]
 
+    @property
+    def are_rooms(self) -> NDArray[np.bool_]:
+        """Return which places (m,) are rooms of their own that repeat most of this one.
+
+        Whoever furnished them alike may have hung the same posters, too.
+        """
+        elsewhere = self.found & ~np.isin(self.others, self.landmarks)
+        return np.asarray(elsewhere.mean(axis=1) >= CALIBRATION.places.room_share) \
+            if len(self.landmarks) else np.empty(0, np.bool_)
+
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
                matched: NDArray[np.int64] = _NOBODY,
@@ -103,7 +113,8 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
 
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
-               matched: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+               matched: NDArray[np.int64], others: NDArray[np.float64]
+               ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return where a camera would be at the places that look most like that of a pose.
 
     Parameters
@@ -118,12 +129,14 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
 
     Returns
     -------
-    ndarray (m, 4, 4)
-        At most 3 poses, the place that is most alike first.
+    poses : ndarray (m, 4, 4)
+        At most 3, the place that is most alike first.
+    are_rooms : ndarray (m,) of bool
+        See Alike.are_rooms.
     """
     alike = find_alike(landmark_map, map_from_camera[:3, 3], matched,
                        _moves_of_poses(map_from_camera, others[:_OTHERS]))
-    return np.asarray(alike.moves @ map_from_camera)
+    return alike.moves @ map_from_camera, alike.are_rooms
 
 
 def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.float64]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.genuine import Signs, chance_genuine
+from cliploc_ros.core.acceptance.motion import Motion
 from cliploc_ros.core.acceptance.refusal_kind import Refusal, RefusalKind
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
@@ -75,8 +77,10 @@ class Evidence:
         search that tried all samples.
     unexplained : float
         Number of other detected objects of the map's classes.
-    genuine : float
-        Probability that the place is there, not a picture of it, see chance_genuine.
+    signs : Signs or None
+        That the place is there and no picture of it; None where keyframes do not propose it.
+    motion : Motion or None
+        Since an earlier look by keyframes.
     not_mirrored : float
         Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror.
     recognized : RecognizedPlace or None
@@ -101,7 +105,8 @@ class Evidence:
     tried: int = 0
     meetings: float = math.inf
     unexplained: float = 0.0
-    genuine: float = 1.0
+    signs: Signs | None = None
+    motion: Motion | None = None
     not_mirrored: float = 1.0
     recognized: RecognizedPlace | None = None
     earlier: tuple[float, ...] = ()
@@ -116,6 +121,11 @@ class Evidence:
         auto and PROSAC, whose order is not random, it is an assumption.
         """
         return 1.0 - CALIBRATION.search.missed_is_right * math.exp(-self.meetings)
+
+    @property
+    def genuine(self) -> float:
+        """Return the probability that the place is there, and no picture of it."""
+        return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
 
     @property
     def certainty(self) -> float:
