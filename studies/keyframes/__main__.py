@@ -24,7 +24,7 @@ from cliploc_ros.evaluation.output import write_text
 from cliploc_ros.parallel import run_tasks
 from studies.keyframes.cases import cases
 from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
-from studies.keyframes.judge import draw, make_judge, table
+from studies.keyframes.judge import WAYS, draw, make_judge, table
 from studies.keyframes.records import make_collect, read_places
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
@@ -62,7 +62,8 @@ def _fit(options: argparse.Namespace) -> int:
 
 def _judge(options: argparse.Namespace) -> int:
     paths = sorted(options.out.glob('cases/*/*.pickle'))
-    found = [one for _, result in run_tasks(make_judge, paths, workers=options.workers)
+    found = [one for _, result in run_tasks(
+        partial(make_judge, options.ways), paths, workers=options.workers)
              for one in result or () if one.family in options.families
              and any(text in one.place for text in options.places)]
     if not found:
@@ -106,6 +107,8 @@ def main() -> int:
     fits.set_defaults(command=_fit)
     judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     judges.set_defaults(command=_judge)
+    judges.add_argument('--ways', nargs='+', default=WAYS, choices=WAYS, metavar='WAY',
+                        help=f'what answers: {", ".join(WAYS)} (all)')
     judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
                         help='what a line of a table is about (a table by family, one by case)')

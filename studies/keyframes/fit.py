@@ -37,7 +37,7 @@ BY_CHANCE = ('plain', 'image', 'other room', 'classes', 'features')
 POINTS = ('none', 'inliers', 'confirmed', 'explained', 'unexplained')
 GENUINE = ('none', *Signs._fields)
 _UNTROUBLED = ('plain', 'image', 'classes', 'features')
-_WEIGHT = 5.0
+_WEIGHT = 4.0
 # Deviations of the Gaussian prior of all coefficients but the first, for signs of deviation 1.
 _PRIOR = 3.0
 

@@ -64,12 +64,12 @@ def _keyframes(case: StoredCase) -> KeyframeLocalizer:
     return KeyframeLocalizer(case.layer)
 
 
-def make_judge() -> Callable[[Path], list[Outcome]]:
-    """Return what judges the records of a file."""
+def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
+    """Return what judges the records of a file in some ways."""
     def judge(path: Path) -> list[Outcome]:
         case: StoredCase = pickle.loads(path.read_bytes())
         return [_outcome(case, record, way, decide(case, record, way))
-                for record in case.records for way in WAYS]
+                for record in case.records for way in ways]
     return judge
 
 

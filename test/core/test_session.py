@@ -295,6 +295,8 @@ def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
 class Says:
     """A keyframe search with a known answer."""
 
+    deviation_per_metre = 0.01
+
     def __init__(self, place):
         self._place = place
 
@@ -307,7 +309,8 @@ class Says:
 
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
-    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9))
+    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9,
+                                     pixels=np.array([[0.0, 0.0], [640.0, 480.0]])))
 
     def localize(seconds, run=0, detections=SEEN, recognizer=keyframes):
         found = session.localize(frame(seconds, detections=detections), run, 5, 5.0,

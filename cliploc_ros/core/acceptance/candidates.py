@@ -94,8 +94,8 @@ class Candidate(NamedTuple):
         Logarithm of its odds, up to a constant that all candidates share.
     recognized : RecognizedPlace or None
         What keyframes show there, where they propose the pose.
-    alone : float
-        The odds of a pose that keyframes propose, without what the search of objects met there.
+    by_points : float
+        The odds of a pose that keyframes propose, without what objects say for it.
     """
 
     finalist: Finalist
@@ -106,7 +106,7 @@ class Candidate(NamedTuple):
     handicap: float
     odds: float
     recognized: RecognizedPlace | None = None
-    alone: float = -math.inf
+    by_points: float = -math.inf
 
 
 def candidates_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]

@@ -24,6 +24,7 @@ from cliploc_ros.core.acceptance.candidates import (
     unrefined,
 )
 from cliploc_ros.core.acceptance.confidence import (
+    chance_by_points,
     confidences,
     none_right,
     objects_utility,
@@ -148,11 +149,12 @@ def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Candidate]
                           [one.tilt_error <= most for one in seen.places])
     proposed = []
     for one, place in zip(found, seen.places, strict=True):
-        points = points_utility(place)
-        alone = none + points + objects_utility(one.support) - one.handicap
+        points, objects = points_utility(place), objects_utility(one.support)
+        alone = none + points - one.handicap
         there = [other.odds for other in met if SAME_ANSWER.agree(one.pose, other.pose)]
-        proposed.append(one._replace(recognized=place, alone=alone, odds=max(
-            [alone, *(odds + max(0.0, points) for odds in there)])))
+        proposed.append(one._replace(
+            recognized=place, by_points=alone + min(0.0, objects),
+            odds=max([alone + objects, *(odds + max(0.0, points) for odds in there)])))
     return proposed
 
 
@@ -225,7 +227,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         else meetings_of(joined.frames, best.finalist, best.matches),
         best.support.unexplained, _signs(joined, compared),
         _motion(joined, compared, looks, recognizer), _not_mirrored(joined, compared, by_points),
-        place and place.recognized,
+        _uncontradicted(compared), place and place.recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
 
@@ -270,6 +272,14 @@ def _not_mirrored(joined: JoinedFrames, compared: Comparison, by_points: float) 
     return chance_not_mirrored(joined, best)
 
 
+def _uncontradicted(compared: Comparison) -> float:
+    """Return the probability that keyframes are wrong which recognize another place only."""
+    if compared.by_keyframes is not None:
+        return 1.0
+    return min((1.0 - chance_by_points(one.recognized) for one in compared.candidates
+                if one.recognized is not None), default=1.0)
+
+
 def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
     """Return the likeliest pose that does not agree with the leading one."""
     others = np.nonzero(~compared.leading)[0]
@@ -284,13 +294,13 @@ def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
 
 
 def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
-    """Return the probability of the leading place without what the search of objects met there."""
+    """Return the probability of the leading place without what objects say for it."""
     if compared.by_keyframes is None:
         return 0.0
     rows = [row for row, (one, near) in enumerate(zip(compared.candidates, compared.leading,
                                                       strict=True))
             if one.recognized is not None or not near]
-    odds = [one.alone if near else one.odds for one, near in zip(
+    odds = [one.by_points if near else one.odds for one, near in zip(
         compared.candidates, compared.leading, strict=True)]
     found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
     return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))

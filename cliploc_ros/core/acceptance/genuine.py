@@ -19,8 +19,8 @@ from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 
-# Errors of the intrinsics count from so many deviations on, up to a factor of e.
-_SURE_DEVIATIONS, _MOST_ERROR = 2.0, 1.0
+# Errors of the intrinsics count from so many deviations on, and no further than this.
+_SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25
 # Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
 _CENTRAL = (5.0, 95.0)
 # Pictures that are recognized show many features, places also a few. More than these say no more:
@@ -39,7 +39,7 @@ class Signs(NamedTuple):
         See RecognizedPlace.
     focal, aspect : float
         How far the focal length and the aspect that the points suggest are from the camera's, as
-        logarithms of ratios: 0 to 1.
+        logarithms of ratios: 0 to 0.25.
     reach : float
         Share of the image's width or height, the greater one, over which the points and the boxes
         lie that agree: a picture ends within the image.

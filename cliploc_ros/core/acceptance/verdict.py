@@ -55,8 +55,7 @@ class Evidence:
         Probability that it is right, given all poses found, see
         cliploc_ros.core.acceptance.confidence.
     by_points : float
-        The same without the poses that the search of objects met at its place; 0 where keyframes
-        do not propose it.
+        The same without what objects say for it; 0 where keyframes do not propose it.
     rival : Rival or None
     distinct : float
         Probability that its place is not mistaken for one that looks alike.
@@ -83,6 +82,8 @@ class Evidence:
         Since an earlier look by keyframes.
     not_mirrored : float
         Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror.
+    uncontradicted : float
+        Probability that keyframes are wrong which recognize another place only.
     recognized : RecognizedPlace or None
         What keyframes show at the pose.
     earlier : tuple of float
@@ -108,6 +109,7 @@ class Evidence:
     signs: Signs | None = None
     motion: Motion | None = None
     not_mirrored: float = 1.0
+    uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None
     earlier: tuple[float, ...] = ()
     crops_left: int = 0
@@ -130,7 +132,8 @@ class Evidence:
     @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
-        return self.distinct * self.near * self.genuine * self.not_mirrored
+        return (self.distinct * self.near * self.genuine * self.not_mirrored
+                * self.uncontradicted)
 
     @property
     def confidence(self) -> float:
@@ -153,7 +156,7 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
 
     What the search of objects lacks does not matter where keyframes alone are sure enough.
     """
-    by_points = evidence.by_points * evidence.certainty >= _needed(evidence, options)
+    by_points = evidence.by_points >= _needed(evidence, options)
     lacks = None if by_points else _too_short(evidence, options) or _too_few(evidence, options)
     return lacks or _too_unlikely(evidence, options) or _contradicted(evidence, options)
 
@@ -208,7 +211,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
                    'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
-                   'found': found}.items(),
+                   'keyframes': evidence.uncontradicted, 'found': found}.items(),
                   key=lambda item: item[1])[0]
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
@@ -231,18 +234,18 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '
                        f'{evidence.tried} samples; raise iterations or set algorithm to auto')
-    return _unsure(evidence, compared)
+    return _unsure(evidence, compared, weakest == 'keyframes')
 
 
-def _unsure(evidence: Evidence, compared: str) -> Refusal:
+def _unsure(evidence: Evidence, compared: str, by_keyframes: bool) -> Refusal:
     """Return the refusal of a pose that others rival, or that too little supports."""
     rival = evidence.rival
-    if rival is None or not _is_ambiguous(evidence):
+    if rival is None or not (by_keyframes or _is_ambiguous(evidence)):
         return Refusal(RefusalKind.UNEXPLAINED,
                        f'{compared}; {evidence.inliers} objects matched, '
                        f'{round(evidence.unexplained)} unexplained{_points(evidence)}; '
                        f'{_LOOK_ABOUT}')
-    if rival.is_other_source:
+    if rival.is_other_source or by_keyframes:
         apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
         return Refusal(RefusalKind.CONTRADICTION,
                        f'{compared}; objects and keyframes contradict each other, their poses are '
