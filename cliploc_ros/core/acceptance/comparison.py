@@ -276,8 +276,8 @@ def _uncontradicted(compared: Comparison) -> float:
     """Return the probability that keyframes are wrong which recognize another place only."""
     if compared.by_keyframes is not None:
         return 1.0
-    return min((1.0 - chance_by_points(one.recognized) for one in compared.candidates
-                if one.recognized is not None), default=1.0)
+    return min((1.0 - chance_by_points(one.recognized, one.support)
+                for one in compared.candidates if one.recognized is not None), default=1.0)
 
 
 def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
