@@ -227,7 +227,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         else meetings_of(joined.frames, best.finalist, best.matches),
         best.support.unexplained, _signs(joined, compared),
         _motion(joined, compared, looks, recognizer), _not_mirrored(joined, compared, by_points),
-        _uncontradicted(compared), place and place.recognized,
+        _uncontradicted(joined, compared), place and place.recognized,
         looks.confidences_in(last, compared.poses[0]),
         0 if last.compared is None else len(last.detections) - len(last.compared))
 
@@ -272,12 +272,16 @@ def _not_mirrored(joined: JoinedFrames, compared: Comparison, by_points: float) 
     return chance_not_mirrored(joined, best)
 
 
-def _uncontradicted(compared: Comparison) -> float:
-    """Return the probability that keyframes are wrong which recognize another place only."""
-    if compared.by_keyframes is not None:
+def _uncontradicted(joined: JoinedFrames, compared: Comparison) -> float:
+    """Return the probability that keyframes are wrong which recognize another place only.
+
+    They count where they are sure. What a dozen points say is in the comparison.
+    """
+    chance = max((chance_by_points(one.recognized) for one in compared.candidates
+                  if one.recognized is not None), default=0.0)
+    if compared.by_keyframes is not None or chance < joined.options.min_confidence:
         return 1.0
-    return min((1.0 - chance_by_points(one.recognized, one.support)
-                for one in compared.candidates if one.recognized is not None), default=1.0)
+    return 1.0 - chance
 
 
 def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:

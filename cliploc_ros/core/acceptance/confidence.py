@@ -122,8 +122,6 @@ def objects_utility(support: Support, calibration: Calibration = CALIBRATION) ->
             + terms.unexplained * min(terms.most_objects, support.unexplained))
 
 
-def chance_by_points(place: RecognizedPlace, support: Support,
-                     calibration: Calibration = CALIBRATION) -> float:
-    """Return the probability that a recognized place is right, whatever others there are."""
-    odds = points_utility(place, calibration) + objects_utility(support, calibration)
-    return 1.0 / (1.0 + math.exp(-odds))
+def chance_by_points(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+    """Return the probability that a recognized place is right, by its points alone."""
+    return 1.0 / (1.0 + math.exp(-points_utility(place, calibration)))
