@@ -58,6 +58,7 @@ setup(
             'assets/clip.*', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
             'assets/*/rgb/*.jpg',
         ],
+        f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[

@@ -83,4 +83,5 @@ def test_a_fit_judges_each_kind_by_the_others(record_property):
     rooms = [one.case for one in here if one.kind == 'room']
     likely, right = fit.judged([one for one in here if one.kind == 'room'], calibrations)
     assert np.array_equal(likely, outcomes(rooms, calibrations['room'])[0])
-    assert likely[right].mean() > likely[~right].mean()
+    elsewhere = fit.judged([one for one in searched if one.case.is_elsewhere], calibrations)[0]
+    assert likely[right].mean() > elsewhere.mean()
