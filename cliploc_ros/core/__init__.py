@@ -4,7 +4,7 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-relocalizer, session, relocalization, combination, warm_up
+relocalizer, session, relocalization, warm_up
     Entry points and results.
 acceptance
     Confidence, and the decision to accept or refuse.

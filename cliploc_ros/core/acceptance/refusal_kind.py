@@ -27,7 +27,7 @@ class RefusalKind(StrEnum):
     FRAMES_DISAGREE = auto()
     #: Objects and keyframes lead to different places.
     CONTRADICTION = auto()
-    #: Too little of the image shows what the keyframes have there: a picture, or a changed place.
+    #: Keyframes show signs of a picture of the place, of wrong intrinsics, or of a changed place.
     CHANGED = auto()
     #: The time of the request ended before a frame was localized.
     TIME_UP = auto()

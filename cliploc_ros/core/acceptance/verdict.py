@@ -225,8 +225,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
                        f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                        'turn the camera to more or nearer objects')
     if weakest == 'genuine' and evidence.recognized is not None:
-        return Refusal(RefusalKind.CHANGED, f'{compared}{_points(evidence)}; is it a picture, or '
-                                            'has the place changed? move, and ask again')
+        return Refusal(RefusalKind.CHANGED,
+                       f'{compared}; {evidence.recognized.inliers} points of keyframes agree as '
+                       'in a picture or a changed place; move, and ask again')
     if weakest == 'mirror':
         return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
                                               'pose; turn the camera to more objects')
@@ -248,8 +249,8 @@ def _unsure(evidence: Evidence, compared: str, by_keyframes: bool) -> Refusal:
     if rival.is_other_source or by_keyframes:
         apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
         return Refusal(RefusalKind.CONTRADICTION,
-                       f'{compared}; objects and keyframes contradict each other, their poses are '
-                       f'{apart:.2f} m apart; {_LOOK_ABOUT}')
+                       f'{compared}; objects and keyframes lead {apart:.2f} m apart; '
+                       f'{_LOOK_ABOUT}')
     where = f' in {rival.map}' if rival.map else ''
     return Refusal(RefusalKind.AMBIGUOUS,
                    f'{compared}; ambiguous, another pose has {rival.likely:.2g}{where}; '
