@@ -23,6 +23,7 @@ from studies.keyframes.cases import (
     moved_half,
     twin,
 )
+from studies.keyframes.fit import Row, chance, fit, left_out, report
 from studies.keyframes.judge import Outcome, table
 
 RNG = partial(np.random.default_rng, 1)
@@ -169,3 +170,20 @@ def test_what_is_collected_is_judged(shared_data, tmp_path):
               if one['case'] == 'plain: one image' and one['way'] == 'keyframes']
     assert len(errors) == 20
     assert np.median(errors) < 0.1
+
+
+def test_a_fit_finds_what_the_rows_were_made_from():
+    rng, made_from = np.random.default_rng(0), np.array([1.0, 2.0, -3.0])
+    rows = []
+    for number in range(6000):
+        predictors = np.array([1.0, *rng.normal(size=2)])
+        ceiling = rng.uniform(0.5, 1.0)
+        is_right = bool(rng.random() < ceiling * chance(predictors, made_from))
+        rows.append(Row(f'site {number % 3}', 'picture', 'any', predictors, ceiling, is_right))
+    np.testing.assert_allclose(fit(rows), made_from, rtol=0.1, atol=0.2)
+    chances, right = left_out(rows), np.array([one.is_right for one in rows])
+    for low in (0.1, 0.4, 0.7):
+        its = (chances >= low) & (chances < low + 0.2)
+        assert right[its].mean() == pytest.approx(chances[its].mean(), abs=0.06)
+    line, = report(rows, chances)
+    assert line.startswith('any ')
