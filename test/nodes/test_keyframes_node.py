@@ -22,8 +22,8 @@ from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 ROOM = make_room()  # its objects are nowhere in the images
-# image 4 of the walk shows what these of the mapping walk do
-QUERY, LIKE_QUERY = 4, range(2, 10)
+# image 2 of the walk shows what these of the mapping walk do
+QUERY, LIKE_QUERY = 2, range(2, 10)
 UNKNOWN = Detections(np.array([[10.0, 10.0, 90.0, 90.0]]), ('z',), np.ones(1))
 
 

@@ -101,7 +101,7 @@ def recognized(found):
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
     seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, 0.8, keyframes=(0,),
                            pixels=pixels, rows=np.arange(5))
-    return replace(found, recognized=Recognition((seen,)))
+    return replace(found, recognition=Recognition((seen,)))
 
 
 def test_the_best_keyframe_is_beside_the_image(room, found):

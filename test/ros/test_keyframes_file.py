@@ -19,20 +19,20 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
+from cliploc_ros.ros.node.diagnostics import StageTimes
 
 ROOM = make_room()
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 OPTIONS = RelocalizerOptions(matching='class')
 NO_DETECTIONS = Detections(np.empty((0, 4)), (), np.empty(0))
-NOWHERE = Relocalization(False, '0 detections')
-# image 4 of the walk shows what these of the mapping walk do
-QUERY, LIKE_QUERY = 4, range(2, 10)
+# image 2 of the walk shows what these of the mapping walk do
+QUERY, LIKE_QUERY = 2, range(2, 10)
 
 
 @pytest.fixture
@@ -91,21 +91,21 @@ def test_a_request_finds_the_demo_robot_without_any_object(caplog):
     keyframes = Keyframes(KeyframeLocalizer(layer), landmark_map)
     frame = next(one for number, one in enumerate(frames_of(ASSETS / 'sequence').read())
                  if number == QUERY)
-    observation = Observation(frame.camera, NO_DETECTIONS)
 
-    def join(seen, deadline):
-        return keyframes.join(NOWHERE, frame.image_rgb, seen, OPTIONS, deadline)
+    def localize(camera, deadline):
+        recognizer = keyframes.recognizer(frame.image_rgb, camera, deadline, StageTimes('search', 0.0))
+        return recognizer and Relocalizer(landmark_map, OPTIONS).relocalize(
+            [Observation(camera, NO_DETECTIONS)], recognizer)
 
-    later = time.monotonic() + 60.0
-    found = join(observation, later)
+    later, camera = time.monotonic() + 60.0, frame.camera
+    found = localize(camera, later)
     assert found.accepted, found.reason
     assert found.source == 'keyframes'
     assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.05
-    assert join(observation, time.monotonic()) is NOWHERE, 'there is no time for features'
+    assert localize(camera, time.monotonic()) is None, 'there is no time for features'
     assert not caplog.records
-    camera = frame.camera
     other = Camera(camera.width, camera.height, 1.2 * camera.fx, 1.2 * camera.fy, camera.cx,
                    camera.cy)
     for _ in range(2):
-        join(Observation(other, NO_DETECTIONS), later)
+        localize(other, later)
     assert [record.getMessage()[:18] for record in caplog.records] == ['the camera differs']
