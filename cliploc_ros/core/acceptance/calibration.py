@@ -67,7 +67,6 @@ class Places(NamedTuple):
 
     likeness: float
     unlabelled: float
-    room_share: float
 
 
 class Search(NamedTuple):

@@ -66,13 +66,12 @@ class Alike(NamedTuple):
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
-        """Return which places (m,) are rooms of their own that repeat most of this one.
+        """Return which places (m,) are rooms of their own, of landmarks not around this one.
 
         Whoever furnished them alike may have hung the same posters, too.
         """
         elsewhere = self.found & ~np.isin(self.others, self.landmarks)
-        return np.asarray(elsewhere.mean(axis=1) >= CALIBRATION.places.room_share) \
-            if len(self.landmarks) else np.empty(0, np.bool_)
+        return np.asarray(elsewhere.sum(axis=1) >= _LEAST_SHARE * len(self.landmarks))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
 #: Places are so far apart: each is the surroundings of a landmark [m].
 RADIUS_M = 2.0
+# Places that repeat fewer of each other's landmarks do so by chance; labels tell them apart.
+_LEAST_SHARE = 0.6
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,7 @@ def _look_alikes(landmark_map: LandmarkMap, position: NDArray[np.float64]
     alike = find_alike(landmark_map, position)
     ids, labels = landmark_map.landmark_ids, landmark_map.labels
     for move, others, found in zip(alike.moves, alike.others, alike.found, strict=True):
-        # places that repeat less do so by chance; labels tell them apart
-        if found.mean() < CALIBRATION.places.room_share:
+        if found.mean() < _LEAST_SHARE:
             continue
         pairs = list(zip(alike.landmarks[found].tolist(), others[found].tolist(), strict=True))
         yield LookAlike(
