@@ -38,7 +38,7 @@ WEAK = {
     'other source': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0), '', True)},
                      RefusalKind.CONTRADICTION),
     'unexplained': ({'likely': 0.5, 'unexplained': 12.0}, RefusalKind.UNEXPLAINED),
-    'distinct': ({'distinct': 0.5, 'twin': (2.3, -2.3, 1.2)},
+    'distinct': ({'distinct': 0.5, 'twin': (2.3, 2.3, 1.2)},
                  RefusalKind.LOOK_ALIKE),
     'near': ({'near': 0.5, 'deviation_m': 1.23}, RefusalKind.UNCERTAIN_POSITION),
     'genuine': ({'signs': SMALL, 'recognized': RECOGNIZED}, RefusalKind.CHANGED),

@@ -93,7 +93,8 @@ def test_a_request_finds_the_demo_robot_without_any_object(caplog):
                  if number == QUERY)
 
     def localize(camera, deadline):
-        recognizer = keyframes.recognizer(frame.image_rgb, camera, deadline, StageTimes('search', 0.0))
+        recognizer = keyframes.recognizer(frame.image_rgb, camera, deadline,
+                                          StageTimes('search', 0.0))
         return recognizer and Relocalizer(landmark_map, OPTIONS).relocalize(
             [Observation(camera, NO_DETECTIONS)], recognizer)
 
