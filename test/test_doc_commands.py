@@ -195,7 +195,7 @@ def test_the_example_of_the_library_runs():
 @pytest.mark.parametrize('line', [
     'ros2 run cliploc_ros evaluate --map office.yaml --querys office.npz',
     'ros2 run cliploc_ros relocalizer --ros-args -p map_fil:=office.yaml',
-    'python -m cliploc_ros.evaluation.blame --map office.yaml --frobnicate',
+    'python -m studies.blame --map office.yaml --frobnicate',
     'ros2 service call /relocalizer/relocalise std_srvs/srv/Trigger',
     'frobnicate office.yaml'])
 def test_a_wrong_command_is_noticed(line, capsys):

@@ -34,7 +34,6 @@ LAYERS = (
     ('models', 'datasets', 'vocabulary'),
     ('recording',),
     ('evaluation',),
-    ('benchmark',),
     ('ros.qos', 'ros.conversions'),
     ('ros.node',),
     ('ros.inputs',),

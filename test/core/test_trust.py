@@ -25,7 +25,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.evaluation.trials import make_queries
-from cliploc_ros.evaluation.troubles import exchange_landmarks
+from studies.acceptance.troubles import exchange_landmarks
 
 # 95 % of a chi-squared variable of six degrees of freedom lies below this.
 CHI2_95 = 12.592

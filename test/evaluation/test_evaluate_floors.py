@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.benchmark.building import main as building
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.demo import ASSETS
+from studies.speed.building import main as building
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods', 'auto', '--trials', 1,

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.benchmark import floor as benchmark
-from cliploc_ros.benchmark.floors import CLASS_NAMES, compare_maps, make_floor, see_floor
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.evidence import ious_with
@@ -17,6 +15,8 @@ from cliploc_ros.mapping.landmarks import landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.pose_noise import _sample
 from cliploc_ros.mapping.views import make_views
+from studies.speed import floor as benchmark
+from studies.speed.floors import CLASS_NAMES, compare_maps, make_floor, see_floor
 
 
 @pytest.fixture(scope='module')

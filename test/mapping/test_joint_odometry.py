@@ -8,12 +8,6 @@ import numpy as np
 import pytest
 from walk import look_at, make_table, see, walk_around
 
-from cliploc_ros.benchmark.pose_errors import (
-    aligned_offsets_m,
-    disturb,
-    draw_errors,
-    with_odometry,
-)
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.joint import State
 from cliploc_ros.mapping.landmarks import landmarks_of_map
@@ -21,6 +15,12 @@ from cliploc_ros.mapping.odometry import link_frames
 from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.mapping.pose_prior import Prior, pose_bands
 from cliploc_ros.mapping.views import make_views
+from studies.speed.pose_errors import (
+    aligned_offsets_m,
+    disturb,
+    draw_errors,
+    with_odometry,
+)
 
 POSE_ERRORS = PoseErrors(0.05, 1.0, 3.0)
 NOISE = OdometryErrors(0.005, 0.2)

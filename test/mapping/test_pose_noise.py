@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walk import look_at, make_table, nearest_errors, see, walk_around
 
-from cliploc_ros.benchmark.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.landmarks import landmarks_of_map
@@ -15,6 +14,7 @@ from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
 from cliploc_ros.mapping.pose_prior import Prior
 from cliploc_ros.mapping.views import make_views
+from studies.speed.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)
 #: The camera is 3 cm and 2 degrees away from where the given poses have it.

@@ -5,10 +5,10 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.benchmark.pose_errors import draw_errors
 from cliploc_ros.mapping.options import PoseErrors
 from cliploc_ros.mapping.shared_errors import _BENDING, shared_by_neighbours
 from cliploc_ros.mapping.views import Views
+from studies.speed.pose_errors import draw_errors
 
 
 def views_of(stamps_s, frames):

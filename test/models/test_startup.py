@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of CLIP's first start and of a start with a warm cache."""
 
-from cliploc_ros.benchmark.startup import KINDS, format_results, measure_startup
 from cliploc_ros.models import ClipOptions
+from studies.speed.startup import KINDS, format_results, measure_startup
 
 
 def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):

@@ -25,7 +25,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.index.pairs import find_repeats
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 
-# All constants are chosen on simulated worlds, see cliploc_ros.evaluation.worlds: kinds room,
+# All constants are chosen on simulated worlds, see studies.worlds: kinds room,
 # office, shop, corridor, hall and two rooms, seeds 0 to 59.
 # A place: what a pose matched, and what is nearer to it than this; at most so many landmarks.
 _PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64

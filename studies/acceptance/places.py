@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded and simulated places, and what a robot knows there besides one image."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
+from cliploc_ros.evaluation.trials import Query, make_queries
+from studies.worlds.cameras import GROUP_SIZE
+from studies.worlds.modes import HEIGHT_M, MODES, STEP_DEG, STEP_M
+from studies.worlds.places import KINDS
+from studies.worlds.world import make_world
+
+ONE, UPRIGHT, LEVEL, FIVE, ALL = MODES
+# Deviation of an honest vertical.
+_VERTICAL_DEG = 1.0
+_SEED = 7
+
+
+class Place(NamedTuple):
+    """A map, all frames with the group of each, and which frame of each group is its query.
+
+    With every_frame, each frame is a query where one image is localized.
+    """
+
+    landmark_map: LandmarkMap
+    frames: Sequence[Query]
+    groups: Sequence[int]
+    is_main: Sequence[bool]
+    every_frame: bool = False
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Return the modes that are possible: five images need groups of frames."""
+        has_groups = len(set(self.groups)) < len(self.groups)
+        return MODES if has_groups else (ONE, UPRIGHT, LEVEL)
+
+    def ask(self, mode: str) -> list[Query]:
+        """Return the queries with what is known in a mode."""
+        is_fused = mode in (FIVE, ALL)
+        queries: Sequence[Query] = self.frames
+        if mode in (UPRIGHT, LEVEL, ALL):
+            queries = with_vertical(queries, _VERTICAL_DEG, _SEED)
+        if is_fused:
+            queries = with_neighbours(queries, self.groups, STEP_M, STEP_DEG, _SEED)
+        return [one for one, is_main in zip(queries, self.is_main, strict=True)
+                if is_main or (self.every_frame and not is_fused)]
+
+    def options(self, mode: str, options: RelocalizerOptions) -> RelocalizerOptions:
+        """Return options with the height range that is known in a mode."""
+        if mode not in (LEVEL, ALL):
+            return options
+        heights = [one.map_from_camera[2, 3] for one in self.frames]
+        return replace(options, height_range_m=(min(heights) - HEIGHT_M,
+                                                max(heights) + HEIGHT_M))
+
+
+class Recording(NamedTuple):
+    """A query file and its map."""
+
+    queries: Path
+    landmark_map: Path
+    every_frame: bool
+
+    @property
+    def name(self) -> str:
+        """Return the name of its rows in a table."""
+        return self.queries.stem
+
+    def __call__(self) -> Place:
+        """Return the place."""
+        landmark_map = LandmarkMap.from_file(self.landmark_map)
+        found = load_queries(self.queries, landmark_map.landmark_ids)
+        return Place(landmark_map, make_queries(found, landmark_map, every_frame=True),
+                     [one.group for one in found.frames], [one.is_main for one in found.frames],
+                     self.every_frame)
+
+
+class Simulated(NamedTuple):
+    """A simulated world; the last image of each group is a query."""
+
+    kind: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Return the name of its rows in a table."""
+        return self.kind
+
+    def __call__(self) -> Place:
+        """Return the place."""
+        world = make_world(self.kind, self.seed)
+        return Place(world.landmark_map, world.queries, world.groups,
+                     [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
+
+
+def add_arguments(parser: argparse.ArgumentParser, default_kinds: Sequence[str]) -> None:
+    """Add the options that choose places; chosen_places reads them."""
+    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
+    parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
+                        help='one for all query files, or one for each')
+    parser.add_argument('--frames', choices=('main', 'all'), default='all')
+    parser.add_argument('--worlds', type=int, default=0, metavar='N',
+                        help='simulated worlds of each kind, besides')
+    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(default_kinds))
+    parser.add_argument('--first-seed', type=int, default=1000, metavar='N')
+
+
+def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
+    """Return the places that the command line chooses.
+
+    Raises
+    ------
+    OptionsError
+        There are none, maps do not fit query files, or a number is below 0.
+    """
+    if options.worlds < 0 or options.first_seed < 0:
+        raise OptionsError('--worlds and --first-seed must not be below 0')
+    maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
+    if len(maps) != len(options.queries):
+        raise OptionsError('give one map, or as many maps as query files in the same order')
+    places: list[Recording | Simulated] = [
+        *(Recording(path, map_path, options.frames == 'all')
+          for path, map_path in zip(options.queries, maps, strict=True)),
+        *(Simulated(kind, options.first_seed + number) for kind in options.kinds
+          for number in range(options.worlds))]
+    if not places:
+        raise OptionsError('nothing to test: give --queries and --map, or --worlds')
+    return places

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a robot looks from: groups of five images while it turns or drives."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
+from studies.worlds.places import Place
+from studies.worlds.things import Objects
+
+#: Images of one group.
+GROUP_SIZE = 5
+# Recordings have 500 (demo), 525 (kitchen) and 535 (TUM fr3); cameras of robots are wider.
+_FOCAL_PX = (380.0, 620.0)
+# Hands and tripods: 1.28 to 1.64 (fr3), 1.12 to 1.35 (demo). Robots are lower, a guess.
+_HEIGHT_M = (0.3, 1.8)
+# 20 to 39 down (fr3), 2 to 10 (demo). Low robots look up, by a guess. Deviation of the roll: 4.4
+# (fr3, hand), 1.2 (demo).
+_PITCH_DEG, _ROLL_DEG = (-20.0, 35.0), 3.0
+# In a second: 5 to 21 degrees and .12 to .36 m (fr3, hand).
+_TURN_DEG, _STEP_M = (5.0, 20.0), 0.15
+_ELBOW_ROOM_M = 0.2
+_TRIES = 100
+# Looks to choose from: the more things there are ahead, the more likely.
+_CHOICES, _AHEAD_COSINE, _AHEAD_M = 16, 0.85, 4.0
+
+
+def make_camera(rng: np.random.Generator) -> Camera:
+    """Return a camera of 640 x 480 pixels."""
+    focal = rng.uniform(*_FOCAL_PX)
+    return Camera(640, 480, focal, focal, 320.0, 240.0)
+
+
+def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Generator
+                ) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (groups, 5, 4, 4) of a robot in a place.
+
+    Its height and pitch are the same in the whole place. In each group it turns on the spot or
+    drives on while it turns.
+    """
+    height = rng.uniform(*_HEIGHT_M)
+    pitch = np.radians(rng.uniform(*_PITCH_DEG))
+    found = np.empty((groups, GROUP_SIZE, 4, 4))
+    for group in range(groups):
+        position, yaw = _look(place, objects, rng)
+        turn = np.radians(rng.uniform(*_TURN_DEG)) * rng.choice((-1.0, 1.0))
+        drives = rng.random() < 0.5
+        for number in range(GROUP_SIZE):
+            roll, nod = np.radians(_ROLL_DEG) * rng.normal(size=2)
+            found[group, number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+            yaw += turn
+            if drives:
+                step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
+                position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
+    return found
+
+
+def walk_through(place: Place, objects: Objects, images: int, rng: np.random.Generator
+                 ) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (images, 4, 4) of a robot that stands, turns and drives.
+
+    It stands for the first quarter of the images, turns on the spot for the second, and then
+    drives along a curve.
+    """
+    height, pitch = rng.uniform(*_HEIGHT_M), np.radians(rng.uniform(*_PITCH_DEG))
+    position, yaw = _look(place, objects, rng)
+    turn = np.radians(rng.uniform(*_TURN_DEG)) * rng.choice((-1.0, 1.0))
+    found = np.empty((images, 4, 4))
+    for number in range(images):
+        roll, nod = np.radians(_ROLL_DEG) * rng.normal(size=2) if 4 * number >= images else (0, 0)
+        found[number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+        if 4 * number >= images:
+            yaw += turn
+        if 2 * number >= images:
+            step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
+            position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
+    return found
+
+
+def _look(place: Place, objects: Objects, rng: np.random.Generator
+          ) -> tuple[NDArray[np.float64], float]:
+    """Return a spot (2,) and a direction [rad] in which there are things to see."""
+    spots = np.array([_free_spot(place, objects, rng) for _ in range(_CHOICES)])
+    yaws = rng.uniform(-np.pi, np.pi, _CHOICES)
+    offsets = objects.centers[:, :2] - spots[:, None]
+    distances = np.linalg.norm(offsets, axis=2)
+    ahead = np.einsum('cnd,cd->cn', offsets, np.stack([np.cos(yaws), np.sin(yaws)], axis=1))
+    counts = ((ahead > _AHEAD_COSINE * distances) & (distances < _AHEAD_M)).sum(axis=1)
+    chances = (0.5 + counts) ** 2.0
+    chosen = rng.choice(_CHOICES, p=chances / chances.sum())
+    return spots[chosen], float(yaws[chosen])
+
+
+def _free_spot(place: Place, objects: Objects, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return a spot (2,) where no object stands, if there is one."""
+    radii = objects.semi_axes[:, :2].max(axis=1) + _ELBOW_ROOM_M
+    spots = rng.uniform(0.2, (place.width - 0.2, place.depth - 0.2), (_TRIES, 2))
+    gaps = np.linalg.norm(spots[:, None] - objects.centers[:, :2], axis=2) - radii
+    free = np.nonzero(gaps.min(axis=1) > 0.0)[0]
+    return np.asarray(spots[free[0] if len(free) else int(np.argmax(gaps.min(axis=1)))])
+
+
+def _pose(position: NDArray[np.float64], yaw: float, pitch: float, roll: float
+          ) -> NDArray[np.float64]:
+    """Return map_from_camera of a camera that looks down by a pitch and rolls [rad]."""
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    cos, sin = np.cos(roll), np.sin(roll)
+    return make_transform(np.stack([cos * right + sin * down, cos * down - sin * right, forward],
+                                   axis=1), position)

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Kinds of places: rooms, offices, shops, corridors of equal bays, symmetric halls.
+
+Numbers of objects, spacings and shares are guesses about ordinary buildings.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.worlds.things import (
+    FURNITURE,
+    ON_SHELVES,
+    ON_TABLES,
+    ON_WALLS,
+    TYPICAL,
+    Thing,
+)
+
+
+class Place(NamedTuple):
+    """Things in a rectangle from (0, 0) to (width, depth) [m]."""
+
+    width: float
+    depth: float
+    things: Sequence[Thing]
+
+
+def room(rng: np.random.Generator) -> Place:
+    """Return a room: furniture, tables with things on them, no two alike."""
+    width, depth = rng.uniform(3.0, 6.0, 2)
+    things = _scattered(rng, FURNITURE, _some(rng, 5, 13), width, depth)
+    for _ in range(_some(rng, 2, 5)):
+        things += _table(rng, *_spot(rng, width, depth), _some(rng, 3, 11))
+    things += _on_walls(rng, _some(rng, 0, 3), width, depth)
+    return Place(width, depth, things)
+
+
+def office(rng: np.random.Generator) -> Place:
+    """Return an office: rows of desks with the same monitors, keyboards and chairs."""
+    columns, rows = _some(rng, 2, 5), _some(rng, 1, 4)
+    pitch = rng.uniform(1.9, 2.6, 2)
+    likeness = rng.uniform(0.3, 0.9)
+    things = [thing for column in range(columns) for row in range(rows)
+              for thing in _desk(rng, 1.2 + pitch[0] * column, 1.2 + pitch[1] * row,
+                                 0.5 * np.pi * rng.integers(4), likeness)]
+    width, depth = 2.4 + pitch * (columns - 1, rows - 1)
+    things += _scattered(rng, FURNITURE, _some(rng, 1, 6), width, depth)
+    return Place(width, depth, things + _on_walls(rng, _some(rng, 0, 4), width, depth))
+
+
+def shop(rng: np.random.Generator) -> Place:
+    """Return a shop: shelves with runs of the same thing, and few other objects."""
+    aisles = _some(rng, 2, 5)
+    width, depth = rng.uniform(4.0, 7.0), 1.5 + 1.8 * aisles
+    things = []
+    for aisle in range(aisles):
+        x, y = 0.5, 0.8 + 1.8 * aisle
+        while x < width - 0.5:
+            name, model = str(rng.choice(ON_SHELVES)), _new_model(rng)
+            spacing = 2.0 * TYPICAL[name][0] * rng.uniform(1.1, 1.6)
+            count = _some(rng, 3, 9)
+            height = rng.choice((0.5, 0.9, 1.3, 1.7))
+            things += [Thing(name, x + spacing * number, y, height, 0.0, model)
+                       for number in range(count) if rng.random() < 0.9]
+            x += spacing * count + rng.uniform(0.1, 0.4)
+    things += _scattered(rng, FURNITURE, _some(rng, 1, 5), width, depth)
+    return Place(width, depth, things + _on_walls(rng, _some(rng, 0, 3), width, depth))
+
+
+def corridor(rng: np.random.Generator) -> Place:
+    """Return a corridor of equal bays; some bays lack a thing or have one of their own."""
+    bays, pitch = _some(rng, 4, 11), rng.uniform(2.2, 4.0)
+    width, depth = bays * pitch, rng.uniform(1.8, 3.0)
+    pattern = _scattered(rng, (*FURNITURE, *ON_WALLS), _some(rng, 3, 8), pitch, depth)
+    things = [one._replace(x=one.x + pitch * bay) for bay in range(bays) for one in pattern
+              if rng.random() < 0.93]
+    things += _scattered(rng, FURNITURE, _some(rng, 0, bays), width, depth)
+    return Place(width, depth, things)
+
+
+def hall(rng: np.random.Generator) -> Place:
+    """Return a hall of twofold symmetry with a few exceptions."""
+    width, depth = rng.uniform(6.0, 12.0, 2)
+    half = _scattered(rng, FURNITURE, _some(rng, 6, 15), 0.5 * width, depth)
+    for _ in range(_some(rng, 1, 4)):
+        half += _table(rng, *_spot(rng, 0.5 * width, depth), _some(rng, 2, 9))
+    turned = [one._replace(x=width - one.x, y=depth - one.y, yaw=one.yaw + np.pi)
+              for one in half]
+    things = [one for one in half + turned if rng.random() < 0.93]
+    return Place(width, depth, things + _scattered(rng, (*FURNITURE, *ON_WALLS),
+                                                   _some(rng, 0, 5), width, depth))
+
+
+def bare_room(rng: np.random.Generator) -> Place:
+    """Return a room with hardly anything in it."""
+    width, depth = rng.uniform(3.0, 7.0, 2)
+    return Place(width, depth, _scattered(rng, (*FURNITURE, *ON_TABLES), _some(rng, 4, 8),
+                                          width, depth))
+
+
+def two_rooms(rng: np.random.Generator) -> Place:
+    """Return two equal rooms side by side, of which each has up to three things of its own."""
+    one = room(rng)
+    gap = 1.5
+    twin = [thing._replace(x=thing.x + one.width + gap) for thing in one.things]
+    own = [_scattered(rng, FURNITURE, _some(rng, 0, 4), one.width, one.depth)
+           for _ in range(2)]
+    moved = [thing._replace(x=thing.x + one.width + gap) for thing in own[1]]
+    return Place(2.0 * one.width + gap, one.depth, [*one.things, *twin, *own[0], *moved])
+
+
+#: All kinds of places, by name.
+KINDS: dict[str, Callable[[np.random.Generator], Place]] = {
+    'room': room, 'office': office, 'shop': shop, 'corridor': corridor, 'hall': hall,
+    'bare room': bare_room, 'two rooms': two_rooms}
+
+
+def _some(rng: np.random.Generator, least: int, limit: int) -> int:
+    """Return a whole number from least to below limit."""
+    return int(rng.integers(least, limit))
+
+
+def _new_model(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 40))
+
+
+def _spot(rng: np.random.Generator, width: float, depth: float) -> tuple[float, float]:
+    return rng.uniform(0.3, width - 0.3), rng.uniform(0.3, depth - 0.3)
+
+
+def _scattered(rng: np.random.Generator, names: Sequence[str], count: int, width: float,
+               depth: float) -> list[Thing]:
+    """Return things at random spots, at the usual height, each with its own looks."""
+    return [Thing(name, *_spot(rng, width, depth), TYPICAL[name][3],
+                  rng.uniform(0.0, np.pi), _new_model(rng))
+            for name in map(str, rng.choice(names, count))]
+
+
+def _on_walls(rng: np.random.Generator, count: int, width: float, depth: float) -> list[Thing]:
+    things = []
+    for name in map(str, rng.choice(ON_WALLS, count)):
+        along, wall = rng.uniform(0.1, 0.9), rng.integers(4)
+        x, y = ((along * width, 0.0), (along * width, depth), (0.0, along * depth),
+                (width, along * depth))[wall]
+        things.append(Thing(name, x, y, rng.uniform(1.2, 2.0), 0.5 * np.pi * (wall // 2),
+                            _new_model(rng)))
+    return things
+
+
+def _table(rng: np.random.Generator, x: float, y: float, count: int) -> list[Thing]:
+    """Return a table with things on it."""
+    table = Thing('dining table', x, y, TYPICAL['dining table'][3], rng.uniform(0.0, np.pi),
+                  _new_model(rng))
+    along, across = TYPICAL['dining table'][:2]
+    things = [table]
+    for name in map(str, rng.choice(ON_TABLES, count)):
+        u, v = rng.uniform(-0.8, 0.8, 2) * (along, across)
+        things.append(_beside(table, name, u, v, rng, _new_model(rng)))
+    return things
+
+
+def _beside(table: Thing, name: str, u: float, v: float, rng: np.random.Generator, model: int
+            ) -> Thing:
+    """Return a thing at a place (u, v) [m] along and across a table."""
+    cos, sin = np.cos(table.yaw), np.sin(table.yaw)
+    height = TYPICAL[name][3] if name == 'chair' else 0.74 + TYPICAL[name][2]
+    return Thing(name, table.x + cos * u - sin * v, table.y + sin * u + cos * v, height,
+                 table.yaw + 0.15 * rng.normal(), model)
+
+
+def _desk(rng: np.random.Generator, x: float, y: float, yaw: float, likeness: float
+          ) -> list[Thing]:
+    """Return a desk; likeness is the share of its things that look as on every desk."""
+    desk = Thing('dining table', x, y, TYPICAL['dining table'][3], yaw, 0)
+    usual = (('tv', 0.0, 0.25, 0.9), ('keyboard', 0.0, -0.1, 0.9), ('mouse', 0.35, -0.1, 0.9),
+             ('chair', 0.0, -0.7, 0.9), ('laptop', -0.45, 0.0, 0.4), ('cup', 0.55, 0.1, 0.5),
+             ('tv', 0.5, 0.25, 0.3), ('bottle', -0.6, 0.2, 0.4), ('cell phone', 0.5, -0.2, 0.3))
+    things = [desk]
+    for name, u, v, share in usual:
+        if rng.random() < share:
+            model = 0 if rng.random() < likeness else _new_model(rng)
+            shift = 0.06 * rng.normal(size=2)
+            thing = _beside(desk, name, u + shift[0], v + shift[1], rng, model)
+            things.append(thing._replace(z=0.74 + 0.25) if name == 'tv' else thing)
+    for name in map(str, rng.choice(('book', 'book', 'scissors', 'bowl', 'vase', 'teddy bear'),
+                                    _some(rng, 0, 4))):
+        u, v = rng.uniform(-0.8, 0.8, 2) * TYPICAL['dining table'][:2]
+        things.append(_beside(desk, name, u, v, rng, _new_model(rng)))
+    return things

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One simulated world: a map with errors, and what a robot sees there."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.units import NS_PER_S
+from studies.worlds.appearance import Encoder
+from studies.worlds.cameras import (
+    GROUP_SIZE,
+    make_camera,
+    make_groups,
+    walk_through,
+)
+from studies.worlds.detector import Detector, detect
+from studies.worlds.places import KINDS, Place
+from studies.worlds.surveyor import MapErrors, Survey, survey
+from studies.worlds.things import Objects, make_objects
+
+_FRAME_S = 1.0
+_SCORE = 0.8
+
+
+@dataclass(frozen=True)
+class World:
+    """A simulated world.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    landmark_map : LandmarkMap
+        With errors.
+    queries : tuple of Query
+        All images, five of each group in order of time. They know neither vertical nor odometry.
+    """
+
+    kind: str
+    landmark_map: LandmarkMap
+    queries: tuple[Query, ...]
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """Return the group of each query."""
+        return tuple(query.number // GROUP_SIZE for query in self.queries)
+
+
+class _Scene(NamedTuple):
+    """Everything that the images of a world show."""
+
+    objects: Objects
+    shapes: NDArray[np.float64]
+    found: Survey
+    detector: Detector
+    encoder: Encoder
+    vectors: NDArray[np.float64]
+    biases: NDArray[np.float64]
+
+
+def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None) -> World:
+    """Return a world; equal seeds give equal worlds.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    seed : int
+    groups : int
+        Places from which the robot looks, five images each.
+    sigma_m : float, optional
+        Standard deviation of the map's positions on each axis [m]; drawn by default.
+    """
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    place, scene = _make_scene(kind, sigma_m, rng)
+    camera = make_camera(rng)
+    poses = make_groups(place, scene.objects, groups, rng).reshape(-1, 4, 4)
+    return _seen(kind, scene, camera, poses, rng)
+
+
+def make_walk(kind: str, seed: int, images: int) -> World:
+    """Return a world and the images of one walk through it, a second apart.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    seed : int
+        Its objects and map are those of make_world.
+    images : int
+    """
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    place, scene = _make_scene(kind, None, rng)
+    camera = make_camera(rng)
+    return _seen(kind, scene, camera, walk_through(place, scene.objects, images, rng), rng)
+
+
+def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator
+                ) -> tuple[Place, _Scene]:
+    place = KINDS[kind](rng)
+    objects = make_objects(place.things, rng)
+    encoder = Encoder.random(rng)
+    errors = MapErrors.random(rng)
+    if sigma_m is not None:
+        errors = errors._replace(sigma_m=sigma_m)
+    return place, _Scene(objects, objects.shapes, survey(objects, errors, rng),
+                         Detector.random(objects, rng), encoder,
+                         encoder.vectors(objects.class_ids, objects.models, rng),
+                         encoder.biases(len(objects.class_ids), rng))
+
+
+def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
+          rng: np.random.Generator) -> World:
+    return World(kind, scene.found.landmark_map, tuple(
+        Query(number, _look(scene, camera, pose, number, rng), pose)
+        for number, pose in enumerate(poses)))
+
+
+def _look(scene: _Scene, camera: Camera, pose: NDArray[np.float64], number: int,
+          rng: np.random.Generator) -> Observation:
+    boxes = detect(scene.detector, scene.objects, scene.shapes, camera, pose, rng)
+    known = boxes.shown >= 0
+    crops = scene.encoder.unknown(boxes.class_ids)
+    crops[known] = scene.vectors[boxes.shown[known]]
+    biases = scene.encoder.biases(len(known), rng)
+    biases[known] = scene.biases[boxes.shown[known]]
+    similarities = scene.encoder.similarities(crops, biases, boxes.bboxes_xyxy,
+                                              scene.vectors[scene.found.described], rng)
+    return Observation(
+        camera, Detections(boxes.bboxes_xyxy, boxes.class_ids, np.full(len(known), _SCORE)),
+        similarities, round(number * _FRAME_S * NS_PER_S))
