@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 # Shares of the budget at which the search and the refinement end; acceptance takes the rest.
 _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
-# Both end earlier by this time [s] for each further frame, up to four, since poses are scored and
-# compared on all frames. A budget below _SHORT_BUDGET_S scales these times down.
-_EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0045, 0.002, 0.05
-_MOST_FURTHER_FRAMES = 4
+# Both end earlier by this time [s] for each frame, up to five, since poses are scored and compared
+# on all frames. A budget below _SHORT_BUDGET_S scales these times down.
+_EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
+_MOST_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -51,5 +51,5 @@ class TimeBudget:
 
     def _time_s(self, share: float, earlier_s: float) -> float:
         scale = min(1.0, self.total_s / _SHORT_BUDGET_S)
-        further = min(self.frames - 1, _MOST_FURTHER_FRAMES)
-        return share * self.total_s - scale * earlier_s * further
+        frames = min(self.frames, _MOST_FRAMES)
+        return share * self.total_s - scale * earlier_s * frames

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from builtin_interfaces.msg import Time
-from handing_over import ONE_HZ, TEN_HZ, rest, tell
+from handing_over import ONE_HZ, TEN_HZ, tell
 from nav_msgs.msg import Odometry
 
 from cliploc_ros.ros.outputs.handoff import HandOffError
@@ -142,8 +142,7 @@ def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
 def test_after_the_deadline_odometry_of_late_will_do(robot, wheels):
     robot.localizer.subscribe()
     robot.meet()
-    robot.wait(lambda: robot.odometry.speeds_by_poses(0.0) is not None, 'odometry',
-               lambda: rest(wheels))
+    tell(robot, wheels, TEN_HZ)
     assert robot.hand_over(-1.0) < 0.5
     robot.wait(lambda: robot.localizer.poses, 'the pose')
 

@@ -33,22 +33,26 @@ from cliploc_ros.core.observation import Observation
 
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])
-# Planes that are tried, and poses that are refined. Chosen on mirrored images of TUM fr3.
-_MOST_PLANES, _REFINED = 30, 4
+# Planes that are tried, poses that are refined, and frames that count, the last ones: a camera
+# mirrors them all. Chosen on mirrored images of TUM fr3.
+_MOST_PLANES, _REFINED, _MOST_FRAMES = 16, 2, 3
 
 
 def chance_not_mirrored(joined: JoinedFrames, best: Candidate) -> float:
     """Return the probability that no mirror image explains the detections instead."""
+    joined = join_frames(joined.landmark_map, joined.options, joined.frames[-_MOST_FRAMES:])
+    matches = best.matches[-_MOST_FRAMES:]
     mirrored = _mirrored(joined)
     centers = joined.landmark_map.centers[
-        sorted({one.landmark for found in best.matches for one in found})]
-    starts = [unrefined(_reflection(*plane) @ best.pose @ _FLIP) for plane in _planes(centers)]
+        sorted({one.landmark for found in matches for one in found})]
+    starts = [unrefined(pose) for pose in _reflections(*_planes(centers)) @ best.pose @ _FLIP]
     starts.sort(key=lambda one: -verify_rig(mirrored.rig, one.rotation, one.translation).score)
     found = [refined(mirrored, one) for one in starts[:_REFINED]]
     supports = supports_of(mirrored, np.array([one.map_from_camera for one in found]),
                            [matches_of(mirrored.rig, one) for one in found])
-    lead = (CALIBRATION.attitude.not_mirrored + float(utilities([best.support])[0])
-            - float(utilities(supports).max()))
+    own, = utilities([best.support] if len(joined.frames) == len(best.matches)
+                     else supports_of(joined, best.pose[None], [matches]))
+    lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
     return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
 
 
@@ -74,23 +78,26 @@ def _mirrored_observation(observation: Observation) -> Observation:
                                       bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
 
 
-def _planes(points: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return points on planes with their normals: level, fitted to points, through three each."""
+def _planes(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points (m, 3) on planes with their normals (m, 3).
+
+    The planes are level, fitted to all points, and through three points each.
+    """
     middle = points.mean(axis=0)
-    planes = [(middle, _UP), (middle, np.linalg.svd(points - middle)[2][-1])]
     triples = np.array([*combinations(range(len(points)), 3)], dtype=np.int64).reshape(-1, 3)
     chosen = np.linspace(0, len(triples) - 1, min(_MOST_PLANES, len(triples))).astype(np.int64)
-    for first, second, third in points[triples[chosen]]:
-        normal = np.cross(second - first, third - first)
-        length = float(np.linalg.norm(normal))
-        if length > 1e-6:
-            planes.append((first, normal / length))
-    return planes
+    first, second, third = np.moveaxis(points[triples[chosen]], 1, 0)
+    normals = np.cross(second - first, third - first)
+    lengths = np.linalg.norm(normals, axis=1)
+    first, normals = first[lengths > 1e-6], (normals.T / np.maximum(lengths, 1e-6)).T
+    return (np.vstack([middle, middle, first]),
+            np.vstack([_UP, np.linalg.svd(points - middle)[2][-1], normals[lengths > 1e-6]]))
 
 
-def _reflection(point: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transform (4, 4) that reflects points at a plane."""
-    reflection = np.eye(4)
-    reflection[:3, :3] -= 2.0 * np.outer(normal, normal)
-    reflection[:3, 3] = 2.0 * (point @ normal) * normal
-    return reflection
+def _reflections(points: NDArray[np.float64], normals: NDArray[np.float64]
+                 ) -> NDArray[np.float64]:
+    """Return the transforms (m, 4, 4) that reflect points at planes."""
+    reflections = np.tile(np.eye(4), (len(points), 1, 1))
+    reflections[:, :3, :3] -= 2.0 * normals[:, :, None] * normals[:, None]
+    reflections[:, :3, 3] = 2.0 * (points * normals).sum(axis=1, keepdims=True) * normals
+    return reflections
