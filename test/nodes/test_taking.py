@@ -81,7 +81,7 @@ def why_not_taken(tester, stamp_s=100.0):
     tester.set_parameter('timeout_s', TIMEOUT_S)
     begin = time.monotonic()
     answer = tester.relocalize(make_frame(stamp_s=stamp_s))
-    assert time.monotonic() - begin < TIMEOUT_S + 2.0
+    assert time.monotonic() - begin < TIMEOUT_S + 4.0
     assert not answer.success, answer.message
     found = re.match(r'withheld: the localizer did not take the pose: (.*) \(accepted: x 0\.3',
                      answer.message)
