@@ -18,7 +18,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
 # pytest-xdist hands whole files to its workers in this order. The folders with long files come
 # first, so that all workers end at about the same time.
-LONGEST_FIRST = ('nodes', 'demo', 'models', 'evaluation', 'mapping', 'cli', 'core')
+LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
 #: The tests that do not run here, by the Python module they need.
 NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 

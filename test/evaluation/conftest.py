@@ -1,48 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small world for evaluations: the simulated room, and queries seen in it."""
+"""A small world for evaluations."""
 
-import numpy as np
-import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
+from recorded_room import files, recording, room
 
-from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
-
-QUERIES = 12
-
-
-def make_recording(room):
-    """Views of two to twelve objects; boxes are shaken a little, labels are half sure."""
-    rng = np.random.default_rng(3)
-    seen = see_room(room)
-    frames = []
-    for number in range(QUERIES):
-        rows = np.sort(rng.permutation(len(seen))[:2 + number])
-        own = np.zeros((len(rows), len(room)))
-        own[np.arange(len(rows)), rows] = 0.08
-        frames.append(QueryFrame(
-            stamp_ns=(100 + number) * 10**9,
-            bboxes_xyxy=seen.bboxes_xyxy[rows] + rng.normal(0, 1.0, (len(rows), 4)),
-            class_ids=tuple(seen.class_ids[row] for row in rows), scores=seen.scores[rows],
-            similarities=rng.uniform(0.1, 0.3, own.shape) + own, true_landmark=rows,
-            map_from_camera=MAP_FROM_CAMERA, group=number, is_main=True))
-    return Queries(room.landmark_ids, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), tuple(frames))
-
-
-@pytest.fixture(scope='package')
-def room():
-    return make_room()
-
-
-@pytest.fixture(scope='package')
-def recording(room):
-    return make_recording(room)
-
-
-@pytest.fixture(scope='package')
-def files(room, recording, tmp_path_factory):
-    """A folder with queries.npz and map.yaml."""
-    folder = tmp_path_factory.mktemp('small')
-    write_map(room, folder / 'map.yaml')
-    save_queries(folder / 'queries.npz', recording)
-    return folder
+__all__ = ['files', 'recording', 'room']
