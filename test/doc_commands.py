@@ -10,7 +10,7 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
 PAGES = [PROJECT / 'README.md', PROJECT / 'CONTRIBUTING.md', PROJECT / 'SECURITY.md',
-         *sorted((PROJECT / 'doc').glob('*.md'))]
+         PROJECT / 'studies/README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
 # Programs of others, and words of the shell. A program that is in no list fails the test.
 FOREIGN = {'bloom-release', 'cd', 'cp', 'dask', 'docker', 'done', 'export', 'git', 'grep', 'pip',
            'rosdep', 'rosdoc2', 'rsync', 'rviz2', 'sleep', 'source', 'sudo', 'touch'}

@@ -184,7 +184,7 @@ def environment() -> dict[str, str]:
 
 
 def test_the_example_of_the_library_runs():
-    text = (PROJECT / 'doc/api.md').read_text()
+    text = (PROJECT / 'doc/developers.md').read_text()
     code = re.search(r'```python\n(.*?)```', text, re.DOTALL).group(1)
     done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, text=True,
                           capture_output=True, timeout=300)
@@ -207,4 +207,4 @@ def test_a_wrong_command_is_noticed(line, capsys):
 def test_pages_have_commands():
     """Else a change of the layout of the pages would hide all of them from these tests."""
     pages = {command.page for command in commands()}
-    assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'security.md'} <= pages
+    assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'fleet.md'} <= pages

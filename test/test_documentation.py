@@ -91,7 +91,7 @@ def texts(node):
 def test_the_messages_that_are_looked_up_exist():
     sources = (PROJECT / 'cliploc_ros').rglob('*.py')
     known = [text for path in sources for text in texts(ast.parse(path.read_text()))]
-    page = (PROJECT / 'doc/troubleshooting.md').read_text().split('\n## There is no')[1]
+    page = (PROJECT / 'doc/your_robot.md').read_text().split('\n### There is no')[1]
     quoted = re.findall(r'^\| `([^`|]+ [^`|]+)` \|', page, re.MULTILINE)
     assert len(quoted) > 10
     for message in quoted:
@@ -119,7 +119,7 @@ def test_the_interface_has_every_topic_and_service_and_no_other(node):
             for name in named} == used
 
 
-@pytest.mark.parametrize('page', ['README.md', 'doc/maps.md'])
+@pytest.mark.parametrize('page', ['README.md', 'doc/mapping.md'])
 def test_the_map_of_the_documents_is_valid(page, tmp_path):
     text = (PROJECT / page).read_text()
     path = tmp_path / 'map.yaml'

@@ -35,7 +35,7 @@ def test_every_page_is_there_and_in_the_menu(site):
 
 
 def test_the_reference_has_the_docstrings(site):
-    text = (site / 'api.html').read_text()
+    text = (site / 'developers.html').read_text()
     assert 'Find where the camera was when it saw the last of some frames.' in text
     assert 'id="cliploc_ros.core.relocalizer.Relocalizer.relocalize"' in text
 
