@@ -131,7 +131,8 @@ def grow(place: Place, options: RelocalizerOptions, seed: int, vertical: bool
     landmark_map = place.landmark_map
     relocalizer = Relocalizer(landmark_map, replace(options, k=min(options.k, len(landmark_map))))
     for group in dict.fromkeys(place.groups):
-        session, answers = Session(relocalizer), []
+        session = Session(relocalizer)
+        answers: list[Answer] = []
         for query in sorted((one for one, its in zip(queries, place.groups, strict=True)
                              if its == group), key=lambda one: one.observation.stamp_ns):
             found = session.localize(query.observation, 0, GROUP_SIZE, _WINDOW_S)
