@@ -25,7 +25,7 @@ def test_a_simulated_room_is_searched_in_every_mode(capsys):
         right, requests = map(int, row[3].split(' of '))
         assert requests == 4
         for cell in row[4:-1]:
-            accepted, wrong = map(int, re.match(r'(\d+), (\d+);', cell).groups())
+            accepted, wrong = map(int, re.match(r'(\d+), (\d+) \(', cell).groups())
             assert accepted - wrong <= right
             assert accepted <= requests
     assert cells(elsewhere.splitlines()[-1])[:2] == ['all objects exchanged', '0 of 40']
