@@ -151,9 +151,12 @@ def check_script(script: str, *arguments: str) -> None:
 def test_an_option_in_a_sentence_exists(command):
     """A sentence may leave out what is required, so only the options are looked up."""
     module, arguments = program_of(command)
+    parser = parser_of(module)
+    if parser._subparsers is not None:
+        parser = parser._subparsers._group_actions[0].choices[arguments[0]]
     for word in arguments:
         if word.startswith('--') and len(word) > 2 and word != '--ros-args':
-            assert word.partition('=')[0] in parser_of(module)._option_string_actions, word
+            assert word.partition('=')[0] in parser._option_string_actions, word
 
 
 @pytest.fixture
