@@ -122,8 +122,12 @@ def make_room(seed: int, counts: Mapping[str, int] | None = None, unknown: int =
     objects = []
     for i, (look, place) in enumerate(zip(looks, chosen, strict=True)):
         numbers[look.class_id] += 1
+        slot = slots[place]
+        x, y, z = slot.position
+        dx, dy = rng.uniform(-0.025, 0.025, 2)
+        jitter = Slot((x + dx, y + dy, z), slot.yaw + rng.uniform(-0.5, 0.5))
         objects.append(WorldObject(f'{look.class_id}_{numbers[look.class_id]}', look,
-                                   _jitter(slots[place], rng), i not in unmapped))
+                                   jitter, i not in unmapped))
     return Room(seed, furniture, tuple(objects))
 
 
@@ -155,12 +159,6 @@ def _draw_looks(class_id: str, count: int, rng: np.random.Generator) -> list[App
         if look.label not in {other.label for other in looks}:
             looks.append(look)
     return looks
-
-
-def _jitter(slot: Slot, rng: np.random.Generator) -> Slot:
-    x, y, z = slot.position
-    dx, dy = rng.uniform(-0.025, 0.025, 2)
-    return Slot((x + dx, y + dy, z), slot.yaw + rng.uniform(-0.5, 0.5))
 
 
 def _furnish(rng: np.random.Generator) -> tuple[tuple[tuple[Mesh, str], ...], list[Slot]]:

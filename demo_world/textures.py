@@ -49,7 +49,8 @@ def paint(look: Appearance, repeats: int, rng: np.random.Generator) -> npt.NDArr
         for x in range(0, width, SIZE_PX):
             image[72:190, x + 18:x + 238] = second
             _print_word(image[72:190, x + 18:x + 238], look.word, second)
-    return _weather(image, rng)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, image.shape[:2]).astype(np.float32), (0, 0), 6)
+    return np.clip(image * (1 + 0.25 * noise[..., None]), 0, 255).astype(np.uint8)
 
 
 def _print_word(field: npt.NDArray[np.uint8], word: str, paper: tuple[int, int, int]) -> None:
@@ -86,8 +87,3 @@ def paint_wall(color: tuple[int, int, int], rng: np.random.Generator) -> npt.NDA
     if rng.random() < 0.5:
         image[:, (np.arange(SIZE_PX) // 16) % 2 == 0] *= 0.96
     return np.clip(image, 0, 255).astype(np.uint8)
-
-
-def _weather(image: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    noise = cv2.GaussianBlur(rng.normal(0, 1, image.shape[:2]).astype(np.float32), (0, 0), 6)
-    return np.clip(image * (1 + 0.25 * noise[..., None]), 0, 255).astype(np.uint8)

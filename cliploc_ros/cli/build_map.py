@@ -96,7 +96,12 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.maps.map_file import write_map
 
     begin = time.monotonic()
-    _check_folder(options.out)
+    # Refuse an output whose folder is missing, before the work is done.
+    path = options.out
+    if not path.parent.is_dir():
+        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
+    if path.is_dir():
+        raise MappingError(f'{path} is a folder; name the map file to write')
     check_layer_options(options)
     old = None if options.update is None else read_old_map(options.update)
     recorded = read_source(options)
@@ -195,14 +200,6 @@ def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]'
     given = correction if options.mount is None else mount_from_numbers(options.mount) @ correction
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
-
-
-def _check_folder(path: Path) -> None:
-    """Refuse an output whose folder is missing, before the work is done."""
-    if not path.parent.is_dir():
-        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
-    if path.is_dir():
-        raise MappingError(f'{path} is a folder; name the map file to write')
 
 
 def _write_report(path: Path, report: dict[str, Any]) -> None:

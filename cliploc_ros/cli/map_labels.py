@@ -3,7 +3,6 @@
 """Options that say how to label a map, and what comes of them."""
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,7 +16,6 @@ from cliploc_ros.errors import ModelError
 if TYPE_CHECKING:
     from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
     from cliploc_ros.core.maps.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.labelling import Phrases
     from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
     from cliploc_ros.vocabulary.vocabulary import Vocabulary
@@ -80,17 +78,15 @@ class Labeller:
             return landmark_map, embeddings
         names = sorted({name for row in range(len(landmark_map))
                         for name in classes_of(landmark_map, row)})
-        labelled = label_landmarks(landmark_map, embeddings, self._phrases(self.encoder, names))
-        return labelled, embeddings
-
-    def _phrases(self, encoder: Encoder, names: Sequence[str]) -> 'dict[str, list[Phrases]]':
-        """Return the phrases of some classes; the user's change more often than the shipped."""
+        # The phrases of some classes; the user's change more often than the shipped.
         from cliploc_ros.models.phrase_embeddings import phrases_of_classes
         from cliploc_ros.vocabulary.vocabulary import shipped_phrases
 
-        return phrases_of_classes(encoder.weights, encoder.options, [
+        phrases = phrases_of_classes(self.encoder.weights, self.encoder.options, [
             {name: shipped_phrases(name) for name in names},
             {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
+        labelled = label_landmarks(landmark_map, embeddings, phrases)
+        return labelled, embeddings
 
 
 def prepare_labels(options: argparse.Namespace, detections: 'PosedDetections') -> Labeller:

@@ -73,7 +73,13 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
     square = float(innovation @ np.linalg.solve(before.covariance + covariance, innovation))
     doubt = max(1.0, square / _CONTRADICTION)
     prior, own = doubt * before.covariance, doubt * covariance
-    given = _what_is_new(prior, own)
+    # The covariance that makes a filter of a prior as certain as the better of both.
+    root = np.linalg.cholesky(prior)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, own).T)
+    ratios, axes = np.linalg.eigh((whitened + whitened.T) / 2)
+    information = np.maximum(1.0 / ratios - 1.0, _LEAST_SHARE / ratios)
+    axes = root @ axes
+    given = np.asarray((axes / information) @ axes.T)
     gain = np.linalg.solve(prior + given, prior).T
     step, after = gain @ innovation, prior - gain @ prior
     pose = before.map_from_camera.copy()
@@ -91,13 +97,3 @@ def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
             float(Rotation.from_matrix(motion[:3, :3]).magnitude())]
     return Known(odom_from_camera, pose,
                  covariance + np.diag(np.repeat(_DRIFT ** 2 * np.array(ways), 3)))
-
-
-def _what_is_new(prior: NDArray[np.float64], own: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance that makes a filter of a prior as certain as the better of both."""
-    root = np.linalg.cholesky(prior)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, own).T)
-    ratios, axes = np.linalg.eigh((whitened + whitened.T) / 2)
-    information = np.maximum(1.0 / ratios - 1.0, _LEAST_SHARE / ratios)
-    axes = root @ axes
-    return np.asarray((axes / information) @ axes.T)

@@ -84,7 +84,13 @@ class BagReader:
 
     def __enter__(self) -> Self:
         """Open the recording."""
-        self._check_path()
+        if not self.path.exists():
+            raise DatasetError(f'{self.path}: no such recording')
+        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
+            raise DatasetError(
+                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
+                f'one that `ros2 bag reindex {self.path}` rebuilds'
+            )
         try:
             reader = Reader(self.path)
             reader.open()
@@ -214,15 +220,6 @@ class BagReader:
         if self._reader is None:
             raise RuntimeError('the recording is not open: use it in a with statement')
         return self._reader
-
-    def _check_path(self) -> None:
-        if not self.path.exists():
-            raise DatasetError(f'{self.path}: no such recording')
-        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
-            raise DatasetError(
-                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
-                f'one that `ros2 bag reindex {self.path}` rebuilds'
-            )
 
     def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
         topics: dict[str, BagTopic] = {}

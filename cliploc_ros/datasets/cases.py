@@ -133,9 +133,11 @@ def read_case(path: Path) -> Case:
     for stamp, image in sorted(images.items()):
         if not (stamp in others[_CAMERA_INFO] and stamp in others[_DETECTIONS]):
             raise DatasetError(f'{path}: the image of {stamp} ns has no camera_info or detections')
+        data = others[_CAMERA].get(stamp)
+        pose_of = None if data is None else map_from_camera_of(_deserialized(data, POSE, _CAMERA))
         frames.append(CaseFrame(
             stamp, image_type, image, others[_CAMERA_INFO][stamp], others[_DETECTIONS][stamp],
-            _up_of(others[_UP].get(stamp)), _pose_of(others[_CAMERA].get(stamp))))
+            _up_of(others[_UP].get(stamp)), pose_of))
     if not frames:
         raise DatasetError(f'{path}: {topics[0]} has no messages')
     return Case(tuple(frames), report)
@@ -168,10 +170,6 @@ def _parsed(text: str, path: Path) -> Mapping[str, Any]:
     if not isinstance(report, dict):
         raise DatasetError(f'{path}: {VERDICT} must be a mapping')
     return report
-
-
-def _pose_of(data: bytes | None) -> NDArray[np.float64] | None:
-    return None if data is None else map_from_camera_of(_deserialized(data, POSE, _CAMERA))
 
 
 def _up_of(data: bytes | None) -> NDArray[np.float64] | None:

@@ -117,7 +117,9 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
     depths = np.full(len(bboxes_xyxy), np.nan, dtype=np.float32)
     spreads = depths.copy()
     density = depth.depths_m.size / (camera.width * camera.height) / _STEP**2
-    for row, (left, top, right, bottom) in enumerate(_inner(bboxes_xyxy)):
+    centres = np.tile(0.5 * (bboxes_xyxy[:, :2] + bboxes_xyxy[:, 2:]), 2)
+    inner = centres + _INNER_SHARE * (bboxes_xyxy - centres)
+    for row, (left, top, right, bottom) in enumerate(inner):
         inside = values[(pixels[0] >= left) & (pixels[0] <= right)
                         & (pixels[1] >= top) & (pixels[1] <= bottom)]
         expected = density * (right - left) * (bottom - top)
@@ -177,11 +179,6 @@ def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
         raise DatasetError(
             f'{where}: the median depth of the boxes is {median:.4g} m, expected {least} to '
             f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')
-
-
-def _inner(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
-    centres = np.tile(0.5 * (bboxes_xyxy[:, :2] + bboxes_xyxy[:, 2:]), 2)
-    return centres + _INNER_SHARE * (bboxes_xyxy - centres)
 
 
 def _points_in_color(depth: DepthImage, camera: Camera, step: int

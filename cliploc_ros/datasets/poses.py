@@ -87,7 +87,11 @@ def read_pose_topic(reader: BagReader, name: str) -> Trajectory:
         message = reader.deserialize(recorded)
         pose = pose_of(message)
         stamps.append(stamp_ns(message))
-        rows.append(_numbers(pose.position, pose.orientation))
+        position = pose.position
+        orientation = pose.orientation
+        numbers = (position.x, position.y, position.z,
+                   orientation.x, orientation.y, orientation.z, orientation.w)
+        rows.append(numbers)
     return make_trajectory(stamps, rows, f'{reader.path}: {name}')
 
 
@@ -148,8 +152,3 @@ def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:
     raise DatasetError(
         f'{where}: images begin at {first_ns / NS_PER_S:.3f} s, poses at '
         f'{span[0] / NS_PER_S:.3f} s, {offset_s:+.3f} s apart, and do not overlap; {remedy}')
-
-
-def _numbers(position: Any, orientation: Any) -> tuple[float, ...]:
-    return (position.x, position.y, position.z,
-            orientation.x, orientation.y, orientation.z, orientation.w)

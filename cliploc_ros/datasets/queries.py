@@ -243,7 +243,9 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
             row = np.argwhere(~np.isfinite(arrays[name]))[0][0]
             raise _ArrayError(f'array {name} is not finite in row {row}')
     ids = arrays['landmark_ids']
-    _refuse('landmark_ids', 'repeats an id', _repeated(ids))
+    repeated = np.ones(len(ids), dtype=np.bool_)
+    repeated[np.unique(ids, return_index=True)[1]] = False
+    _refuse('landmark_ids', 'repeats an id', repeated)
     _refuse('landmark_ids', 'is empty', ids == '')
     if (arrays['intrinsics_fx_fy_cx_cy'][:2] <= 0).any():
         raise _ArrayError('array intrinsics_fx_fy_cx_cy has a focal length that is not above 0')
@@ -261,20 +263,28 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
     )
     truth = arrays['true_landmark']
     _refuse('true_landmark', 'is no landmark', (truth < -1) | (truth >= len(ids)))
-    _check_poses(arrays['map_from_camera'])
-    _check_stamps(arrays)
-    _check_groups(arrays['query_group'], arrays['is_main'])
+    poses = arrays['map_from_camera']
+    rotations = poses[:, :3, :3]
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    no_rotation = (error > 1e-3) | (np.linalg.det(rotations) < 0)
+    no_rotation |= (poses[:, 3] != [0, 0, 0, 1]).any(axis=1)
+    _refuse('map_from_camera', 'is no rigid transform', no_rotation)
+    timestamps = arrays['timestamps']
+    _refuse('timestamps', 'is negative', timestamps < 0)
+    if STAMPS_NS in arrays:
+        difference_s = np.abs(arrays[STAMPS_NS] / NS_PER_S - timestamps)
+        _refuse(STAMPS_NS, 'contradicts timestamps', difference_s > 1e-6)
+    groups = arrays['query_group']
+    is_main = arrays['is_main']
+    for group in np.unique(groups):
+        mains = int(is_main[groups == group].sum())
+        if mains != 1:
+            raise _ArrayError(f'array is_main marks {mains} frames of query_group {group}, not 1')
 
 
 def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
     if is_wrong.any():
         raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
-
-
-def _repeated(values: NDArray[Any]) -> NDArray[np.bool_]:
-    repeated = np.ones(len(values), dtype=np.bool_)
-    repeated[np.unique(values, return_index=True)[1]] = False
-    return repeated
 
 
 def _check_offsets(offsets: NDArray[Any], boxes: int) -> None:
@@ -284,29 +294,6 @@ def _check_offsets(offsets: NDArray[Any], boxes: int) -> None:
             f'expected 0 to {boxes}, the number of boxes'
         )
     _refuse('frame_offsets', 'decreases', np.diff(offsets.astype(np.int64), prepend=0) < 0)
-
-
-def _check_poses(poses: NDArray[Any]) -> None:
-    rotations = poses[:, :3, :3]
-    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    no_rotation = (error > 1e-3) | (np.linalg.det(rotations) < 0)
-    no_rotation |= (poses[:, 3] != [0, 0, 0, 1]).any(axis=1)
-    _refuse('map_from_camera', 'is no rigid transform', no_rotation)
-
-
-def _check_stamps(arrays: dict[str, NDArray[Any]]) -> None:
-    timestamps = arrays['timestamps']
-    _refuse('timestamps', 'is negative', timestamps < 0)
-    if STAMPS_NS in arrays:
-        difference_s = np.abs(arrays[STAMPS_NS] / NS_PER_S - timestamps)
-        _refuse(STAMPS_NS, 'contradicts timestamps', difference_s > 1e-6)
-
-
-def _check_groups(groups: NDArray[Any], is_main: NDArray[np.bool_]) -> None:
-    for group in np.unique(groups):
-        mains = int(is_main[groups == group].sum())
-        if mains != 1:
-            raise _ArrayError(f'array is_main marks {mains} frames of query_group {group}, not 1')
 
 
 def _check_landmarks(arrays: dict[str, NDArray[Any]], known: Collection[str]) -> None:

@@ -55,7 +55,12 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
         axes.grid(color='#EEEEEE', zorder=0)
         _draw_panel(axes, review, (across, up), entries)
         if up == 1:
-            _draw_walk(axes, map_from_camera)
+            # Draw where the camera was, and where it looked.
+            positions, forward = map_from_camera[:, :2, 3], map_from_camera[:, :2, 2]
+            axes.plot(*positions.T, ':', color='#888888', linewidth=1.0, zorder=2)
+            axes.plot(*positions.T, '.', color='#666666', markersize=5, zorder=2)
+            for start, end in zip(positions, positions + _HEADING_M * forward, strict=True):
+                axes.plot(*zip(start, end, strict=True), color='#666666', linewidth=0.9, zorder=2)
     legend = figure.add_subplot(grid[0, 1])
     legend.set_axis_off()
     legend.legend(handles=_legend(review), loc='upper left', frameon=False, fontsize=11)
@@ -90,15 +95,6 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
 def _name(axes: Axes, place: NDArray[np.float64], name: str, color: str) -> None:
     axes.text(place[0], place[1], name, fontsize=8, ha='center', va='center', color=color,
               zorder=8, fontweight='bold', path_effects=EDGED)
-
-
-def _draw_walk(axes: Axes, map_from_camera: NDArray[np.float64]) -> None:
-    """Draw where the camera was, and where it looked."""
-    positions, forward = map_from_camera[:, :2, 3], map_from_camera[:, :2, 2]
-    axes.plot(*positions.T, ':', color='#888888', linewidth=1.0, zorder=2)
-    axes.plot(*positions.T, '.', color='#666666', markersize=5, zorder=2)
-    for start, end in zip(positions, positions + _HEADING_M * forward, strict=True):
-        axes.plot(*zip(start, end, strict=True), color='#666666', linewidth=0.9, zorder=2)
 
 
 def _legend(review: MapReview) -> list[Line2D | Patch]:

@@ -94,25 +94,22 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
     repeated = sum(review.repeated for review in reviews)
     how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
     page = folder / 'index.html'
-    page.write_text('\n'.join([
-        '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
-        '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
-        '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
-        f'{escape(method)}.</p>', _SYNTHETIC, section, _table(judged),
-        f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
-        '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
-        'poses were not published.</figcaption></figure>', how,
-        *map(_figure, judged), '</html>', '']), encoding='utf-8')
-    return page
-
-
-def _table(judged: Sequence[Judged]) -> str:
     rows = [''.join(f'<th>{escape(heading)}</th>' for heading, _ in _COLUMNS)]
     for one in judged:
         kind = 'accepted' if one.wake_up.accepted else 'refused'
         rows.append(''.join(f'<td class="{kind}">{escape(cell)}</td>' if cell == kind
                             else f'<td>{escape(cell)}</td>' for cell in _cells(one)))
-    return '<table>' + ''.join(f'<tr>{row}</tr>' for row in rows) + '</table>'
+    table = '<table>' + ''.join(f'<tr>{row}</tr>' for row in rows) + '</table>'
+    page.write_text('\n'.join([
+        '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
+        '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
+        '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
+        f'{escape(method)}.</p>', _SYNTHETIC, section, table,
+        f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
+        '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
+        'poses were not published.</figcaption></figure>', how,
+        *map(_figure, judged), '</html>', '']), encoding='utf-8')
+    return page
 
 
 def _figure(judged: Judged) -> str:

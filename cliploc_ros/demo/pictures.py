@@ -40,7 +40,13 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
         The PNG to write.
     """
     figure = Figure(figsize=(14.0, 6.9), dpi=_DPI)
-    _draw_title(figure, review)
+    judged = review.judged
+    color = ACCEPTED if judged.wake_up.accepted else REFUSED
+    figure.text(0.008, 0.945, f'Wake-up {judged.number}: {verdict(judged)}', color=color,
+                fontsize=15, fontweight='bold')
+    wake_up = judged.wake_up
+    figure.text(0.992, 0.945, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
+                fontsize=11, ha='right')
     image_axes = figure.add_axes((0.008, 0.075, 0.552, 0.84))
     _draw_image(image_axes, review, landmark_map)
     _draw_legend(figure)
@@ -49,16 +55,6 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     panel.set(xlim=(0, 1), ylim=(_MOST_ROWS, -1))
     _list_matches(panel, review, landmark_map)
     figure.savefig(path)
-
-
-def _draw_title(figure: Figure, review: Review) -> None:
-    judged = review.judged
-    color = ACCEPTED if judged.wake_up.accepted else REFUSED
-    figure.text(0.008, 0.945, f'Wake-up {judged.number}: {verdict(judged)}', color=color,
-                fontsize=15, fontweight='bold')
-    wake_up = judged.wake_up
-    figure.text(0.992, 0.945, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
-                fontsize=11, ha='right')
 
 
 def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap) -> None:
@@ -125,7 +121,15 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap) -> Non
     line += 1.1
     numbers = _reading_order(review)
     for match in sorted(review.matches, key=lambda match: numbers[match.detection]):
-        cells = _match_cells(review, landmark_map, match.detection, match.landmark)
+        # Label, similarity and its rank as text, and whether the match is true.
+        landmark = match.landmark
+        similarity = rank = ''
+        if review.similarities is not None:
+            row = review.similarities[match.detection]
+            similarity, rank = f'{row[landmark]:.2f}', str(1 + int((row > row[landmark]).sum()))
+        is_true = None if review.true_landmarks is None else (
+            review.true_landmarks[match.detection] == landmark_map.landmark_ids[landmark])
+        cells = landmark_map.labels[landmark], similarity, rank, is_true
         _write_row(panel, line, [str(numbers[match.detection]), *cells[:3], f'{match.iou:.2f}'],
                    cells[3])
         line += 1
@@ -143,18 +147,6 @@ def _list_reason(panel: Axes, review: Review, line: float) -> float:
         panel.text(0, line, text, fontsize=9, va='top', color=REFUSED)
         line += 1
     return line + 0.3
-
-
-def _match_cells(review: Review, landmark_map: LandmarkMap, detection: int, landmark: int
-                 ) -> tuple[str, str, str, bool | None]:
-    """Return label, similarity and its rank as text, and whether the match is true."""
-    similarity = rank = ''
-    if review.similarities is not None:
-        row = review.similarities[detection]
-        similarity, rank = f'{row[landmark]:.2f}', str(1 + int((row > row[landmark]).sum()))
-    is_true = None if review.true_landmarks is None else (
-        review.true_landmarks[detection] == landmark_map.landmark_ids[landmark])
-    return landmark_map.labels[landmark], similarity, rank, is_true
 
 
 def _write_row(panel: Axes, line: float, cells: list[str], is_true: bool | None) -> None:

@@ -140,7 +140,10 @@ class Reviewer:
     def review(self, judged: Judged) -> Review:
         """Repeat the search of a wake-up."""
         stamp = judged.wake_up.stamp_ns
-        image_rgb = _read_image(self._sequence.image_paths[self._sequence.stamps_ns.index(stamp)])
+        path = self._sequence.image_paths[self._sequence.stamps_ns.index(stamp)]
+        pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        assert pixels_bgr is not None  # the conversion to a recording has read it
+        image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
         detections = judged.wake_up.detections.usable(
             self._camera.width, self._camera.height, self._max_detections)
         observation = self._observe(image_rgb, self._camera, detections, stamp)
@@ -161,12 +164,6 @@ def _same_pose(first: NDArray[np.float64] | None, second: NDArray[np.float64] | 
         return first is second
     error_m, error_deg = pose_error(first, second)
     return error_m < _SAME_POSE[0] and error_deg < _SAME_POSE[1]
-
-
-def _read_image(path: Path) -> NDArray[np.uint8]:
-    pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    assert pixels_bgr is not None  # the conversion to a recording has read it
-    return np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
 
 
 def _read_true_boxes(folder: Path) -> dict[int, tuple[TrueBox, ...]]:

@@ -130,7 +130,11 @@ class Robot(Node):
         """
         last_ns = self._reader.start_ns
         for stamp, group in groupby(self._reader.messages(), key=lambda message: message.stamp_ns):
-            self._rest((stamp - last_ns) / NS_PER_S / rate)
+            seconds = (stamp - last_ns) / NS_PER_S / rate
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                self._check()
+                self._executor.spin_once(timeout_sec=_SPIN_S)
             last_ns, frame = stamp, list(group)
             if stamp in wake_up_at:
                 yield self._wake_up(stamp, frame)
@@ -165,12 +169,6 @@ class Robot(Node):
     def _publish(self, frame: list[BagMessage]) -> None:
         for message in frame:
             self._topics[message.topic].publish(message.data)
-
-    def _rest(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._check()
-            self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def _wait(self, condition: Callable[[], bool]) -> None:
         """Process callbacks until a condition holds."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from numpy.typing import NDArray
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
@@ -160,20 +159,16 @@ def prepare(options: DemoOptions) -> None:
         For an unknown method, missing assets, and a folder that cannot be written.
     """
     relocalizer_options(options.values)
-    _make_folder(options.out)
+    # Make the folder for the pictures, and remove those of an earlier run.
+    make_folder(options.out)
+    for picture in options.out.glob(page.PICTURES):
+        picture.unlink()
     needed = [options.assets / 'sequence', options.assets / 'yolo.pt',
               *(value for value in options.parameters.values() if isinstance(value, Path))]
     for path in needed:
         if not path.exists():
             raise DemoError(f'{path} is missing: run script/setup again, or choose another '
                             'folder with --assets')
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the folder for the pictures, and remove those of an earlier run."""
-    make_folder(folder)
-    for picture in folder.glob(page.PICTURES):
-        picture.unlink()
 
 
 def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:
@@ -252,16 +247,13 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
     for one in judged:
         reviews.append(reviewer.review(one))
         draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(one))
-    draw_top_view(judged, landmark_map, _walked(sequence), options.out / page.TOP_VIEW)
-    section = '' if options.wake_up_map is None else options.wake_up_map.section
-    return page.write_page(options.out, reviews, options.method, section)
-
-
-def _walked(sequence: TumSequence) -> NDArray[np.float64]:
-    """Return the camera's path while it took images (t, 3) [m]."""
+    # The camera's path while it took images (t, 3) [m].
     truth = sequence.trajectory
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
-    return truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]
+    walked = truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]
+    draw_top_view(judged, landmark_map, walked, options.out / page.TOP_VIEW)
+    section = '' if options.wake_up_map is None else options.wake_up_map.section
+    return page.write_page(options.out, reviews, options.method, section)
 
 
 def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence) -> Reviewer:

@@ -38,7 +38,8 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     path : Path
         The PNG to write.
     """
-    low, high = _bounds(landmark_map, path_xyz)
+    points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     width, height = high - low
     scale = min(11.0 / width, 9.0 / height)
     figure = Figure(figsize=(width * scale + 3.2, height * scale + 0.9), dpi=_DPI,
@@ -56,12 +57,6 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     figure.legend(handles=_legend(class_colors), loc='outside right upper', frameon=False,
                   fontsize=9)
     figure.savefig(path)
-
-
-def _bounds(landmark_map: LandmarkMap, path_xyz: NDArray[np.float64]
-            ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
-    return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
 
 
 def _draw_wake_up(axes: Axes, judged: Judged) -> None:

@@ -133,7 +133,9 @@ def _seen(frame: CaseFrame, parameters: Mapping[str, Any]
     camera = camera_from_msg(frame.message('camera_info'), (width, height),
                              parameters['rectified'])
     detections = detections_of(frame.message('detections'))
-    names = _class_map(parameters['class_map'])
+    text = parameters['class_map']
+    pairs = (pair.partition('=') for pair in text.split(',') if pair.strip())
+    names = {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
     detections = replace(detections, class_ids=tuple(
         names.get(name, name) for name in detections.class_ids))
     return image, Observation(
@@ -148,9 +150,3 @@ def _parameters(case: Case) -> Mapping[str, Any]:
     if not isinstance(parameters, dict) or not needed <= parameters.keys():
         raise DatasetError(f'the parameters of this case are broken: it needs {sorted(needed)}')
     return parameters
-
-
-def _class_map(text: str) -> dict[str, str]:
-    """Return the map's class names by the detector's, which the node has checked."""
-    pairs = (pair.partition('=') for pair in text.split(',') if pair.strip())
-    return {theirs.strip(): ours.strip() for theirs, _, ours in pairs}

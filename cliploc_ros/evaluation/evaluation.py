@@ -94,7 +94,13 @@ class Evaluation:
         results = self._run(everything, resume)
         own = [one for one in results if _AT not in one.method]
         summaries = summarize(own)
-        self._write(own, summaries)
+        rows = table_rows(summaries)
+        write_trajectories(self.out / _TRAJECTORIES, self.queries, own)
+        remarks = notes(summaries)
+        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
+        write_text(self.out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
+        write_text(self.out / 'results.json', as_json(own))
+        write_text(self.out / 'summary.csv', as_csv(summaries))
         if figures:
             self._draw(own, summaries, _by_count(summarize(results), methods), frames)
         Journal(self.out / _JOURNAL).remove()
@@ -155,15 +161,6 @@ class Evaluation:
             digest.update(np.ascontiguousarray(part).tobytes())
         return {'digest': digest.hexdigest(),
                 'methods': [one.name for one in methods if one.keyframes]}
-
-    def _write(self, results: Sequence[Result], summaries: Sequence[Summary]) -> None:
-        rows = table_rows(summaries)
-        write_trajectories(self.out / _TRAJECTORIES, self.queries, results)
-        remarks = notes(summaries)
-        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
-        write_text(self.out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
-        write_text(self.out / 'results.json', as_json(results))
-        write_text(self.out / 'summary.csv', as_csv(summaries))
 
     def _draw(self, results: Sequence[Result], summaries: Sequence[Summary],
               sweep: dict[str, dict[int, Summary]], frames: Sequence[QueryFrame]) -> None:

@@ -319,7 +319,15 @@ def _make_map(detections: PosedDetections, landmarks: Landmarks, shown: NDArray[
             baseline_deg=float(evidence.baseline_deg[row]),
             last_seen=float(evidence.last_seen[row]), source=options.source)
         for row in range(len(names)))
-    return LandmarkMap(options.frame_id, _landmark_ids(names), names, names, landmarks.centers,
+    # A unique id for each landmark: its class and a number.
+    counts: dict[str, int] = {}
+    ids = []
+    for name in names:
+        word = ''.join(char if char.isalnum() else '_' for char in name)
+        counts[word] = counts.get(word, 0) + 1
+        ids.append(f'{word}_{counts[word]}')
+    landmark_ids = tuple(ids)
+    return LandmarkMap(options.frame_id, landmark_ids, names, names, landmarks.centers,
                        semi_axes, Rotation.from_matrix(rotations).as_quat(), details)
 
 
@@ -331,14 +339,3 @@ def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
         return None
     return tuple((detections.class_names[number], float(counts[number] / counts.sum()))
                  for number in np.argsort(-counts, kind='stable') if counts[number])
-
-
-def _landmark_ids(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a unique id for each landmark: its class and a number."""
-    counts: dict[str, int] = {}
-    ids = []
-    for name in names:
-        word = ''.join(char if char.isalnum() else '_' for char in name)
-        counts[word] = counts.get(word, 0) + 1
-        ids.append(f'{word}_{counts[word]}')
-    return tuple(ids)

@@ -59,16 +59,12 @@ def check_weights_file(path: Path) -> None:
     if path.suffix != '.safetensors' and not head.startswith(_HEADS):
         raise ModelError(f'{path} holds no weights: it is neither a file of PyTorch nor, by its '
                          'name, of safetensors')
-    if path.suffix == '.safetensors':
-        _check_safetensors_size(path, head, size)
+    # The format: eight bytes with the length of a JSON header, the header, the tensors.
+    if path.suffix == '.safetensors' and (
+            len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size):
+        raise damaged(path, 'its header is longer than the file')
 
 
 def damaged(path: Path, reason: object) -> ModelError:
     """Return the error for weights that are truncated or corrupt."""
     return ModelError(f'{path} is truncated or corrupt ({reason}): download it again')
-
-
-def _check_safetensors_size(path: Path, head: bytes, size: int) -> None:
-    # The format: eight bytes with the length of a JSON header, the header, the tensors.
-    if len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size:
-        raise damaged(path, 'its header is longer than the file')

@@ -71,7 +71,12 @@ class LabelCache:
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._prune()
+            # Remove the least recently used files, and those of writers that were killed.
+            files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
+            stale = [file for file in self._folder.glob('.*.tmp')
+                     if _modified(file) < time.time() - _STALE_S]
+            for file in files[self._most_files - 1:] + stale:
+                file.unlink(missing_ok=True)
             self._write(file, key, labels, embeddings)
         except OSError as error:
             logger.warning('label embeddings are not cached and the next start is slow again: '
@@ -91,14 +96,6 @@ class LabelCache:
             Path(name).replace(file)
         finally:
             Path(name).unlink(missing_ok=True)
-
-    def _prune(self) -> None:
-        """Remove the least recently used files, and those of writers that were killed."""
-        files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
-        stale = [file for file in self._folder.glob('.*.tmp')
-                 if _modified(file) < time.time() - _STALE_S]
-        for file in files[self._most_files - 1:] + stale:
-            file.unlink(missing_ok=True)
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()

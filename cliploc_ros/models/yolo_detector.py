@@ -48,7 +48,11 @@ class TorchYolo:
         self._model = load_yolo(file)
         self._settings = {'device': str(device), 'verbose': False}
         if precision == 'fp16':
-            self._settings |= _half_precision()
+            from ultralytics.utils import DEFAULT_CFG_DICT
+
+            # The name changed within 8.4, and the old one warns with every image.
+            half_precision = {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
+            self._settings |= half_precision
         self.stride = stride_of(self._model.model)
         self.names: dict[int, str] = self._model.names
 
@@ -147,10 +151,3 @@ def _load(options: YoloOptions, device: 'torch.device') -> TorchYolo | OpenVinoY
                 raise
             logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
     return TorchYolo(path, device, precision)
-
-
-def _half_precision() -> dict[str, Any]:
-    from ultralytics.utils import DEFAULT_CFG_DICT
-
-    # The name changed within 8.4, and the old one warns with every image.
-    return {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}

@@ -148,12 +148,9 @@ def _convert(file: Path) -> Conversion:
             module.export, module.dynamic, module.format = True, True, 'openvino'
     probe = np.random.default_rng(0).random((1, 3, 2 * stride, 3 * stride), dtype=np.float32)
     with torch.inference_mode():
-        expected = _first(model(torch.from_numpy(probe)))
+        outputs = model(torch.from_numpy(probe))
+        expected = outputs[0] if isinstance(outputs, tuple | list) else outputs
     network = convert_module(model, torch.zeros(1, 3, 4 * stride, 4 * stride), (1, 3, -1, -1))
     about = {'names': {int(number): str(name) for number, name in loaded.names.items()},
              'stride': stride, 'size': None, 'end2end': bool(getattr(model, 'end2end', False))}
     return Conversion(network, probe, expected.numpy(), about)
-
-
-def _first(outputs: Any) -> Any:
-    return outputs[0] if isinstance(outputs, tuple | list) else outputs

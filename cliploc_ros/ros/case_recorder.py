@@ -170,21 +170,16 @@ def _made_folder(name: str) -> Path:
     return folder
 
 
-def _bytes_in(folder: Path) -> int:
-    """Return the size of all files; some may be moved away meanwhile."""
+def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
+    """Raise unless the case fits into what the recordings of the folder may take."""
+    size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
+               for frame in case.frames)
+    # The size of all files; some may be moved away meanwhile.
     used = 0
     for parent, _, names in folder.walk():
         for name in names:
             with suppress(FileNotFoundError):
                 used += (parent / name).stat().st_size
-    return used
-
-
-def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
-    """Raise unless the case fits into what the recordings of the folder may take."""
-    size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
-               for frame in case.frames)
-    used = _bytes_in(folder)
     if used + size > limit_mb * _MIB:
         raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
                            f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: move '

@@ -32,7 +32,12 @@ def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]
         before = _hash_of(files)
         landmark_map = load_map(node, files)
         if not files:
-            return landmark_map, _hash(_content(landmark_map))
+            content = b''.join([
+                repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+                      landmark_map.class_ids)).encode(),
+                landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+                landmark_map.quats_xyzw.tobytes()])
+            return landmark_map, _hash(content)
         if before == _hash_of(files):
             return landmark_map, before
     raise MapError(f'{", ".join(files)}: changes while it is read: write another file and '
@@ -45,14 +50,6 @@ def _hash_of(files: Sequence[str]) -> str:
         return _hash(b''.join(Path(file).read_bytes() for file in files))
     except (OSError, ValueError):
         return ''
-
-
-def _content(landmark_map: LandmarkMap) -> bytes:
-    return b''.join([
-        repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
-              landmark_map.class_ids)).encode(),
-        landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
-        landmark_map.quats_xyzw.tobytes()])
 
 
 def _hash(content: bytes) -> str:

@@ -187,7 +187,10 @@ def relocalizer_options(values: Mapping[str, Value]) -> RelocalizerOptions:
         Names the parameter and its allowed values.
     """
     names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s'}
-    _check_mount(values['base_from_camera'])
+    mount = values['base_from_camera']
+    assert isinstance(mount, list)
+    if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
+        raise OptionsError(f'base_from_camera: the quaternion {mount[3:]} is not of unit length')
     parse_class_map(str(values['class_map']))
     if values['gravity'] == 'base_frame' and not values['base_frame']:
         raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
@@ -227,9 +230,3 @@ def _height_range(heights: Value) -> tuple[float, float]:
     assert isinstance(heights, list)
     low, high = map(float, heights)
     return (low, high) if low != high else (-math.inf, math.inf)
-
-
-def _check_mount(mount: Value) -> None:
-    assert isinstance(mount, list)
-    if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
-        raise OptionsError(f'base_from_camera: the quaternion {mount[3:]} is not of unit length')

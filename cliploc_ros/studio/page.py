@@ -113,9 +113,6 @@ class Page:
             with tools.add_tab('Robot'):
                 self._tools.append(LivePanel(self, live))
         tools.dock_left()
-        self._place_camera()
-
-    def _place_camera(self) -> None:
         centers = np.array([one.center for one in self.studio.document.landmarks.values()])
         middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
         spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0

@@ -4,7 +4,7 @@
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -97,7 +97,7 @@ def _grammar(name: Any, where: str) -> dict[str, list[str]]:
     """Return the rules of a grammar and, where it has none, those of the general one."""
     grammars = _shipped('grammars.yaml')
     if not isinstance(name, str) or name not in grammars:
-        raise OptionsError(f'{where}: grammar: {name!r:.60} is none of {_listed(grammars)}')
+        raise OptionsError(f'{where}: grammar: {name!r:.60} is none of {", ".join(grammars)}')
     return {**grammars[_GENERAL], **grammars[name]}
 
 
@@ -110,7 +110,3 @@ def _words(words: Any, where: str) -> list[str]:
         if not isinstance(word, str) or not word.strip():
             raise OptionsError(f'{where}: {word!r:.60} is no text (quote numbers and yes/no)')
     return words
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ', '.join(names)

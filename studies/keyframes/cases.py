@@ -275,7 +275,10 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     """
     other = others[int(rng.integers(len(others)))]
     strange = other.asked[int(rng.integers(len(other.asked)))]
-    source = _elsewhere(place, frame, rng)
+    # A mapped image that looks another way, by more than 60 degrees or else the most.
+    cosines = np.array([pose_of(one)[:3, 2] for one in place.mapped]) @ pose_of(frame)[:3, 2]
+    away = np.nonzero(cosines < _AWAY_COS)[0]
+    source = place.mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
     if case.is_strange:
         place, frame = other, strange
     frames = [frame, *_second_look(frame, place.seconds)][:case.looks]
@@ -284,7 +287,12 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     poses = [pose_of(one) for one in frames]
     picture = case.picture and make_picture(*case.picture, frame.color()[1], *source.color(), rng)
     shots: list[tuple[Image, Camera, Floats | None]] = []
-    for one, pose, odom in zip(frames, poses, _odometry(poses, rng), strict=True):
+    # `odom_from_camera` of one or two poses, with the error that the package expects.
+    steps = [invert_transform(poses[0]) @ pose for pose in poses]
+    errors = [odometry_deviations(step) * rng.normal(size=6) for step in steps]
+    odometry = [step @ make_transform(Rotation.from_rotvec(error[3:]).as_matrix(), error[:3])
+                for step, error in zip(steps, errors, strict=True)]
+    for one, pose, odom in zip(frames, poses, odometry, strict=True):
         image, camera = one.color()
         if picture is not None:
             image = hang(image, picture, camera, invert_transform(poses[0]) @ pose)
@@ -309,24 +317,9 @@ def pose_of(frame: RawFrame) -> Floats:
     return frame.map_from_camera
 
 
-def _elsewhere(place: Place, frame: RawFrame, rng: Rng) -> RawFrame:
-    """Return a mapped image that looks another way, by more than 60 degrees or else the most."""
-    cosines = np.array([pose_of(one)[:3, 2] for one in place.mapped]) @ pose_of(frame)[:3, 2]
-    away = np.nonzero(cosines < _AWAY_COS)[0]
-    return place.mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
-
-
 def _second_look(frame: RawFrame, others: Sequence[RawFrame]) -> list[RawFrame]:
     """Return the image whose distance is nearest to 20 cm; none where all look another way."""
     found = [(abs(distance - _SECOND_M), row) for row, other in enumerate(others)
              for distance, angle in [pose_error(pose_of(frame), pose_of(other))]
              if _SECOND_RANGE_M[0] <= distance <= _SECOND_RANGE_M[1] and angle < _SECOND_DEG]
     return [others[min(found)[1]]] if found else []
-
-
-def _odometry(poses: Sequence[Floats], rng: Rng) -> list[Floats]:
-    """Return odom_from_camera of one or two poses, with the error that the package expects."""
-    steps = [invert_transform(poses[0]) @ pose for pose in poses]
-    errors = [odometry_deviations(step) * rng.normal(size=6) for step in steps]
-    return [step @ make_transform(Rotation.from_rotvec(error[3:]).as_matrix(), error[:3])
-            for step, error in zip(steps, errors, strict=True)]

@@ -155,7 +155,10 @@ def see_floor(floor: Floor, frames: int, seed: int = 0) -> SeenFloor:
     for pose, place in zip(poses, places, strict=True):
         rows = np.arange(bounds[place], bounds[place + 1])
         clipped, seen = _see(floor.landmark_map, pose, rows, rng)
-        extra = _false_boxes(rng)
+        # Boxes that show nothing.
+        count = rng.poisson(_FALSE_BOXES)
+        corners = rng.uniform([0.0, 0.0], [560.0, 400.0], (count, 2))
+        extra = np.c_[corners, corners + rng.uniform(20.0, 80.0, (count, 2))]
         boxes.append(np.concatenate([clipped, extra]))
         shown.append(np.concatenate([seen, np.full(len(extra), -1)]))
     true = np.concatenate(shown)
@@ -186,13 +189,6 @@ def _see(true_map: LandmarkMap, pose: NDArray[np.float64], rows: NDArray[np.int6
     deviations = np.hypot(_NOISE_PX, _NOISE_SHARE * np.tile(extents[seen], 2))
     noisy = np.clip(clipped[seen] + deviations * rng.normal(size=deviations.shape), 0.0, size)
     return noisy, rows[seen]
-
-
-def _false_boxes(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return boxes that show nothing."""
-    count = rng.poisson(_FALSE_BOXES)
-    corners = rng.uniform([0.0, 0.0], [560.0, 400.0], (count, 2))
-    return np.c_[corners, corners + rng.uniform(20.0, 80.0, (count, 2))]
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,12 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
     yolo, clip = str(kept), ''
     if not kept.exists():
         yolo = str(folder / profile.detector)
-        _write_random_yolo(profile.detector, Path(yolo))
+        file = Path(yolo)
+        import torch
+
+        torch.manual_seed(0)
+        model = import_ultralytics().YOLO(Path(profile.detector).with_suffix('.yaml').name)
+        torch.save({'model': model.model}, file)
     os.environ['HF_HUB_OFFLINE'] = '1'  # before huggingface_hub is imported
     try:
         resolve_clip_weights(ClipOptions(profile.clip_model, profile.clip_pretrained))
@@ -130,14 +135,6 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
     random = [what for what, is_real in kinds.items() if not is_real]
     encoder = json.dumps([profile.clip_model, profile.clip_pretrained, clip])
     return yolo, encoder, f'random: {", ".join(random)}' if random else 'published'
-
-
-def _write_random_yolo(name: str, file: Path) -> None:
-    import torch
-
-    torch.manual_seed(0)
-    model = import_ultralytics().YOLO(Path(name).with_suffix('.yaml').name)
-    torch.save({'model': model.model}, file)
 
 
 def _start(options: argparse.Namespace, *child: str) -> 'subprocess.Popen[str]':

@@ -120,8 +120,15 @@ def detect(detector: Detector, objects: Objects, shapes: NDArray[np.float64], ca
     names = np.where(rng.random(len(rows)) < detector.confusion[rows],
                      np.array(detector.confused, dtype=object)[rows],
                      np.array(objects.class_ids, dtype=object)[rows])
-    boxes, names, rows = _with_halves(boxes, names, rows, detector.split, rng)
-    extra = _false_boxes(rng.poisson(detector.false_boxes), camera, rng)
+    # Boxes, of which some have a second one around their upper half.
+    twice = np.nonzero(rng.random(len(rows)) < detector.split)[0]
+    halves = boxes[twice]
+    halves[:, 3] = 0.5 * (halves[:, 1] + halves[:, 3])
+    boxes, names, rows = (np.concatenate([boxes, halves]), np.concatenate([names, names[twice]]),
+                          np.concatenate([rows, rows[twice]]))
+    count = rng.poisson(detector.false_boxes)
+    corners = rng.uniform(0.0, (camera.width, camera.height), (count, 2))
+    extra = np.c_[corners, corners + rng.uniform(*_FALSE_SIDE_PX, (count, 2))]
     boxes = np.clip(np.concatenate([boxes, extra]), 0.0, [camera.width, camera.height] * 2)
     names = np.concatenate([names, rng.choice(np.array(CLASS_NAMES, dtype=object), len(extra))])
     rows = np.concatenate([rows, np.full(len(extra), -1)])
@@ -153,20 +160,3 @@ def hidden(boxes: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
     shared = np.maximum(high - low, 0.0).prod(axis=2)
     share = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
     return np.asarray((np.tril(share, -1) > most).any(axis=1))
-
-
-def _with_halves(boxes: NDArray[np.float64], names: NDArray[np.object_],
-                 rows: NDArray[np.int64], share: float, rng: np.random.Generator
-                 ) -> tuple[NDArray[np.float64], NDArray[np.object_], NDArray[np.int64]]:
-    """Return boxes, of which some have a second one around their upper half."""
-    twice = np.nonzero(rng.random(len(rows)) < share)[0]
-    halves = boxes[twice]
-    halves[:, 3] = 0.5 * (halves[:, 1] + halves[:, 3])
-    return (np.concatenate([boxes, halves]), np.concatenate([names, names[twice]]),
-            np.concatenate([rows, rows[twice]]))
-
-
-def _false_boxes(count: int, camera: Camera, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return boxes (count, 4) that show nothing."""
-    corners = rng.uniform(0.0, (camera.width, camera.height), (count, 2))
-    return np.c_[corners, corners + rng.uniform(*_FALSE_SIDE_PX, (count, 2))]

@@ -242,20 +242,16 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
         kept = found.sum(axis=1) >= _LEAST_LANDMARKS
         moves, others, found = moves[kept], others[kept], found[kept]
         if near_m > _NEAR_M[-1]:
-            moves = _fitted(centers, landmark_map.centers[others], found)
+            # The upright moves (m, 4, 4) that take points (r, 3) nearest to others (m, r, 3).
+            after = landmark_map.centers[others]
+            weights = found / np.maximum(1, found.sum(axis=1, keepdims=True))
+            first, second = weights @ centers, np.einsum('nr,nrj->nj', weights, after)
+            x, y = np.moveaxis(centers - first[:, None], 2, 0)[:2]
+            u, v = np.moveaxis(after - second[:, None], 2, 0)[:2]
+            turns = np.arctan2((weights * (x * v - y * u)).sum(axis=1),
+                               (weights * (x * u + y * v)).sum(axis=1))
+            moves = _upright_moves(turns, first, second)
     steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
     elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
                  | (moves[:, 0, 0] < _OWN_TURN))
     return moves[elsewhere], others[elsewhere], found[elsewhere]
-
-
-def _fitted(before: NDArray[np.float64], after: NDArray[np.float64], found: NDArray[np.bool_]
-            ) -> NDArray[np.float64]:
-    """Return the upright moves (m, 4, 4) that take points (r, 3) nearest to others (m, r, 3)."""
-    weights = found / np.maximum(1, found.sum(axis=1, keepdims=True))
-    first, second = weights @ before, np.einsum('nr,nrj->nj', weights, after)
-    x, y = np.moveaxis(before - first[:, None], 2, 0)[:2]
-    u, v = np.moveaxis(after - second[:, None], 2, 0)[:2]
-    turns = np.arctan2((weights * (x * v - y * u)).sum(axis=1),
-                       (weights * (x * u + y * v)).sum(axis=1))
-    return _upright_moves(turns, first, second)

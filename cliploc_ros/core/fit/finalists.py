@@ -124,7 +124,11 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
     found = [one for frame in range(len(frames))
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
     if len(frames) > 1 and found:
-        found = _best_in_all(found, rig, count)
+        # The best distinct poses by their scores in all frames, best first.
+        rotations, translations = _poses(found)
+        scores = scores_of(rig, rotations, translations)
+        rows = choose_distinct(scores, rotations, translations, count)
+        found = [found[row]._replace(score=float(scores[row])) for row in rows]
     return _refined(found, rig, deadline)[:_COMPARED] if refine else found[:MAX_DISTINCT]
 
 
@@ -137,14 +141,6 @@ def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[F
                      float(leaders.scores[row]), int(leaders.iterations[row]), frame,
                      leaders.samples[row][leaders.samples[row] >= 0])
             for row in leaders.ranked()]
-
-
-def _best_in_all(found: list[Finalist], rig: Rig, count: int) -> list[Finalist]:
-    """Return the best distinct poses by their scores in all frames, best first."""
-    rotations, translations = _poses(found)
-    scores = scores_of(rig, rotations, translations)
-    rows = choose_distinct(scores, rotations, translations, count)
-    return [found[row]._replace(score=float(scores[row])) for row in rows]
 
 
 def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:

@@ -116,7 +116,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
     information = of_objects.sum(axis=0) + verticals + prior
-    noise_of_objects = _edge_noise(fit) + _position_noise(fit, of_objects)
+    # What the edges' errors add to M, for each object (n, 6, 6).
+    # an edge is as far off as its weight says, in the same direction in all frames
+    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, None, None] * fit.jacobian,
+                  fit.objects, len(fit.sigmas))
+    edge_noise = np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
+    noise_of_objects = edge_noise + _position_noise(fit, of_objects)
     of_frames = _sums(of_matches, fit.frames, len(fit.cameras)) + fit.verticals
     known = max(1, int(fit.verticals.any(axis=(1, 2)).sum()))
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
@@ -200,14 +205,6 @@ def _sums(rows: NDArray[np.float64], groups: NDArray[np.int64], count: int
     sums = np.zeros((count, *rows.shape[1:]))
     np.add.at(sums, groups, rows)
     return sums
-
-
-def _edge_noise(fit: _Fit) -> NDArray[np.float64]:
-    """Return what the edges' errors add to M, for each object (n, 6, 6)."""
-    # an edge is as far off as its weight says, in the same direction in all frames
-    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, None, None] * fit.jacobian,
-                  fit.objects, len(fit.sigmas))
-    return np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
 
 
 def _mean_square(fit: _Fit) -> float:

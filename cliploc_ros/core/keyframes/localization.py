@@ -147,7 +147,11 @@ class KeyframeLocalizer:
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
-            more = self._more(ranks, chosen, first)
+            # More keyframes: those near the pose so far, and the next similar ones.
+            near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
+                                   )[:_MORE].tolist() if first else []
+            more = [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
+                    if one not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
             first = _place(matched, look)
         places = _places(first, matched, look)
@@ -188,14 +192,6 @@ class KeyframeLocalizer:
             near = keyframes_near(poses, guess)
             chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
         return chosen
-
-    def _more(self, ranks: Sequence[int], chosen: Sequence[int], first: '_Place | None'
-              ) -> list[int]:
-        """Return more keyframes: those near the pose so far, and the next similar ones."""
-        near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
-                               )[:_MORE].tolist() if first else []
-        return [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
-                if one not in chosen]
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:

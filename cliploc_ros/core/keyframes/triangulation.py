@@ -45,7 +45,12 @@ def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64
     the most matches agree with is kept, or the one with the widest angle. NaN: no point.
     """
     ours = images[row]
-    neighbours = _neighbours(images, row)
+    poses = np.array([one.map_from_camera for one in images])
+    distances = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
+    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
+    fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
+    order = np.argsort(distances, kind='stable')
+    neighbours = [int(one) for one in order[fit[order]][:_NEIGHBOURS]]
     count = len(ours.bearings)
     seen = np.full((len(neighbours), count, 2), np.nan)
     cameras = np.array([invert_transform(images[one].map_from_camera) @ ours.map_from_camera
@@ -67,15 +72,6 @@ def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64
         best[score > scores] = points[score > scores]
         scores = np.maximum(scores, score)
     return best
-
-
-def _neighbours(images: Sequence[PosedFeatures], row: int) -> list[int]:
-    poses = np.array([one.map_from_camera for one in images])
-    distances = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
-    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
-    fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
-    order = np.argsort(distances, kind='stable')
-    return [int(one) for one in order[fit[order]][:_NEIGHBOURS]]
 
 
 def _crossings(ours: NDArray[np.float64], theirs: NDArray[np.float64],

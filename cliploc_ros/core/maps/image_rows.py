@@ -10,7 +10,6 @@ neither ranks nor standardized similarities, so they stay.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.index.similarities import LabelEmbeddings
 from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
@@ -37,7 +36,13 @@ def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: st
     """
     known = np.flatnonzero(images.is_known)
     means = images.means.astype(np.float32)
-    text_spread, image_spread = _spreads(labels, means, known)
+    # The deviation of a crop's similarities over the map, with labels and with images.
+    sample = known[::-(-len(known) // _CROPS_SAMPLED)]
+    crops = means[sample]
+    with_labels = (crops @ labels.unique[labels.of_landmarks[sample]].T).std(axis=1).mean()
+    others = ~np.eye(len(sample), dtype=np.bool_)  # a mean's similarity with itself says nothing
+    with_means = (crops @ crops.T).std(axis=1, where=others).mean() if len(sample) > 1 else 0.0
+    text_spread, image_spread = max(float(with_labels), 1e-6), max(float(with_means), 1e-6)
     rows = np.asarray(labels, dtype=np.float32)
     if compare == 'both':
         share = image_spread / (text_spread + image_spread)
@@ -51,14 +56,3 @@ def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: st
         rows += means[known].mean(axis=0)
         rows[known] = means[known]
     return LabelEmbeddings.of(rows)
-
-
-def _spreads(labels: LabelEmbeddings, means: NDArray[np.float32], known: NDArray[np.int64]
-             ) -> tuple[float, float]:
-    """Return the deviation of a crop's similarities over the map, with labels and with images."""
-    sample = known[::-(-len(known) // _CROPS_SAMPLED)]
-    crops = means[sample]
-    with_labels = (crops @ labels.unique[labels.of_landmarks[sample]].T).std(axis=1).mean()
-    others = ~np.eye(len(sample), dtype=np.bool_)  # a mean's similarity with itself says nothing
-    with_means = (crops @ crops.T).std(axis=1, where=others).mean() if len(sample) > 1 else 0.0
-    return max(float(with_labels), 1e-6), max(float(with_means), 1e-6)

@@ -270,7 +270,8 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     labelled = isinstance(fields, Mapping) and 'labels' in fields
     _check_keys(fields, _FIELDS[1:] if labelled else _FIELDS, where, _FIELDS[:1] + OPTIONAL_FIELDS)
     details = read_details(fields, where)
-    label = fields.get('label', _heaviest_label(details))
+    heaviest_label = max(details.labels, key=lambda pair: pair[1])[0] if details.labels else ''
+    label = fields.get('label', heaviest_label)
     semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
     low, high = _SEMI_AXIS_RANGE_M
     if not all(low <= axis <= high for axis in semi_axes):
@@ -284,10 +285,6 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
                        f'{math.hypot(*quat_xyzw):.3g}, not 1')
     return (_text(label, f'{where}: label'), _text(fields['class_id'], f'{where}: class_id'),
             center, semi_axes, quat_xyzw, details)
-
-
-def _heaviest_label(details: LandmarkDetails) -> str:
-    return max(details.labels, key=lambda pair: pair[1])[0] if details.labels else ''
 
 
 def _check_keys(tree: Any, expected: tuple[str, ...], where: str,

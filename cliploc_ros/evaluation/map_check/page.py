@@ -56,7 +56,13 @@ def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str,
     if report.look_alikes:
         parts += ['<h2>Places that look alike</h2>', _look_alikes(report)]
     if report.recording is not None:
-        parts += ['<h2>Held-out boxes</h2>', _folds(report.recording),
+        rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
+                 f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
+                for number, one in enumerate(report.recording.folds, start=1)]
+        folds = ('<p>Blocks of time take turns in being judged; landmarks are fitted to the other '
+                 'blocks.</p>' + _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
+                                         '#median IoU'), rows))
+        parts += ['<h2>Held-out boxes</h2>', folds,
                   '<h2>Systematic residuals</h2>', _corrections(report.recording)]
     parts += ['<h2>What these figures rest on</h2>', _list(report.notes), '</html>', '']
     return '\n'.join(parts)
@@ -157,15 +163,6 @@ def _look_alikes(report: CheckReport) -> str:
                      f'{len(one.matched)} of {one.landmarks}', str(one.same_labels), pairs))
     return _table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
                    '#with equal labels', 'which'), rows)
-
-
-def _folds(recording: RecordingCheck) -> str:
-    rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
-             f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
-            for number, one in enumerate(recording.folds, start=1)]
-    return ('<p>Blocks of time take turns in being judged; landmarks are fitted to the other '
-            'blocks.</p>' + _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
-                                    '#median IoU'), rows))
 
 
 def _corrections(recording: RecordingCheck) -> str:

@@ -47,7 +47,14 @@ _MOST_LOOK_ALIKES = 6
 def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
-    bounds = _bounds(landmark_map, report)
+    # Low and high corner (2, 2) of what the pictures show [m].
+    grid = report.grid.positions[:, :2]
+    half = report.grid.spacing_m / 2
+    points = [landmark_map.centers[:, :2], grid - half, grid + half]
+    if report.recording is not None:
+        points.append(report.recording.path_xyz[:, :2])
+    every = np.concatenate(points)
+    bounds = np.array([every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M])
     yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
            'the more of the headings with at least three detectable landmarks give an accepted, '
            'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
@@ -72,17 +79,6 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=_DPI)
     return buffer.getvalue()
-
-
-def _bounds(landmark_map: LandmarkMap, report: CheckReport) -> NDArray[np.float64]:
-    """Return low and high corner (2, 2) of what the pictures show [m]."""
-    grid = report.grid.positions[:, :2]
-    half = report.grid.spacing_m / 2
-    points = [landmark_map.centers[:, :2], grid - half, grid + half]
-    if report.recording is not None:
-        points.append(report.recording.path_xyz[:, :2])
-    every = np.concatenate(points)
-    return np.array([every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M])
 
 
 def _map_figure(landmark_map: LandmarkMap, bounds: NDArray[np.float64], title: str

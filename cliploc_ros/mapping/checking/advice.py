@@ -160,7 +160,7 @@ def _on_spans(report: CheckReport) -> Iterator[str]:
 
 def _on_grid(report: CheckReport) -> Iterator[str]:
     grid = report.grid
-    for rows in _dead_areas(grid)[:_MOST_OF_A_KIND]:
+    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
         if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) > 0.5:
             continue
         low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
@@ -181,11 +181,6 @@ def _on_keyframes(report: CheckReport) -> Iterator[str]:
                f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: drive there when '
                'the layer is made again, or rely on the landmarks')
     yield from _more(len(areas), 'areas that no keyframe reaches')
-
-
-def _dead_areas(grid: GridCheck) -> list[NDArray[np.int64]]:
-    """Return the rows of neighbouring positions that accept no heading, the most first."""
-    return _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])
 
 
 def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -76,15 +76,11 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
     for number in range(options.folds):
         judged = np.nonzero(of_frames == number)[0]
         if len(judged):
-            training = ~_is_near(views.stamps_s, judged, _gap(views.stamps_s, options))
+            block_s = (views.stamps_s[-1] - views.stamps_s[0]) / options.folds
+            gap = float(min(options.gap_s, 0.25 * block_s))
+            training = ~_is_near(views.stamps_s, judged, gap)
             rows, landmarks = _refit(views, witness, training, options)
             yield Fold(judged, rows, landmarks)
-
-
-def _gap(stamps_s: NDArray[np.float64], options: CheckOptions) -> float:
-    """Return the gap [s]; shorter in a recording whose blocks are shorter than asked for."""
-    block_s = (stamps_s[-1] - stamps_s[0]) / options.folds
-    return float(min(options.gap_s, 0.25 * block_s))
 
 
 def _is_near(stamps_s: NDArray[np.float64], judged: NDArray[np.int64], gap_s: float

@@ -66,7 +66,14 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     if options.camera_height_m is not None:
         height = options.camera_height_m
     positions, spacing = _positions(low[:2] - margin, high[:2] + margin, height, options)
-    positions = positions[~_inside(landmark_map, positions)]
+    # Tell which positions lie in a landmark.
+    inside = np.zeros(len(positions), dtype=np.bool_)
+    for center, upper in zip(landmark_map.centers, landmark_map.shapes, strict=True):
+        xx, xy, xz, yy, yz, zz = upper
+        shape = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        offsets = positions - center
+        inside |= np.einsum('pi,pi->p', offsets, np.linalg.solve(shape, offsets.T).T) < 1.0
+    positions = positions[~inside]
     near = np.ones(len(positions), dtype=np.bool_)
     if path is not None:
         near = cKDTree(path[:, :2]).query(positions[:, :2])[0] <= max(_NEAR_M, spacing)
@@ -91,17 +98,6 @@ def _positions(low: NDArray[np.float64], high: NDArray[np.float64], height: floa
     columns = np.meshgrid(x, y, indexing='ij')
     flat = np.stack([column.ravel() for column in columns], axis=1)
     return np.concatenate([flat, np.full((len(flat), 1), height)], axis=1), spacing
-
-
-def _inside(landmark_map: LandmarkMap, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which positions lie in a landmark."""
-    inside = np.zeros(len(positions), dtype=np.bool_)
-    for center, upper in zip(landmark_map.centers, landmark_map.shapes, strict=True):
-        xx, xy, xz, yy, yz, zz = upper
-        shape = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        offsets = positions - center
-        inside |= np.einsum('pi,pi->p', offsets, np.linalg.solve(shape, offsets.T).T) < 1.0
-    return inside
 
 
 def _look(heading: float, pitch: float) -> NDArray[np.float64]:

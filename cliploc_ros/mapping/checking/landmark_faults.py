@@ -130,22 +130,18 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     shown = associate(views, landmarks, options.association_iou)
     evidence = gather_evidence(views, landmarks, shown)
     expected = evidence.expected.copy()
-    reach = _median_reach(views, landmarks, shown)
+    # From how far away landmarks are usually detected [m].
+    farthest = [np.linalg.norm(landmarks.centers[row] - camera_centers(views, views.frames[rows]),
+                               axis=1).max()
+                for row, rows in enumerate(group_boxes(shown, len(landmarks.centers)))
+                if len(rows)]
+    reach = _REACH * float(np.median(farthest)) if farthest else 0.0
     cameras = camera_centers(views, np.arange(len(views.rotations)))
     for row in np.nonzero(evidence.support == 0)[0]:
         expected[row] = count_expected(views, cameras, landmarks.centers[row],
                                        landmarks.bases[row], reach)
     fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
     return Witness(landmarks, shown, evidence, expected, fitted)
-
-
-def _median_reach(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
-    """Return from how far away landmarks are usually detected [m]."""
-    farthest = [np.linalg.norm(landmarks.centers[row] - camera_centers(views, views.frames[rows]),
-                               axis=1).max()
-                for row, rows in enumerate(group_boxes(shown, len(landmarks.centers)))
-                if len(rows)]
-    return _REACH * float(np.median(farthest)) if farthest else 0.0
 
 
 def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None

@@ -61,7 +61,9 @@ def align(given: Views, known: Known, options: UpdateOptions) -> Alignment:
         if np.count_nonzero(found.is_known) < options.min_confirmed:
             break
         step = _offset(known, found)
-        views, total = _moved(views, step), step @ total
+        rotations, translations = camera_from_map(step @ map_from_cameras(views))
+        moved = views._replace(rotations=rotations, translations=translations)
+        views, total = moved, step @ total
         middle = known.landmarks.centers[found.is_known].mean(axis=0)
         if np.linalg.norm(step[:3, :3] @ middle + step[:3, 3] - middle) < _SETTLED_M:
             break
@@ -101,12 +103,6 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
     step[:3, 3] = middle + motion[:3] - step[:3, :3] @ middle
     return step
-
-
-def _moved(views: Views, step: NDArray[np.float64]) -> Views:
-    """Return the views with all poses moved by a rigid motion (4, 4) of the map."""
-    rotations, translations = camera_from_map(step @ map_from_cameras(views))
-    return views._replace(rotations=rotations, translations=translations)
 
 
 def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:

@@ -69,7 +69,8 @@ def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[
     without an old one, the share of the landmarks seen in this recording.
     """
     seen = sight.seen > 0
-    overall = min(options.seen_ratio, _share(sight, seen))
+    share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
+    overall = min(options.seen_ratio, share)
     given = np.array([np.nan if one.seen_ratio is None else one.seen_ratio
                       for one in known.details])
     ratios = np.where(np.isnan(given), overall, given)
@@ -79,8 +80,3 @@ def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[
         factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
     return np.clip(ratios, *_RATIO_RANGE)
-
-
-def _share(sight: Sight, rows: NDArray[np.bool_]) -> float:
-    """Return the share of the views in which some landmarks were seen."""
-    return float(sight.seen[rows].sum()) / max(1.0, float(sight.expected[rows].sum()))

@@ -99,7 +99,8 @@ class WakeUp(Node):
         while not (problem := self._until_ready()):
             looks += 1
             verdict, message = self._look()
-            kinds.update(_kind_of(message))
+            kind_of = re.findall(r'; kind (\w+)(?:; map \w+)?$', message)
+            kinds.update(kind_of)
             print(f'look {looks} [{self._elapsed_s:.1f} s]{turned}: {message}', flush=True)
             if verdict is Verdict.ACCEPTED:
                 return Outcome.ACCEPTED
@@ -194,11 +195,6 @@ def _verdict_of(message: str) -> Verdict:
     """Return the verdict that an answer begins with."""
     return next((verdict for verdict in Verdict if message.startswith(f'{verdict}: ')),
                 Verdict.FAILED)
-
-
-def _kind_of(message: str) -> list[str]:
-    """Return the kind of a refusal, see cliploc_ros.ros.answer; nothing for other answers."""
-    return re.findall(r'; kind (\w+)(?:; map \w+)?$', message)
 
 
 def _in_words(kinds: Counter[str]) -> str:
