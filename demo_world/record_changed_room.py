@@ -30,8 +30,7 @@ from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import make_views
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.yolo_weights import YoloOptions
-from cliploc_ros.recording.keyframes import KeyframeOptions
-from cliploc_ros.recording.recorder import RecordingOptions, record_once
+from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
 
 _ROUNDING = 128
 _SHOWN_IOU = 0.3

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.acceptance.attitude import tilt_handicaps
-from cliploc_ros.core.acceptance.confidence import utilities
+from cliploc_ros.core.acceptance.confidence import tilt_handicaps, utilities
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
+from cliploc_ros.cli.sources import add_network_options, clip_options, yolo_options
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -153,9 +153,9 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.maps.joined_map import join_maps
     from cliploc_ros.core.maps.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.evaluation import Evaluation
-    from cliploc_ros.evaluation.keyframe_queries import with_features
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.recording import with_features
     from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
     from cliploc_ros.evaluation.trials import make_queries
 
@@ -295,8 +295,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
 
 def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     from cliploc_ros.evaluation.recording import recorded_queries
-    from cliploc_ros.recording.keyframes import EVERY_FRAME
-    from cliploc_ros.recording.recorder import RecordingOptions
+    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
 
     frames = _frames(options)
     yolo, clip = yolo_options(options), clip_options(options)

@@ -153,7 +153,7 @@ def _placement(options: argparse.Namespace) -> 'Placement':
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
-    from cliploc_ros.datasets.map_formats.class_names import COCO, read_class_names
+    from cliploc_ros.datasets.map_formats.given_map import COCO, read_class_names
     from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
     from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
     from cliploc_ros.datasets.map_formats.oaslam import read_oaslam

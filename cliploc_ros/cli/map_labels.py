@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cli.networks import clip_options
+from cliploc_ros.cli.sources import clip_options
 from cliploc_ros.errors import ModelError
 
 if TYPE_CHECKING:

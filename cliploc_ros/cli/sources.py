@@ -4,22 +4,58 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.models.devices import INFERENCES
+from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
 
 if TYPE_CHECKING:
-    from cliploc_ros.datasets.bag_frames import ReadPoses
-    from cliploc_ros.datasets.frames import DepthFormat, Frames
-    from cliploc_ros.datasets.observations import Recorded
-    from cliploc_ros.datasets.poses import Poses
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.models.yolo_weights import YoloOptions
 
 _NS_PER_S = 1_000_000_000
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
+
+
+def add_network_options(group: Any) -> None:
+    """Add the options that name detector and CLIP to a group of a parser."""
+    group.add_argument('--profile', choices=PROFILE_NAMES, default='auto',
+                       help='detector and CLIP: that of the robot, as image embeddings are of one '
+                       'CLIP (%(default)s: accurate on a GPU, balanced on a CPU)')
+    group.add_argument('--model', default='', help="YOLO weights (the profile's)")
+    group.add_argument('--clip-model', default='', help="(the profile's)")
+    group.add_argument('--clip-pretrained', default='', help="tag or file (the profile's)")
+    group.add_argument('--device', default='auto', help='(%(default)s)')
+    group.add_argument('--inference', choices=INFERENCES, default='auto',
+                       help='(%(default)s: OpenVINO on a CPU where it is installed)')
+
+
+def yolo_options(options: argparse.Namespace, **more: Any) -> 'YoloOptions':
+    """Return the detector that the command line names."""
+    from cliploc_ros.models.yolo_weights import YoloOptions
+
+    return with_detector(YoloOptions(model=options.model, device=options.device,
+                                     inference=options.inference, **more), options.profile)
+
+
+def clip_options(options: argparse.Namespace) -> 'ClipOptions':
+    """Return the CLIP that the command line names."""
+    from cliploc_ros.models.clip_weights import ClipOptions
+
+    return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
+                                    device=options.device, inference=options.inference),
+                        options.profile)
+
+
+if TYPE_CHECKING:
+    from cliploc_ros.datasets.bag_frames import ReadPoses
+    from cliploc_ros.datasets.frames import DepthFormat, Frames
+    from cliploc_ros.datasets.observations import Recorded
+    from cliploc_ros.datasets.poses import Poses
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
@@ -104,8 +140,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         The source, the networks or the options cannot be used.
     """
     from cliploc_ros.datasets.observations import load_recorded
-    from cliploc_ros.recording.keyframes import KeyframeOptions
-    from cliploc_ros.recording.recorder import RecordingOptions, record_once
+    from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
 
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')

@@ -49,7 +49,7 @@ class RelocalizerOptions:
         the vertical is known, the limit for poses from three points against that vertical.
     tilt_deviation_deg : float
         Standard deviation of the camera's tilt against upright [deg], see
-        cliploc_ros.core.acceptance.attitude. It counts in the confidence where no vertical is
+        cliploc_ros.core.acceptance.confidence. It counts in the confidence where no vertical is
         known. 0: every attitude is as likely, as in a map whose z axis is not up.
     vertical_deviation_deg : float
         Standard deviation of a known vertical [deg]. With one, auto samples two candidates

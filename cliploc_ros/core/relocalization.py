@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
 from cliploc_ros.core.acceptance.support import Support
-from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
@@ -31,7 +30,7 @@ class Hypothesis:
     support : Support
         Basis of the confidence.
     handicap : float
-        Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.attitude.
+        Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence.
     """
 
     map_from_camera: NDArray[np.float64]

@@ -3,7 +3,9 @@
 """The entry point of the method: Relocalizer.relocalize(observations) -> Relocalization."""
 
 import math
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +18,7 @@ from cliploc_ros.core.acceptance.comparison import (
     pose_of,
 )
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
-from cliploc_ros.core.acceptance.verdict import Evidence, refusal
+from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.association.candidates import check_k
 from cliploc_ros.core.fit.finalists import find_with_rivals
 from cliploc_ros.core.geometry.tolerances import SAME_PLACE
@@ -28,10 +29,57 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Hypothesis, Relocalization
 from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
-from cliploc_ros.core.time_budget import TimeBudget
 from cliploc_ros.core.warm_up import call_every_kernel
 
+# Shares of the budget at which the search and the refinement end; acceptance takes the rest.
+_SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
+# Both end earlier by this time [s] for each frame, up to five, since poses are scored and compared
+# on all frames. A budget below _SHORT_BUDGET_S scales these times down.
+_EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
+_MOST_FRAMES = 5
 _NO_LOOKS = Looks()
+
+
+@dataclass(frozen=True)
+class TimeBudget:
+    """A time budget that runs from `start`. All times are those of time.perf_counter [s].
+
+    Parameters
+    ----------
+    start : float
+    total_s : float
+        Infinite for no limit.
+    frames : int
+        Number of frames that are localized together.
+    """
+
+    start: float
+    total_s: float
+    frames: int
+
+    @staticmethod
+    def begin(total_s: float, frames: int) -> 'TimeBudget':
+        """Return a budget that starts now."""
+        return TimeBudget(time.perf_counter(), total_s, frames)
+
+    def search_end(self, number: int = 1, count: int = 1) -> float:
+        """Return when the search of a frame ends: the number-th of count frames to search."""
+        return self.start + self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S) * number / count
+
+    @property
+    def refinement_end(self) -> float:
+        """Return when the refinement ends."""
+        return self.start + self._time_s(_REFINEMENT_SHARE, _EARLIER_REFINEMENT_S)
+
+    @property
+    def elapsed_ms(self) -> float:
+        """Return the time since the start [ms]."""
+        return (time.perf_counter() - self.start) * 1e3
+
+    def _time_s(self, share: float, earlier_s: float) -> float:
+        scale = min(1.0, self.total_s / _SHORT_BUDGET_S)
+        frames = min(self.frames, _MOST_FRAMES)
+        return share * self.total_s - scale * earlier_s * frames
 
 
 class Relocalizer:

@@ -13,9 +13,15 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.observations import Recorded, load_recorded
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.demo import map_page
-from cliploc_ros.demo.map_picture import draw_map_review
-from cliploc_ros.demo.map_review import count_sightings, review_map
+from cliploc_ros.demo.map_review import (
+    PICTURE,
+    console_lines,
+    count_sightings,
+    draw_map_review,
+    review_map,
+    section,
+    success_lines,
+)
 from cliploc_ros.demo.processes import DemoError, find_executable
 from cliploc_ros.demo.run import DemoOptions, WakeUpMap, prepare, run_demo
 from cliploc_ros.demo.truth import read_frames, read_objects
@@ -54,15 +60,15 @@ def run_map_demo(options: DemoOptions) -> None:
         LandmarkMap.from_file(built.map_file), objects,
         count_sightings(tuple(read_frames(walk)), built.recorded.detections),
         built.report['left_out'])
-    print('\n'.join(map_page.console_lines(review)), flush=True)
+    print('\n'.join(console_lines(review)), flush=True)
     successes = _judge(options, built.map_file)
-    print('\n' + '\n'.join(map_page.success_lines(successes)) + '\n', flush=True)
+    print('\n' + '\n'.join(success_lines(successes)) + '\n', flush=True)
     poses = built.recorded.detections.map_from_camera
-    draw_map_review(review, poses, options.out / map_page.PICTURE)
+    draw_map_review(review, poses, options.out / PICTURE)
     landmark_of = review.landmark_of
     run_demo(replace(options, wake_up_map=WakeUpMap(
         built.map_file, lambda object_id: landmark_of.get(object_id, ''),
-        map_page.section(review, successes, len(built.recorded.detections)))))
+        section(review, successes, len(built.recorded.detections)))))
 
 
 @dataclass(frozen=True)

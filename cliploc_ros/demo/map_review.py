@@ -3,22 +3,45 @@
 """Compare the map that the demo built with the room: found, missed and false objects."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from cliploc_ros.core.geometry.ellipsoid import outline_points, shape_matrices
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.tum import parse_stamp_ns
+from cliploc_ros.demo.review import ACCEPTED, REFUSED
 from cliploc_ros.demo.truth import TrueFrame, TrueObject, true_ids
+from cliploc_ros.evaluation.figures import EDGED
+from cliploc_ros.evaluation.summary import LIMITS_M, Summary
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 
 #: A landmark this near to an object stands for it [m]. The objects are 0.2 m apart and more.
 NEAR_M = 0.1
+PICTURE = 'built_map.png'
+_SUCCESS_COLUMNS = ('', *(f'within {limit:g} m' for limit in LIMITS_M), 'median error', 'accepted',
+                    'false accepts')
+_DPI = 110
+_MARGIN_M = 0.35
+_MISSED = '#E69F00'
+_TRUTH = '#222222'
+_HEADING_M = 0.2
+_NAME_OFFSET_M = 0.2
+# Axes of the map across and up in each panel, and where these meet in a symmetric matrix that is
+# stored as xx, xy, xz, yy, yz, zz.
+_PANELS = ((0, 1, (0, 1, 3)), (0, 2, (0, 2, 5)), (1, 2, (3, 4, 5)))
+_AXIS_NAMES = 'xyz'
 
 
 @dataclass(frozen=True)
@@ -183,3 +206,155 @@ def _why_missed(one: TrueObject, instead: Sequence[str], seen: Sightings | None,
         best = max(near, key=lambda entry: entry['class_id'] == one.class_id)
         return f'left out as {best["class_id"]}, {best["reason"]}; {sightings}'
     return sightings
+
+
+def console_lines(review: MapReview) -> Iterator[str]:
+    """Yield the comparison of the built map with the room."""
+    yield review.summary()
+    for row, reason in review.missed.items():
+        yield f'  missed: {review.objects[row].object_id}: {reason}'
+    for landmark, instead in review.false.items():
+        yield f'  false: {review.landmark_map.landmark_ids[landmark]}: {instead}'
+
+
+def success_lines(summaries: Mapping[str, Summary]) -> Iterator[str]:
+    """Yield the table of success in both maps."""
+    rows = [_SUCCESS_COLUMNS, *(_success_cells(*item) for item in summaries.items())]
+    for row in rows:
+        yield '  '.join(cell.ljust(13) for cell in row).rstrip()
+
+
+def section(review: MapReview, summaries: Mapping[str, Summary], images: int) -> str:
+    """Return the section of the page."""
+    return '\n'.join([
+        '<h2>The map</h2>',
+        f'<p><code>build_map</code> built it from {images} images of a mapping walk, with the '
+        'poses of that walk. The wake-ups come later: objects have moved, and the light has '
+        'changed.</p>',
+        f'<p><b>{escape(review.summary())}.</b> An object is found if a landmark of its class '
+        f'lies within {NEAR_M * 100:.0f} cm of it. All other landmarks are false.</p>',
+        f'<figure><img src="{PICTURE}" alt="built map and true objects from three sides">'
+        '<figcaption>Found, missed and false objects. The dotted line is the mapping walk.'
+        '</figcaption></figure>',
+        '<p>One look at each image of the wake-ups, in the built map and in the true map:</p>',
+        _table(_SUCCESS_COLUMNS, (_success_cells(*item) for item in summaries.items())),
+        *_losses(review), _all_found(review), '<h2>The wake-ups in this map</h2>'])
+
+
+def _success_cells(name: str, summary: Summary) -> tuple[str, ...]:
+    count = summary.errors_m.size
+    return (name, *(f'{summary.success(limit):.2f}' for limit in LIMITS_M),
+            f'{summary.median_error_m:.3f} m', f'{summary.accepted.sum()} of {count}',
+            str(summary.false_accepts()))
+
+
+def _losses(review: MapReview) -> Iterator[str]:
+    """Yield the tables of missed and false objects."""
+    if review.missed:
+        yield '<h3>Missed objects</h3>'
+        yield _table(('object', 'label', 'why'), (
+            (review.objects[row].object_id, review.objects[row].label, reason)
+            for row, reason in review.missed.items()))
+    if review.false:
+        yield '<h3>False objects</h3>'
+        yield _table(('landmark', 'label', 'what is there'), (
+            (review.landmark_map.landmark_ids[landmark], review.landmark_map.labels[landmark],
+             instead) for landmark, instead in review.false.items()))
+
+
+def _all_found(review: MapReview) -> str:
+    rows = [(review.objects[one.object_row].object_id, review.objects[one.object_row].label,
+             review.landmark_map.landmark_ids[one.landmark],
+             review.landmark_map.labels[one.landmark], f'{one.offset_m * 100:.1f} cm',
+             f'{one.size_ratio - 1:+.0%}')
+            for one in sorted(review.found, key=lambda one: -one.offset_m)]
+    return ('<details><summary>All found objects, the least accurate first</summary>'
+            + _table(('object', "a person's label", 'landmark', "the map's label", 'off by',
+                      'size'), rows) + '</details>')
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    def line(cells: Sequence[str], tag: str) -> str:
+        return '<tr>' + ''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in cells) + '</tr>'
+
+    return '<table>' + line(headings, 'th') + ''.join(line(row, 'td') for row in rows) + '</table>'
+
+
+def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], path: Path) -> None:
+    """Draw found, missed and false objects.
+
+    Parameters
+    ----------
+    review : MapReview
+    map_from_camera : ndarray (F, 4, 4)
+        Of the images of the mapping walk.
+    path : Path
+        The PNG to write.
+    """
+    points = np.concatenate([[one.center for one in review.objects], review.landmark_map.centers,
+                             map_from_camera[:, :3, 3]])
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    extents = high - low
+    figure = Figure(figsize=(13.0, 1.0 + 13.0 * (extents[1] + extents[2]) / extents[:2].sum()),
+                    dpi=_DPI, layout='constrained')
+    grid = figure.add_gridspec(2, 2, height_ratios=(extents[1], extents[2]),
+                               width_ratios=(extents[0], extents[1]))
+    for place, (across, up, entries) in zip((grid[0, 0], grid[1, 0], grid[1, 1]), _PANELS,
+                                            strict=True):
+        axes = figure.add_subplot(place)
+        axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal',
+                 xlabel=f'{_AXIS_NAMES[across]} [m]', ylabel=f'{_AXIS_NAMES[up]} [m]')
+        axes.grid(color='#EEEEEE', zorder=0)
+        _draw_panel(axes, review, (across, up), entries)
+        if up == 1:
+            # Draw where the camera was, and where it looked.
+            positions, forward = map_from_camera[:, :2, 3], map_from_camera[:, :2, 2]
+            axes.plot(*positions.T, ':', color='#888888', linewidth=1.0, zorder=2)
+            axes.plot(*positions.T, '.', color='#666666', markersize=5, zorder=2)
+            for start, end in zip(positions, positions + _HEADING_M * forward, strict=True):
+                axes.plot(*zip(start, end, strict=True), color='#666666', linewidth=0.9, zorder=2)
+    legend = figure.add_subplot(grid[0, 1])
+    legend.set_axis_off()
+    legend.legend(handles=_legend(review), loc='upper left', frameon=False, fontsize=11)
+    figure.savefig(path)
+
+
+def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
+                entries: tuple[int, int, int]) -> None:
+    found = {one.object_row for one in review.found}
+    landmark_map = review.landmark_map
+    for landmark, (center, shape) in enumerate(zip(landmark_map.centers, landmark_map.shapes,
+                                                   strict=True)):
+        color = REFUSED if landmark in review.false else ACCEPTED
+        outline = outline_points(np.array([*center[[*plane]], *shape[[*entries]]]))
+        axes.add_patch(Polygon(outline, closed=True, facecolor=color, edgecolor='none', alpha=0.45,
+                               zorder=4 if landmark in review.false else 3))
+    shapes = shape_matrices(np.array([one.semi_axes for one in review.objects]),
+                            np.array([one.orientation for one in review.objects]))
+    for row, (one, shape) in enumerate(zip(review.objects, shapes, strict=True)):
+        is_missed = row not in found
+        outline = outline_points(np.array([*one.center[[*plane]], *shape[[*entries]]]))
+        axes.add_patch(Polygon(outline, closed=True, fill=False, zorder=6 if is_missed else 5,
+                               edgecolor=_MISSED if is_missed else _TRUTH,
+                               linewidth=2.0 if is_missed else 0.6))
+        if is_missed:
+            _name(axes, one.center[[*plane]] + (0.0, _NAME_OFFSET_M), one.object_id, '#8A5A00')
+    for landmark in review.false:
+        _name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, _NAME_OFFSET_M),
+              landmark_map.landmark_ids[landmark], REFUSED)
+
+
+def _name(axes: Axes, place: NDArray[np.float64], name: str, color: str) -> None:
+    axes.text(place[0], place[1], name, fontsize=8, ha='center', va='center', color=color,
+              zorder=8, fontweight='bold', path_effects=EDGED)
+
+
+def _legend(review: MapReview) -> list[Line2D | Patch]:
+    return [
+        Patch(facecolor=ACCEPTED, alpha=0.45, label=f'landmark of an object: {len(review.found)}'),
+        Patch(facecolor=REFUSED, alpha=0.45, label=f'false landmark: {len(review.false)}'),
+        Patch(facecolor='none', edgecolor=_MISSED, linewidth=2.0,
+              label=f'missed object: {len(review.missed)}'),
+        Patch(facecolor='none', edgecolor=_TRUTH, linewidth=0.6, label='true object'),
+        Line2D([], [], color='#666666', marker='.', linestyle=':',
+               label='mapping walk, with the direction of each view')]

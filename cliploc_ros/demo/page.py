@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cliploc_ros.demo.review import WRONG_M, Judged, Review
-from cliploc_ros.demo.style import ACCEPTED, REFUSED, verdict
+from cliploc_ros.demo.review import ACCEPTED, REFUSED, WRONG_M, Judged, Review, verdict
 
 TOP_VIEW = 'top_view.png'
 #: Pattern of the wake-ups' pictures.

@@ -27,6 +27,8 @@ _SAME_POSE = (1e-6, 1e-4)
 
 #: Makes an observation of image, camera, detections and stamp [ns].
 Observe = Callable[[NDArray[np.uint8], Camera, Detections, int], Observation]
+#: Okabe and Ito's blue and vermilion, which colour-blind readers can distinguish.
+ACCEPTED, REFUSED = '#0072B2', '#D55E00'
 
 
 @dataclass(frozen=True)
@@ -172,3 +174,13 @@ def _read_true_boxes(folder: Path) -> dict[int, tuple[TrueBox, ...]]:
         return {}
     return {parse_stamp_ns(frame.timestamp, 'truth.json'): frame.boxes
             for frame in read_frames(folder, least_visibility=0.0)}
+
+
+def verdict(judged: Judged) -> str:
+    """Return the outcome of a wake-up in words."""
+    if not judged.wake_up.accepted:
+        return 'refused' if judged.error is None else (
+            f'refused, the best hypothesis is {judged.error[0]:.2f} m off')
+    if judged.error is None:
+        return 'accepted'
+    return f'accepted, {judged.error[0]:.2f} m and {judged.error[1]:.1f}° from the truth'

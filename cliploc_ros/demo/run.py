@@ -25,7 +25,7 @@ from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import TumSequence, read_tum
 from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.demo import page
-from cliploc_ros.demo.pictures import draw_wake_up
+from cliploc_ros.demo.pictures import draw_top_view, draw_wake_up
 from cliploc_ros.demo.processes import (
     DemoError,
     Process,
@@ -36,7 +36,6 @@ from cliploc_ros.demo.processes import (
 )
 from cliploc_ros.demo.review import Judged, Observe, Review, Reviewer, judge, observe_classes
 from cliploc_ros.demo.robot import Robot
-from cliploc_ros.demo.top_view import draw_top_view
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options

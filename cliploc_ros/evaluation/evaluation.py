@@ -20,7 +20,7 @@ from cliploc_ros.datasets.queries import QueryFrame
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.journal import Journal
 from cliploc_ros.evaluation.methods import Method
-from cliploc_ros.evaluation.output import write_text
+from cliploc_ros.evaluation.output import write_text, write_trajectories
 from cliploc_ros.evaluation.paper_table import (
     as_csv,
     as_json,
@@ -31,7 +31,6 @@ from cliploc_ros.evaluation.paper_table import (
 )
 from cliploc_ros.evaluation.run import count_trials, run_methods
 from cliploc_ros.evaluation.summary import Summary, summarize
-from cliploc_ros.evaluation.trajectories import write_trajectories
 from cliploc_ros.evaluation.trials import Query, Result
 
 _JOURNAL = 'unfinished.jsonl'

@@ -5,16 +5,22 @@
 import logging
 import os
 import tempfile
+import time
+from collections import defaultdict, deque
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import Recorded
 from cliploc_ros.datasets.queries import Queries, QueryFrame
+from cliploc_ros.evaluation.trials import ImageFeatures, Query
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.recording.recorder import RecordingOptions, observation_file, record_once
 
@@ -72,3 +78,30 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
             clip_ms=float(recorded.clip_ms[frame])))
     return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),
                    tuple(frames))
+
+
+def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]:
+    """Return queries with the features of their images; those without an image stay.
+
+    Parameters
+    ----------
+    queries : sequence of Query
+        Recorded from these frames.
+    frames : Frames
+    """
+    waiting: dict[int, deque[int]] = defaultdict(deque)
+    for row, query in enumerate(queries):
+        waiting[query.observation.stamp_ns].append(row)
+    found = list(queries)
+    wanted = frames.read_raw(lambda place, stamp_ns, pose: pose is not None
+                             and bool(waiting.get(stamp_ns)))
+    for raw in tqdm(wanted, 'features', len(queries), unit='image', disable=None):
+        if not waiting[raw.stamp_ns]:
+            continue  # of images of one stamp, more than were recorded
+        row = waiting[raw.stamp_ns].popleft()
+        frame = raw.decode()
+        begin = time.perf_counter()
+        features = query_features(frame.image_rgb)
+        spent_ms = 1e3 * (time.perf_counter() - begin)
+        found[row] = replace(queries[row], image=ImageFeatures(features, frame.camera, spent_ms))
+    return tuple(found)

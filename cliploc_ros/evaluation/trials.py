@@ -108,7 +108,7 @@ class Result:
         Of several maps, the one of the pose, which is in the coordinates of the first map: on
         another map, it is far away. Empty for a single map.
     refusal_kind : str
-        See cliploc_ros.core.acceptance.refusal_kind; empty when accepted.
+        See cliploc_ros.core.acceptance.verdict; empty when accepted.
     source : str
         What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found.
     keyframe_inliers : int

@@ -14,13 +14,7 @@ from cliploc_ros.core.maps.landmark_details import LandmarkDetails
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.depth_seeds import (
-    add_depths,
-    correct_scale,
-    depth_scale,
-    options_with_depth,
-)
-from cliploc_ros.mapping.evidence import Evidence, gather_evidence
+from cliploc_ros.mapping.evidence import Evidence, gather_evidence, reasons_against
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.joint import pose_errors, refine_jointly
@@ -32,9 +26,15 @@ from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
-from cliploc_ros.mapping.selection import reasons_against
 from cliploc_ros.mapping.shared_errors import left_by_poses, shared_by_neighbours
-from cliploc_ros.mapping.triangulation import SUPPORT_IOU, triangulate
+from cliploc_ros.mapping.triangulation import (
+    SUPPORT_IOU,
+    add_depths,
+    correct_scale,
+    depth_scale,
+    options_with_depth,
+    triangulate,
+)
 from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_out
 
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.

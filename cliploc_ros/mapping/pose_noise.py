@@ -7,7 +7,7 @@ own. The estimate maximizes the marginal likelihood of the boxes over the standa
 the poses, the time for which an error lasts, and the scale s of the edges' deviations (empirical
 Bayes; Laplace's approximation, MacKay, "Bayesian Interpolation", 1992). With H the normal
 equations of the boxes about the best landmarks and poses, b their gradient, and Q the information
-of the process of pose errors e (see cliploc_ros.mapping.pose_prior),
+of the process of pose errors e (see cliploc_ros.mapping.joint),
 
     -log p = r' W r / 2 s^2 + N log s + e' Q e / 2 - b' (H / s^2 + Q)^-1 b / 2
              + log det (H / s^2 + Q) / 2 - log det Q / 2.
@@ -22,10 +22,17 @@ from scipy.optimize import minimize
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import edge_residual, robust_weight
-from cliploc_ros.mapping.joint import Equations, Problem, State, pose_errors, refine_jointly
+from cliploc_ros.mapping.joint import (
+    Equations,
+    Prior,
+    Problem,
+    State,
+    pose_bands,
+    pose_errors,
+    refine_jointly,
+)
 from cliploc_ros.mapping.landmarks import Landmarks
 from cliploc_ros.mapping.options import PoseErrors
-from cliploc_ros.mapping.pose_prior import Prior, pose_bands
 from cliploc_ros.mapping.projection import POSE_SIZE, project_box
 from cliploc_ros.mapping.views import Views
 

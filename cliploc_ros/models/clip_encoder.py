@@ -21,8 +21,7 @@ from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_cl
 from cliploc_ros.models.devices import free_memory, resolve_device
 from cliploc_ros.models.image_towers import load_tower
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
-from cliploc_ros.models.label_embeddings import LabelCache
-from cliploc_ros.models.weighted_labels import mixed_rows
+from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 
 if TYPE_CHECKING:
     import torch

@@ -14,8 +14,7 @@ from typing import Any
 from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.devices import check_inference, check_precision
-from cliploc_ros.models.download import download
-from cliploc_ros.models.files import check_weights_file, fingerprint_file
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')

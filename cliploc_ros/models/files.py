@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of weights: whether they are intact, their fingerprint."""
 
+import errno
 import hashlib
+import logging
 import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 from cliploc_ros.errors import ModelError
@@ -13,6 +16,7 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
+logger = logging.getLogger(__name__)
 
 
 def fingerprint_file(path: Path) -> str:
@@ -68,3 +72,44 @@ def check_weights_file(path: Path) -> None:
 def damaged(path: Path, reason: object) -> ModelError:
     """Return the error for weights that are truncated or corrupt."""
     return ModelError(f'{path} is truncated or corrupt ({reason}): download it again')
+
+
+def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path]) -> Path:
+    """Download a file with a library's own function.
+
+    Parameters
+    ----------
+    what : str
+        Name of the file or weights, for the log and the error.
+    folder : Path
+        Where the file goes; made if it does not exist.
+    remedy : str
+        What the user can do without a network, for the error.
+    fetch : callable
+        Downloads the file and returns its path. It must leave no partial file under that path.
+
+    Raises
+    ------
+    ModelError
+        When the download fails.
+    """
+    logger.info('downloading %s into %s', what, folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return Path(fetch())
+    except Exception as error:  # each library raises exceptions of its own
+        raise ModelError(f'cannot download {what}: {_reason(error, folder)}. {remedy}; or run '
+                         'prepare --cache-dir there, and set cache_dir to a copy of its folder'
+                         ) from error
+
+
+def _reason(error: Exception, folder: Path) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f'the disk of {folder} is full: make room, or set cache_dir to another disk'
+    return f'{type(error).__name__}: {first_line(error).rstrip(".")}'
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of a library's message in ASCII; some hold emojis and colours."""
+    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
+    return lines[0].strip() if lines else type(error).__name__

@@ -6,13 +6,13 @@ import logging
 from collections.abc import Sequence
 
 from cliploc_ros.core.index.similarities import LabelEmbeddings
-from cliploc_ros.core.maps.image_rows import with_images
 from cliploc_ros.core.maps.joined_map import JoinedMap, parts_of
 from cliploc_ros.core.maps.landmark_embeddings import (
     LandmarkEmbeddings,
     concatenated,
     embeddings_path,
     load_embeddings_of_map,
+    with_images,
 )
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.devices import import_openvino
-from cliploc_ros.models.download import first_line
-from cliploc_ros.models.files import fingerprint_file
+from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.openvino_networks import (
     Conversion,
     Network,

@@ -13,15 +13,14 @@ from std_srvs.srv import Empty, Trigger
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
 from cliploc_ros.ros.case_recorder import CaseRecorder
-from cliploc_ros.ros.counters import RequestCounters
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.map_services import MapServices
-from cliploc_ros.ros.node.callback_group import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes
+from cliploc_ros.ros.node.executor import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly

@@ -3,13 +3,15 @@
 """The answer to a request, or to one frame in continuous mode."""
 
 import math
+import threading
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.ros.inputs.robot_state import RobotState
 
 
@@ -46,7 +48,7 @@ class Answer:
     stages_ms : mapping of str to float
         How long each stage took [ms].
     map_hash : str
-        Of the map that was searched, see cliploc_ros.ros.map_hash; empty without one.
+        Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one.
     kind : RefusalKind or None
         Of a refusal; None for other verdicts.
     """
@@ -73,3 +75,31 @@ class Answer:
         if self.kind is not None:
             text = f'{text}; kind {self.kind}'
         return f'{text}; map {self.map_hash}' if self.map_hash else text
+
+
+class RequestCounters:
+    """Counts requests by their answers; written in several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._kinds: Counter[RefusalKind] = Counter()
+        self._total_s = self._longest_s = 0.0
+
+    def add(self, answer: Answer, duration_s: float) -> None:
+        """Count a request that took so long [s]."""
+        with self._lock:
+            self._counts[answer.verdict] += 1
+            if answer.kind is not None:
+                self._kinds[answer.kind] += 1
+            self._total_s += duration_s
+            self._longest_s = max(self._longest_s, duration_s)
+
+    def values(self) -> dict[str, object]:
+        """Return the counts; they only grow until the node is started anew."""
+        with self._lock:
+            return {'requests': self._counts.total(),
+                    **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},
+                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind},
+                    'requests total [s]': f'{self._total_s:.3f}',
+                    'requests longest [s]': f'{self._longest_s:.3f}'}

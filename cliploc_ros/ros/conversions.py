@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conversion of messages to values and back. No field of a message is taken for valid."""
 
+import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -20,7 +22,10 @@ from vision_msgs.msg import (
 
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
+
+DETECTION_TYPES = ('vision_msgs', 'yolo_msgs')
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -99,3 +104,45 @@ def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float
 def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArray:
     """Return poses (4, 4) as a message, in the same order."""
     return PoseArray(header=header, poses=[pose_to_msg(pose) for pose in poses])
+
+
+class DetectionType(NamedTuple):
+    """A message type, and what makes a vision_msgs/Detection2DArray of it."""
+
+    message_type: type
+    converted: Callable[[Any], Detection2DArray]
+
+
+def detection_type(package: str) -> DetectionType:
+    """Return the message type of a package.
+
+    Raises
+    ------
+    OptionsError
+        The package is not installed.
+    """
+    if package == 'vision_msgs':
+        return DetectionType(Detection2DArray, lambda msg: msg)
+    try:
+        message_type = importlib.import_module('yolo_msgs.msg').DetectionArray
+    except ImportError as error:
+        raise OptionsError('detections_type: yolo_msgs is not installed: build yolo_ros in this '
+                           'workspace and source it, or set vision_msgs') from error
+    return DetectionType(message_type, from_yolo_msg)
+
+
+def from_yolo_msg(msg: Any) -> Detection2DArray:
+    """Return a yolo_msgs/DetectionArray as the common type: boxes, class names and scores."""
+    return Detection2DArray(header=msg.header, detections=[
+        Detection2D(header=msg.header, id=one.id, bbox=_box(one.bbox), results=[
+            ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(
+                class_id=one.class_name or str(one.class_id), score=one.score))])
+        for one in msg.detections])
+
+
+def _box(bbox: Any) -> BoundingBox2D:
+    box = BoundingBox2D(size_x=bbox.size.x, size_y=bbox.size.y)
+    box.center.position.x = bbox.center.position.x
+    box.center.position.y = bbox.center.position.y
+    box.center.theta = bbox.center.theta
+    return box

@@ -22,7 +22,7 @@ from cliploc_ros.core.keyframes.localization import (
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.map_urls import path_of
+from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
 
 logger = logging.getLogger(__name__)

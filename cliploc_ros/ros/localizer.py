@@ -35,8 +35,7 @@ from cliploc_ros.ros.conversions import (
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
-from cliploc_ros.ros.map_hash import load_hashed_map
-from cliploc_ros.ros.map_parameters import map_files
+from cliploc_ros.ros.map_parameters import load_hashed_map, map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
@@ -87,7 +86,7 @@ class Localizer:
     device : str
         Where the observer's network runs.
     map_hash : str
-        See cliploc_ros.ros.map_hash.
+        See cliploc_ros.ros.map_parameters.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
     """

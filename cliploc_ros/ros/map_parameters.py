@@ -2,17 +2,49 @@
 # SPDX-License-Identifier: Apache-2.0
 """The maps of a node: in files, or in its parameters, where `--params-file map.yaml` puts one."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ament_index_python.packages import get_package_share_directory
 from rclpy.node import Node
 
 from cliploc_ros.core.maps.joined_map import join_maps
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, OptionsError
-from cliploc_ros.ros.map_urls import path_of
 
+_FILE, _PACKAGE = 'file://', 'package://'
 _PREFIX = 'map.'
+_DIGITS = 12
+# A file that is replaced while it is read is read again.
+_ATTEMPTS = 3
+
+
+def path_of(name: str) -> str:
+    """Return the path of a map.
+
+    Parameters
+    ----------
+    name : str
+        A path; ``file:///PATH``; or ``package://PACKAGE/PATH``, a path in the package's share
+        folder, as in URDF files.
+
+    Raises
+    ------
+    MapError
+        The package is not installed, or the URL names no file in it.
+    """
+    if not name.startswith(_PACKAGE):
+        return name.removeprefix(_FILE)
+    package, _, path = name.removeprefix(_PACKAGE).partition('/')
+    if not package or not path:
+        raise MapError(f'{name}: no package://PACKAGE/PATH, such as package://my_maps/office.yaml')
+    try:
+        return str(Path(get_package_share_directory(package)) / path)
+    except (LookupError, ValueError) as error:
+        raise MapError(f"{name}: there is no package '{package}' here: install it, or source "
+                       'the workspace that has it') from error
 
 
 def map_files(values: Mapping[str, Any]) -> list[str]:
@@ -60,3 +92,42 @@ def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
                            'and fields')
         tree = branch
     tree[path[-1]] = value
+
+
+def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
+    """Load one map or several and return them with their hash.
+
+    The hash is the beginning of what `cat FILE... | sha256sum` prints. A map in parameters has
+    the hash of its landmarks.
+
+    Raises
+    ------
+    MapError
+        See load_map; or a file changes again and again.
+    """
+    for _ in range(_ATTEMPTS):
+        before = _hash_of(files)
+        landmark_map = load_map(node, files)
+        if not files:
+            content = b''.join([
+                repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+                      landmark_map.class_ids)).encode(),
+                landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+                landmark_map.quats_xyzw.tobytes()])
+            return landmark_map, _hash(content)
+        if before == _hash_of(files):
+            return landmark_map, before
+    raise MapError(f'{", ".join(files)}: changes while it is read: write another file and '
+                   'rename it')
+
+
+def _hash_of(files: Sequence[str]) -> str:
+    """Return the hash of files; empty where load_map says what is wrong."""
+    try:
+        return _hash(b''.join(Path(file).read_bytes() for file in files))
+    except (OSError, ValueError):
+        return ''
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.map_urls import path_of
+from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.pipeline import Pipeline
 
@@ -49,7 +49,7 @@ class MapServices:
         Parameters
         ----------
         map_url : str
-            See cliploc_ros.ros.map_urls.
+            See cliploc_ros.ros.map_parameters.
 
         Raises
         ------

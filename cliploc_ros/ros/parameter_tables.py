@@ -17,7 +17,7 @@ from cliploc_ros.core.options import (
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
-from cliploc_ros.ros.inputs.detection_types import DETECTION_TYPES
+from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.inputs.vertical import SOURCES
 from cliploc_ros.ros.node.parameters import ParameterRow, Value
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError

@@ -6,12 +6,16 @@ import html
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
-from cliploc_ros.evaluation.map_check.style import LOOK_ALIKE, MISLED
+from cliploc_ros.core.geometry.camera import frusta
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
 from cliploc_ros.mapping.checking.look_alikes import RADIUS_M, LookAlike
 from cliploc_ros.mapping.checking.report import GridCheck
 from cliploc_ros.studio.places import Places, PlacesSearch
+from cliploc_ros.studio.scene import some_cameras
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.page import Page
@@ -34,6 +38,10 @@ _LEGEND = tuple(f'<span style="color:{color}">■</span> {text}' for color, text
     ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike')))
+_RGB = (0, 150, 136)
+_FRUSTUM_M, _POINT_M = 0.12, 0.015
+# More points slow the browser down.
+_MOST_POINTS = 30_000
 
 
 class PlacesPanel:
@@ -167,3 +175,45 @@ def _floor(places: Places) -> float:
 
 def _rgb(color: str) -> tuple[int, int, int]:
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+
+
+class KeyframesPanel:
+    """A switch for the layer, which is drawn when it is first shown.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    layer : KeyframeLayer
+    """
+
+    def __init__(self, server: viser.ViserServer, layer: KeyframeLayer):
+        self._scene, self._layer = server.scene, layer
+        self._handles: list[Any] = []
+        images = 'no images' if layer.images is None else 'small images'
+        self._box = server.gui.add_checkbox(
+            'Show keyframes', False,
+            hint=f'{len(layer)} keyframes with {layer.offsets[-1]} points, {images}')
+        self._box.on_update(lambda event: self._show())
+
+    def _show(self) -> None:
+        if self._box.value and not self._handles:
+            self._handles = self._draw()
+        for handle in self._handles:
+            handle.visible = self._box.value
+
+    def _draw(self) -> list[Any]:
+        layer = self._layer
+        shown = some_cameras(len(layer))
+        lines = self._scene.add_line_segments(
+            '/keyframes/cameras', frusta(layer.camera, layer.map_from_camera[shown], _FRUSTUM_M),
+            _RGB, thickness=2.0, thickness_units='screen')
+        points = some_points(layer)
+        cloud = self._scene.add_point_cloud('/keyframes/points', points.astype(np.float32), _RGB,
+                                            point_size=_POINT_M, point_shape='circle')
+        return [lines, cloud]
+
+
+def some_points(layer: KeyframeLayer) -> NDArray[np.float64]:
+    """Return the points (n, 3) of all keyframes in the map, or every n-th of many [m]."""
+    step = max(1, -(-int(layer.offsets[-1]) // _MOST_POINTS))
+    return np.concatenate([layer.points_in_map(row)[::step] for row in range(len(layer))])

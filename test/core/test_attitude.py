@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.attitude import tilt_handicaps
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     confidences,
     none_right,
+    tilt_handicaps,
     utilities,
 )
 from cliploc_ros.core.acceptance.support import Support

@@ -12,8 +12,7 @@ from cliploc_ros.core.index.similarities import (
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.maps.image_rows import with_images
-from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings, with_images
 
 COUNT, SIZE = 50, 64
 

@@ -9,8 +9,8 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
-from cliploc_ros.core.fit.fusion import fuse
+from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.fit.covariance import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace

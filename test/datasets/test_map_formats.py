@@ -27,8 +27,13 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.maps.map_file import write_map
-from cliploc_ros.datasets.map_formats.class_names import COCO, read_class_names
-from cliploc_ros.datasets.map_formats.given_map import GivenMap, Placement, place
+from cliploc_ros.datasets.map_formats.given_map import (
+    COCO,
+    GivenMap,
+    Placement,
+    place,
+    read_class_names,
+)
 from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
 from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
 from cliploc_ros.datasets.map_formats.oaslam import read_oaslam

@@ -12,9 +12,14 @@ import pytest
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.demo.map_page import console_lines, section
-from cliploc_ros.demo.map_picture import draw_map_review
-from cliploc_ros.demo.map_review import Sightings, count_sightings, review_map
+from cliploc_ros.demo.map_review import (
+    Sightings,
+    console_lines,
+    count_sightings,
+    draw_map_review,
+    review_map,
+    section,
+)
 from cliploc_ros.demo.truth import TrueBox, TrueFrame, TrueObject, read_objects
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.summary import Summary

@@ -21,8 +21,7 @@ from cliploc_ros.evaluation.recording import recorded_queries
 from cliploc_ros.models.clip_encoder import embed_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.yolo_weights import YoloOptions
-from cliploc_ros.recording.keyframes import EVERY_FRAME
-from cliploc_ros.recording.recorder import RecordingOptions
+from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
 
 
 @pytest.fixture(scope='module')

@@ -9,11 +9,10 @@ import pytest
 from walk import look_at, make_table, see, walk_around
 
 from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.joint import State
+from cliploc_ros.mapping.joint import Prior, State, pose_bands
 from cliploc_ros.mapping.landmarks import landmarks_of_map
 from cliploc_ros.mapping.odometry import link_frames
 from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
-from cliploc_ros.mapping.pose_prior import Prior, pose_bands
 from cliploc_ros.mapping.views import make_views
 from studies.speed.pose_errors import (
     aligned_offsets_m,

@@ -18,8 +18,8 @@ from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
 from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
-from cliploc_ros.mapping.checking.keyframe_reach import check_keyframes, in_reach
 from cliploc_ros.mapping.checking.options import CheckOptions
+from cliploc_ros.mapping.checking.report import check_keyframes, in_reach
 
 ROOM = make_room()
 #: The camera looks along x, z is up.

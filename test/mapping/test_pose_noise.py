@@ -9,10 +9,10 @@ from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.joint import Prior
 from cliploc_ros.mapping.landmarks import landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
-from cliploc_ros.mapping.pose_prior import Prior
 from cliploc_ros.mapping.views import make_views
 from studies.speed.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
 

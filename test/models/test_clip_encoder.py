@@ -19,8 +19,8 @@ from safetensors.torch import save_file
 
 from cliploc_ros.errors import CliplocError, ImageError
 from cliploc_ros.models import ClipOptions, load_encoder
-from cliploc_ros.models.clip_checkpoint import read_state_dict
 from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_towers import read_state_dict
 from cliploc_ros.models.clip_weights import resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
 

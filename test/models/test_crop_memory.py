@@ -11,8 +11,7 @@ import pytest
 from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.crop_memory import CropMemory
-from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.observer import CropMemory, Observer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.models import weighted_labels
-from cliploc_ros.models.weighted_labels import mixed_rows
+from cliploc_ros.models import label_embeddings
+from cliploc_ros.models.label_embeddings import mixed_rows
 
 AXES = {'a': [1.0, 0, 0], 'b': [0, 1.0, 0], 'c': [0, 0.6, 0.8]}
 
@@ -41,8 +41,8 @@ def test_each_label_is_encoded_once_and_parts_change_nothing(monkeypatch):
         return np.array([embeddings[label] for label in labels])
 
     whole = mixed_rows(descriptions, encode_some, 8)
-    monkeypatch.setattr(weighted_labels, 'PART', 16)
-    monkeypatch.setattr(weighted_labels, '_BLOCK', 32)
+    monkeypatch.setattr(label_embeddings, 'PART', 16)
+    monkeypatch.setattr(label_embeddings, '_BLOCK', 32)
     assert mixed_rows(descriptions, encode_some, 8) == pytest.approx(whole, abs=1e-6)
     assert max(map(len, asked[1:])) == 16
     assert list(chain(*asked[1:])) == asked[0] == sorted(set(asked[0]))

@@ -10,7 +10,7 @@ from processes import wait_for
 from rclpy.serialization import serialize_message
 from tester import RELIABLE, class_matching, make_frame
 
-from cliploc_ros.ros.inputs.detection_types import from_yolo_msg
+from cliploc_ros.ros.conversions import from_yolo_msg
 
 
 def as_yolo(msg, array=Fields, detection=Fields):

@@ -12,7 +12,7 @@ from disks import small_disk
 
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.recording.journal import Journal
-from cliploc_ros.recording.keyframes import EVERY_FRAME, KeyframeFilter, KeyframeOptions
+from cliploc_ros.recording.recorder import EVERY_FRAME, KeyframeFilter, KeyframeOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
 

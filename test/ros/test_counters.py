@@ -7,13 +7,11 @@ import hashlib
 import pytest
 from scene import make_room, write_map
 
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
-from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
+from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.answer import Answer, Verdict
-from cliploc_ros.ros.counters import RequestCounters
-from cliploc_ros.ros.map_hash import load_hashed_map
+from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
+from cliploc_ros.ros.map_parameters import load_hashed_map
 
 
 @pytest.mark.parametrize(('kind', 'evidence'), [

@@ -5,7 +5,7 @@ import logging
 import pytest
 from rcl_interfaces.msg import Log
 
-from cliploc_ros.ros.node.log import RosLogHandler
+from cliploc_ros.ros.node.lifecycle import RosLogHandler
 
 
 @pytest.fixture

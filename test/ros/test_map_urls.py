@@ -5,8 +5,7 @@
 import pytest
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.map_parameters import map_files
-from cliploc_ros.ros.map_urls import path_of
+from cliploc_ros.ros.map_parameters import map_files, path_of
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from visualization_msgs.msg import Marker
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.ros.outputs.markers import (
+from cliploc_ros.ros.outputs.visualization import (
     MAX_SHOWN,
     class_color,
     landmark_markers,

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.core.acceptance.refusal_kind import RefusalKind
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.inputs.frame_source import FrameSource

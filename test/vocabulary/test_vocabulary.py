@@ -10,9 +10,13 @@ import pytest
 import yaml
 
 from cliploc_ros.errors import CliplocError, OptionsError
-from cliploc_ros.vocabulary.grammar import MOST_PHRASES, expand_phrases
 from cliploc_ros.vocabulary.print_phrases import main
-from cliploc_ros.vocabulary.vocabulary import load_vocabulary, shipped_classes
+from cliploc_ros.vocabulary.vocabulary import (
+    MOST_PHRASES,
+    expand_phrases,
+    load_vocabulary,
+    shipped_classes,
+)
 
 
 def test_a_small_grammar_written_out():

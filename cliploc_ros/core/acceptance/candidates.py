@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.attitude import tilt_handicaps
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, utilities
+from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig

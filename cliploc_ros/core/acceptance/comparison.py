@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.candidates import (
@@ -35,9 +36,8 @@ from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
 from cliploc_ros.core.acceptance.motion import Motion, compare_motion
-from cliploc_ros.core.acceptance.spread import spread
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
-from cliploc_ros.core.fit.covariance import share_within
+from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
     covariance_of,
@@ -45,7 +45,6 @@ from cliploc_ros.core.fit.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.fit.fusion import fuse
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
@@ -55,6 +54,34 @@ from cliploc_ros.core.search.leaders import MAX_DISTINCT
 
 # The most poses of objects that propose keyframes.
 _MOST_GUESSES = 3
+
+
+def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean square of the differences between a pose and those that agree with it.
+
+    The right pose need not be among those found. So their mean square is added in all directions,
+    too.
+
+    Parameters
+    ----------
+    poses : ndarray (m, 4, 4)
+        map_from_camera; the first one is the pose.
+    odds : ndarray (m,)
+        Logarithm of the odds of each, up to a constant.
+
+    Returns
+    -------
+    ndarray (6, 6)
+        Of position [m] and rotation about the map's axes [rad].
+    """
+    agreeing = SAME_ANSWER.agreeing(poses)[0]
+    # poses near each other share landmarks and errors: their supports differ by less than they say
+    weights = np.exp(CALIBRATION.covariance.sharpness * (odds[agreeing] - odds[agreeing].max()))
+    turns = Rotation.from_matrix(poses[agreeing, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
+    steps = np.concatenate([poses[agreeing, :3, 3] - poses[0, :3, 3], turns], axis=1)
+    squares = (steps.T * (weights / weights.sum())) @ steps
+    anywhere = np.repeat([np.trace(squares[:3, :3]) / 3, np.trace(squares[3:, 3:]) / 3], 3)
+    return np.asarray(squares + np.diag(anywhere))
 
 
 class Comparison(NamedTuple):

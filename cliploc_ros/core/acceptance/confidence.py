@@ -125,3 +125,23 @@ def objects_utility(support: Support, calibration: Calibration = CALIBRATION) ->
 def chance_by_points(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
     """Return the probability that a recognized place is right, by its points alone."""
     return 1.0 / (1.0 + math.exp(-points_utility(place, calibration)))
+
+
+def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float
+                   ) -> NDArray[np.float64]:
+    """Return the log odds (m,) that the tilt of each camera takes from its pose, 0 to 4.6.
+
+    Parameters
+    ----------
+    map_from_cameras : ndarray (m, 4, 4)
+        Poses in a map whose third axis is up.
+    deviation_deg : float
+        Standard deviation of the tilt [deg], see RelocalizerOptions; 0 for none.
+    """
+    if deviation_deg == 0.0:
+        return np.zeros(len(map_from_cameras))
+    deviation = np.radians(deviation_deg)
+    # the optical frame's second axis is down
+    tilts = np.arccos(np.clip(-map_from_cameras[:, 2, 1], -1.0, 1.0))
+    against = 0.5 * (tilts / deviation) ** 2 - np.log(2.0 / deviation ** 2)
+    return np.clip(against, 0.0, CALIBRATION.attitude.wrong_mount)

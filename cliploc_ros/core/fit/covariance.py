@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_difference
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 # Scatter of box centres assumed before any box is seen, as a share of the box, and how many
@@ -32,6 +32,8 @@ _ODOMETRY_FLOOR_RAD = np.radians(0.25)
 _ODOMETRY_DRIFT = 0.03
 # A camera that moves less stands still: rounding [m and rad].
 _STANDS_STILL = 1e-9
+# Weights of the first pose that covariance intersection tries.
+_WEIGHTS = np.linspace(0.0, 1.0, 11)
 
 
 def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64],
@@ -164,3 +166,26 @@ def _moved(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.f
     moved[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     moved[:3, 3] += step[:3]
     return moved
+
+
+def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
+         second: NDArray[np.float64], second_covariance: NDArray[np.float64]
+         ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the weighted mean of two poses (4, 4) and its covariance (6, 6).
+
+    Both share the errors of the map, to an unknown degree. Covariance intersection is right for
+    any degree (Julier and Uhlmann, "A Non-divergent Estimation Algorithm in the Presence of
+    Unknown Correlations", 1997). The weight gives the least variance of the position, so a pose
+    that is better in every direction stays as it is. The covariances are in the order of
+    core.fit.covariance.
+    """
+    informations = np.linalg.inv(first_covariance), np.linalg.inv(second_covariance)
+    covariances = [np.linalg.inv(weight * informations[0] + (1.0 - weight) * informations[1])
+                   for weight in _WEIGHTS]
+    best = int(np.argmin([np.trace(one[:3, :3]) for one in covariances]))
+    covariance = (covariances[best] + covariances[best].T) / 2
+    step = np.concatenate([first[:3, 3] - second[:3, 3],
+                           Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()])
+    moved = _WEIGHTS[best] * covariance @ informations[0] @ step
+    turn = Rotation.from_rotvec(moved[3:]).as_matrix()
+    return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance

@@ -19,6 +19,8 @@ _NEWTON_DIFFERENCE = 1e-6
 _FOLD_STEP_DEG = 0.1
 # A larger error after undistorting and distorting again means that the model has no inverse.
 _MAX_ROUND_TRIP_PX = 0.1
+# Corners of the base: right and down, in units of half its size.
+_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -165,3 +167,24 @@ class Camera:
         edges: NDArray[np.float64] = np.stack(
             [points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], axis=-1)
         return edges
+
+
+def frusta(camera: Camera, map_from_camera: NDArray[np.float64], depth_m: float
+           ) -> NDArray[np.float64]:
+    """Return the edges (8 f, 2, 3) of the frusta of a camera at some poses [m].
+
+    Parameters
+    ----------
+    camera : Camera
+    map_from_camera : ndarray (f, 4, 4)
+    depth_m : float
+        From the tip to the base [m].
+    """
+    half = np.array([camera.width / camera.fx, camera.height / camera.fy]) * 0.5 * depth_m
+    corners = np.column_stack([_CORNERS * half, np.full(4, depth_m)])
+    points = np.einsum('fij,kj->fki', map_from_camera[:, :3, :3], corners) \
+        + map_from_camera[:, None, :3, 3]
+    tips = np.broadcast_to(map_from_camera[:, None, :3, 3], points.shape)
+    lines = np.concatenate([np.stack([tips, points], axis=2),
+                            np.stack([points, np.roll(points, 1, axis=1)], axis=2)], axis=1)
+    return np.asarray(lines.reshape(-1, 2, 3))

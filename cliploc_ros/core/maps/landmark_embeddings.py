@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.index.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.replace_file import replace_file
 
@@ -28,6 +29,8 @@ _LAYOUT = {
 _KIND_NAMES = {'U': 'text', 'f': 'floats', 'iu': 'integers'}
 # float16 rounds each number by up to 5e-4 of it.
 _MAX_NORM_ERROR = 5e-3
+# Landmarks whose images stand for crops where spreads are measured.
+_CROPS_SAMPLED = 1024
 
 
 @dataclass(frozen=True)
@@ -242,3 +245,43 @@ def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
 def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
     if is_wrong.any():
         raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
+
+
+def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: str
+                ) -> LabelEmbeddings:
+    """Return a row for each landmark that compares crops with images, or with images and labels.
+
+    A landmark without images keeps its label; where images alone are compared, its label's
+    similarity is scaled and shifted to those of images.
+
+    Parameters
+    ----------
+    labels : LabelEmbeddings
+        Of L landmarks.
+    images : LandmarkEmbeddings
+        Of the same landmarks, at least one of them known.
+    compare : str
+        'image' or 'both'.
+    """
+    known = np.flatnonzero(images.is_known)
+    means = images.means.astype(np.float32)
+    # The deviation of a crop's similarities over the map, with labels and with images.
+    sample = known[::-(-len(known) // _CROPS_SAMPLED)]
+    crops = means[sample]
+    with_labels = (crops @ labels.unique[labels.of_landmarks[sample]].T).std(axis=1).mean()
+    others = ~np.eye(len(sample), dtype=np.bool_)  # a mean's similarity with itself says nothing
+    with_means = (crops @ crops.T).std(axis=1, where=others).mean() if len(sample) > 1 else 0.0
+    text_spread, image_spread = max(float(with_labels), 1e-6), max(float(with_means), 1e-6)
+    rows = np.asarray(labels, dtype=np.float32)
+    if compare == 'both':
+        share = image_spread / (text_spread + image_spread)
+        means[~images.is_known] = means[known].mean(axis=0)
+        rows *= share
+        means *= 1.0 - share
+        rows += means
+    else:
+        rows -= rows.mean(axis=0)
+        rows *= image_spread / text_spread
+        rows += means[known].mean(axis=0)
+        rows[known] = means[known]
+    return LabelEmbeddings.of(rows)

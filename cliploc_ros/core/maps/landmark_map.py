@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
-from cliploc_ros.core.index.duplicates import objects_of
 from cliploc_ros.core.index.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.maps.landmark_details import (
     OPTIONAL_FIELDS,
@@ -28,6 +29,7 @@ from cliploc_ros.core.maps.parameter_file import parse_parameters, read_text
 from cliploc_ros.core.maps.written_map import WrittenMap, parse_written_map
 from cliploc_ros.errors import MapError
 
+_UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 #: Standard deviation of a centre on each axis [m] where the map has no position_sigma: a guess for
 #: maps made by hand. Landmarks of build_map have .006 (median, TUM fr3), simulated ones .005 to
@@ -43,6 +45,29 @@ _CLASS_DISTANCE_M = 10.0
 # To find duplicates, each landmark is compared with its three nearest neighbours of the same class
 # within this distance.
 _COMPARED, _NEAR_M = 3, 0.5
+
+
+def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
+               neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of each landmark's object (L,): duplicates share one.
+
+    Landmarks of one class are duplicates if the centre of one lies in the other, after both have
+    got their mean shape. So books side by side are none.
+
+    Parameters
+    ----------
+    centers, shapes : ndarray (L, 3), (L, 6)
+        See cliploc_ros.core.geometry.ellipsoid.
+    neighbours : ndarray (p, 2) of int
+        Landmarks of one class that are near each other.
+    """
+    first, second = neighbours.T
+    offsets = centers[second] - centers[first]
+    means = (0.5 * (shapes[first] + shapes[second]))[:, _UPPER]
+    inside = np.einsum('ni,nij,nj->n', offsets, np.linalg.inv(means), offsets) < 1.0
+    links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
+                       (len(centers), len(centers)))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a reader of a map format returns, and how it becomes a map of ours."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from stat import S_ISREG
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,21 @@ from cliploc_ros.errors import DatasetError
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
+MAX_FILE_BYTES = 512 * 1024 * 1024
+COCO = (
+    'person', 'bicycle', 'car', 'motorcycle', 'airplane', 'bus', 'train', 'truck', 'boat',
+    'traffic light', 'fire hydrant', 'stop sign', 'parking meter', 'bench', 'bird', 'cat', 'dog',
+    'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra', 'giraffe', 'backpack', 'umbrella',
+    'handbag', 'tie', 'suitcase', 'frisbee', 'skis', 'snowboard', 'sports ball', 'kite',
+    'baseball bat', 'baseball glove', 'skateboard', 'surfboard', 'tennis racket', 'bottle',
+    'wine glass', 'cup', 'fork', 'knife', 'spoon', 'bowl', 'banana', 'apple', 'sandwich',
+    'orange', 'broccoli', 'carrot', 'hot dog', 'pizza', 'donut', 'cake', 'chair', 'couch',
+    'potted plant', 'bed', 'dining table', 'toilet', 'tv', 'laptop', 'mouse', 'remote',
+    'keyboard', 'cell phone', 'microwave', 'oven', 'toaster', 'sink', 'refrigerator', 'book',
+    'clock', 'vase', 'scissors', 'teddy bear', 'hair drier', 'toothbrush')
+_MAX_LENGTH = 1000
+# A map file holds four decimals of a weight. A class with less means nothing.
+_LEAST_SHARE = 0.001
 
 
 class GivenLandmark(NamedTuple):
@@ -144,3 +161,67 @@ def make_id(class_id: str, number: int | str) -> str:
     """Return an id for a landmark that has only a number: its class and the number."""
     word = ''.join(char if char.isalnum() else '_' for char in class_id)
     return f'{word}_{number}'
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a regular file that is neither empty nor too large.
+
+    Raises
+    ------
+    DatasetError
+        Names the file and what is wrong with it.
+    """
+    try:
+        if not S_ISREG(path.stat().st_mode):
+            raise DatasetError(f'{path}: is no file; name the file of the map')
+        with path.open('rb') as file:
+            content = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
+    if len(content) > MAX_FILE_BYTES:
+        raise DatasetError(f'{path}: is larger than {MAX_FILE_BYTES // 2**20} MiB; split it')
+    if not content:
+        raise DatasetError(f'{path}: is empty')
+    return content
+
+
+def read_class_names(path: Path) -> tuple[str, ...]:
+    """Read a text file with one class name in each line.
+
+    Raises
+    ------
+    DatasetError
+        Names the file and the line to correct.
+    """
+    try:
+        lines = read_bytes(path).decode('utf-8-sig').splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f'{path}: not a text file in UTF-8') from error
+    names = tuple(line.strip() for line in lines)
+    for number, name in enumerate(names, 1):
+        if not name or len(name) > _MAX_LENGTH:
+            raise DatasetError(f'{path}: line {number} must be a class name, one in each line')
+    return names
+
+
+def class_name(names: Sequence[str], index: int) -> str:
+    """Return the name of a class.
+
+    Raises
+    ------
+    DatasetError
+        The list of names has no such index.
+    """
+    if not 0 <= index < len(names):
+        raise DatasetError(f'class index {index} is not among {len(names)} names; name the '
+                           'classes that the map was made with: --class-names FILE')
+    return names[index]
+
+
+def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    """Return classes with their shares, the greatest first; those below a thousandth go."""
+    least = _LEAST_SHARE * sum(weights.values())
+    ranked = sorted(((name, weight) for name, weight in weights.items() if weight > least),
+                    key=lambda pair: -pair[1])
+    total = sum(weight for _, weight in ranked)
+    return tuple((name, weight / total) for name, weight in ranked)

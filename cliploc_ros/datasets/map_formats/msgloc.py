@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.datasets.map_formats.class_names import class_name, shares
-from cliploc_ros.datasets.map_formats.files import read_bytes
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,
     LeftOut,
+    class_name,
     make_id,
+    read_bytes,
+    shares,
 )
 from cliploc_ros.errors import DatasetError
 

@@ -17,17 +17,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.datasets.map_formats.class_names import class_name
-from cliploc_ros.datasets.map_formats.files import read_bytes
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,
     LeftOut,
+    class_name,
     make_id,
+    read_bytes,
 )
-from cliploc_ros.datasets.map_formats.goreloc import read_quadric
+from cliploc_ros.datasets.map_formats.goreloc import QuadricError, decompose, read_quadric
 from cliploc_ros.datasets.map_formats.protobuf import WireError, read_fields
-from cliploc_ros.datasets.map_formats.quadrics import QuadricError, decompose
 from cliploc_ros.errors import DatasetError
 
 _NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '

@@ -14,8 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.datasets.map_formats.files import read_bytes
-from cliploc_ros.datasets.map_formats.given_map import GivenLandmark, GivenMap, make_id
+from cliploc_ros.datasets.map_formats.given_map import GivenLandmark, GivenMap, make_id, read_bytes
 from cliploc_ros.errors import DatasetError
 
 _CENTER, _SEMI_AXES, _QUATERNION = ('x', 'y', 'z'), ('a', 'b', 'c'), ('qx', 'qy', 'qz', 'qw')

@@ -6,11 +6,16 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from cliploc_ros.evaluation.map_check.style import ACCEPTED, FAULTY, GRADE_NAMES, MINOR, grade
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts
-from cliploc_ros.mapping.checking.report import CheckReport, RecordingCheck, share
+from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, RecordingCheck, share
 
+ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
+SOUND, MINOR, FAULTY = '#009E73', '#E69F00', '#D55E00'
+LOOK_ALIKE, INK, FAINT = '#CC79A7', '#222222', '#999999'
+VERDICT_COLORS = {'accepted': ACCEPTED, 'refused': REFUSED, 'misled': MISLED}
+GRADE_COLORS = {'faulty': FAULTY, 'minor': MINOR, 'sound': SOUND}
+GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
 _STYLE = f"""\
@@ -32,6 +37,13 @@ li, h1, figcaption {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
 .note, figcaption {{ font-size: 14px; color: #555 }}
 figure {{ margin: 2rem 0 }} li {{ margin: .3rem 0 }}
 """
+
+
+def grade(landmark: LandmarkCheck) -> str:
+    """Return 'faulty', 'minor' or 'sound'."""
+    if landmark.severity >= SERIOUS:
+        return 'faulty'
+    return 'minor' if landmark.faults else 'sound'
 
 
 def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]]) -> str:

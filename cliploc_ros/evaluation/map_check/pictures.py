@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.evaluation.map_check.style import (
+from cliploc_ros.evaluation.figures import EDGED
+from cliploc_ros.evaluation.map_check.page import (
     FAINT,
     GRADE_COLORS,
     GRADE_NAMES,
@@ -28,7 +29,6 @@ from cliploc_ros.evaluation.map_check.style import (
     VERDICT_COLORS,
     grade,
 )
-from cliploc_ros.evaluation.map_view import EDGED
 from cliploc_ros.mapping.checking.look_alikes import RADIUS_M
 from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
 from cliploc_ros.mapping.checking.report import CheckReport, GridCheck

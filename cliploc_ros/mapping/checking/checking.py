@@ -23,7 +23,6 @@ from cliploc_ros.mapping.checking.detector_model import (
     measure_detector,
 )
 from cliploc_ros.mapping.checking.grid import Grid, make_grid
-from cliploc_ros.mapping.checking.keyframe_reach import check_keyframes
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
     check_landmarks,
@@ -45,6 +44,7 @@ from cliploc_ros.mapping.checking.report import (
     CheckReport,
     GridCheck,
     RecordingCheck,
+    check_keyframes,
     find_failures,
 )
 from cliploc_ros.mapping.checking.systematic import find_corrections

@@ -17,8 +17,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.detection_types import detection_type
+from cliploc_ros.ros.conversions import detection_type, stamp_ns
 from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor of a node: messages in one thread, services and timers in others."""
 
+import threading
 import time
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
@@ -13,12 +15,45 @@ from rclpy.service import Service
 from rclpy.task import Task
 from rclpy.timer import Timer
 
-from cliploc_ros.ros.node.callback_group import MAX_REQUESTS
-
+# Requests that may wait at a time, a thread each; further ones wait in the middleware.
+MAX_REQUESTS = 16
 # For requests that wait, transitions, parameters and timers. The pool creates threads on demand.
 _THREADS = MAX_REQUESTS + 8
 # A thread is free, but may wait for a core.
 _BEGIN_S = 0.1
+
+
+class BoundedCallbackGroup(CallbackGroup):
+    """Runs up to `limit` callbacks at a time.
+
+    Parameters
+    ----------
+    limit : int
+    """
+
+    def __init__(self, limit: int) -> None:
+        super().__init__()
+        self._limit = limit
+        self._running: list[object] = []
+        self._lock = threading.Lock()
+
+    def can_execute(self, entity: object) -> bool:
+        """Return whether another callback may begin."""
+        with self._lock:
+            return len(self._running) < self._limit
+
+    def beginning_execution(self, entity: object) -> bool:
+        """Count a callback that begins; return whether it may."""
+        with self._lock:
+            if len(self._running) >= self._limit:
+                return False
+            self._running.append(entity)
+            return True
+
+    def ending_execution(self, entity: object) -> None:
+        """Count a callback that ended."""
+        with self._lock:
+            self._running.remove(entity)
 
 
 class NodeExecutor(SingleThreadedExecutor):

@@ -22,20 +22,69 @@ from rclpy.node import Node
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
-from cliploc_ros.ros.node.bond import end_bond, start_bond
-from cliploc_ros.ros.node.callback_group import BoundedCallbackGroup
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
-from cliploc_ros.ros.node.log import RosLogHandler
+from cliploc_ros.ros.node.executor import BoundedCallbackGroup
 from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, Value
 from cliploc_ros.ros.node.worker import Worker
 from cliploc_ros.units import NS_PER_S
 
+# Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).
+_HEARTBEAT_PERIOD_S = 0.1
+_HEARTBEAT_TIMEOUT_S = 4.0
 # A transition may load weights for seconds; meanwhile clients can ask for the state.
 _MAX_TRANSITION_REQUESTS = 3
 # Between attempts of a node to bring itself up; the pause doubles each time.
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
 _PACKAGE_LOGGER = logging.getLogger('cliploc_ros')
+
+
+def start_bond(node: Node) -> Any:
+    """Return a started bond, which the manager takes up; None where bondpy is not installed.
+
+    Parameters
+    ----------
+    node : Node
+        The manager identifies the bond by the node's name.
+    """
+    try:
+        from bondpy.bondpy import Bond
+    except ImportError:
+        return None
+    bond = Bond(node, 'bond', node.get_name())
+    bond.set_heartbeat_period(_HEARTBEAT_PERIOD_S)
+    bond.set_heartbeat_timeout(_HEARTBEAT_TIMEOUT_S)
+    bond.start()
+    return bond
+
+
+def end_bond(node: Node, bond: Any) -> None:
+    """Tell the manager that the node ends its work.
+
+    bondpy destroys its publisher and subscription, but leaves them to the node: its executor
+    would come upon them for ever, and do nothing else.
+    """
+    bond.shutdown()
+    node.destroy_publisher(bond.pub)
+    node.destroy_subscription(bond.sub)
+
+
+class RosLogHandler(logging.Handler):
+    """Logs the records of Python's logging through a node."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(logging.INFO)
+        self._logger = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one record at its level."""
+        # rclpy refuses a level that varies at one call site.
+        if record.levelno >= logging.ERROR:
+            self._logger.error(record.getMessage())
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(record.getMessage())
+        else:
+            self._logger.info(record.getMessage())
 
 
 class NotActiveError(CliplocError):
