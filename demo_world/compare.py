@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cliploc_ros.core.maps.landmark_embeddings import embeddings_path, save_landmark_embeddings
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landmark_embeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.observations import save_observations

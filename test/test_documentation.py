@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
 
 PROJECT = Path(__file__).resolve().parents[1]

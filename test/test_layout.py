@@ -16,11 +16,10 @@ MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffi
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
     ('cache_folder', 'errors', 'replace_file', 'units'),
-    ('core.kernels', 'core.time_budget'),
+    ('core.kernels',),
     ('core.geometry',),
-    ('core.index',),
-    ('core.maps', 'core.observation', 'core.options'),
-    ('core.association',),
+    ('core.map',),
+    ('core.observation', 'core.options'),
     ('core.search',),
     ('core.keyframes',),
     ('core.fit',),

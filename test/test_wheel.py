@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 PROJECT = Path(__file__).resolve().parents[1]
 ROOM = PROJECT / 'test/mapping/changed_room'

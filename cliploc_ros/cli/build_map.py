@@ -21,8 +21,8 @@ from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.cli.map_labels import Labeller
-    from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions
     from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.mapping.updating.updating import UpdatedMap
@@ -61,8 +61,8 @@ def read_old_map(path: Path) -> OldMap:
     MapError
         The map or its embeddings are invalid.
     """
-    from cliploc_ros.core.maps.landmark_embeddings import load_embeddings_of_map
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
 
     landmark_map = LandmarkMap.from_file(path)
     return OldMap(landmark_map, load_embeddings_of_map(path, landmark_map.landmark_ids))
@@ -113,8 +113,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.mapping.posed_detections import PosedDetections
 
@@ -172,7 +172,7 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer_file import remove_layer
-    from cliploc_ros.core.maps.map_file import write_map
+    from cliploc_ros.core.map.map_file import write_map
 
     begin = time.monotonic()
     # Refuse an output whose folder is missing, before the work is done.

@@ -56,7 +56,7 @@ class StageBar:
 
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
     from cliploc_ros.mapping.checking.relocalization import PosedObservation
 
@@ -130,7 +130,7 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.evaluation.map_check.output import PAGE, write_report
     from cliploc_ros.evaluation.map_check.page import summary_lines

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.observation import Observation
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
@@ -150,8 +150,8 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
 def evaluate(options: argparse.Namespace) -> int:
     """Evaluate with the options of the command line; return the exit code."""
     # imported late, so that --help is fast
-    from cliploc_ros.core.maps.joined_map import join_maps
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.joined_map import join_maps
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.evaluation import Evaluation
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder

@@ -14,7 +14,7 @@ from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, sp
 from cliploc_ros.errors import DatasetError, MapError, MappingError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.datasets.map_formats.given_map import (
         GivenMap,
         ImportedMap,
@@ -90,7 +90,7 @@ def import_map(options: argparse.Namespace) -> int:
     """Import as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer_file import remove_layer
-    from cliploc_ros.core.maps.map_file import write_map
+    from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.datasets.map_formats.given_map import place
 
     begin = time.monotonic()

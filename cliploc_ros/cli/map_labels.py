@@ -14,8 +14,8 @@ from cliploc_ros.cli.sources import clip_options
 from cliploc_ros.errors import ModelError
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
     from cliploc_ros.vocabulary.vocabulary import Vocabulary

@@ -12,7 +12,7 @@ from cliploc_ros.errors import MapError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.core.maps.landmark_map import LandmarkMap
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 _DEFAULT_POINTS = 600
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from cliploc_ros.core.maps.landmark_embeddings import embeddings_path
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError
 
 EPILOG = """\

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.index.similarities import Similarities
+from cliploc_ros.core.map.similarities import Similarities
 
 
 @dataclass(frozen=True)

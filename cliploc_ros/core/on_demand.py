@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.index.similarities import Similarities
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization

@@ -11,8 +11,8 @@ from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.maps.joined_map import MapPart, parts_of, place_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, shape_matrices
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.tum import parse_stamp_ns
 from cliploc_ros.demo.review import ACCEPTED, REFUSED
 from cliploc_ros.demo.truth import TrueFrame, TrueObject, true_ids

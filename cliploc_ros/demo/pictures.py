@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.demo.review import ACCEPTED, REFUSED, Judged, Review, verdict
 from cliploc_ros.evaluation.figures import EDGED, draw_map
 

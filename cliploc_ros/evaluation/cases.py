@@ -16,7 +16,7 @@ from cliploc_ros.core.keyframes.localization import (
     query_features,
 )
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import stages_of
 from cliploc_ros.core.options import RelocalizerOptions

@@ -14,8 +14,8 @@ import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.maps.joined_map import parts_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.queries import QueryFrame
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.journal import Journal

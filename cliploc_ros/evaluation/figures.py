@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.output import write_file
 from cliploc_ros.evaluation.summary import Summary, find_best

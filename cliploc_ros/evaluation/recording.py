@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.keyframes.localization import query_features
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import Recorded
 from cliploc_ros.datasets.queries import Queries, QueryFrame

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_embeddings import MOST_MEDOIDS, LandmarkEmbeddings
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_embeddings import MOST_MEDOIDS, LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.landmarks import group_boxes
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import number_viewpoints

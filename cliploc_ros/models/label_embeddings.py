@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from cliploc_ros.core.maps.landmark_details import WeightedLabels
+from cliploc_ros.core.map.landmark_details import WeightedLabels
 
 _FORMAT = 1
 # A map of 1,000 labels takes 3 MB with ViT-L-14.

@@ -5,16 +5,16 @@
 import logging
 from collections.abc import Sequence
 
-from cliploc_ros.core.index.similarities import LabelEmbeddings
-from cliploc_ros.core.maps.joined_map import JoinedMap, parts_of
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.joined_map import JoinedMap, parts_of
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     concatenated,
     embeddings_path,
     load_embeddings_of_map,
     with_images,
 )
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.models.clip_encoder import LoadedEncoder, embed_labels, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights

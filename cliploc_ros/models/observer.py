@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.protocols import ImageTextEncoder

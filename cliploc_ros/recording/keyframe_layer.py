@@ -22,7 +22,7 @@ from cliploc_ros.core.keyframes.layer import (
     nearest_words,
 )
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import depths_of_points
 from cliploc_ros.datasets.frames import Frame, Frames, undistorted
 from cliploc_ros.errors import MappingError, OptionsError

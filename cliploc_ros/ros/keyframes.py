@@ -20,7 +20,7 @@ from cliploc_ros.core.keyframes.localization import (
     query_features,
 )
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros.cache_folder import resolve_cache_dir
-from cliploc_ros.core.index.similarities import Similarities, split_similarities
 from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
-from cliploc_ros.core.maps.joined_map import parts_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import Similarities, split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import BATCH, can_do_without_crops, crops_on_demand
 from cliploc_ros.core.options import RelocalizerOptions

@@ -10,8 +10,8 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 from rclpy.node import Node
 
-from cliploc_ros.core.maps.joined_map import join_maps
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import join_maps
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, OptionsError
 
 _FILE, _PACKAGE = 'file://', 'package://'

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.studio.changes import Change, EditError, Landmarks, from_json, to_json
 from cliploc_ros.studio.journal import Journal

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.studio.changes import Change, EditError, Landmarks, change_of
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M, Landmark, rounded, shape_fields
 from cliploc_ros.studio.looks import Look, merge_looks

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.studio.looks import Look
 
 REQUIRED_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')

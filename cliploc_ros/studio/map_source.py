@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 from cliploc_ros.replace_file import replace_file
 from cliploc_ros.studio.landmark import Landmark, map_of

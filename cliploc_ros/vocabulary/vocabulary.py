@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError
 
 #: Symbols with a meaning of their own: the first kind, and a colour other than the first one.

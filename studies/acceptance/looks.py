@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.on_demand import stages_of
 from cliploc_ros.core.options import RelocalizerOptions

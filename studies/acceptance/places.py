@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cliploc_ros.command import positive_int
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError

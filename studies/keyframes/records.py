@@ -27,7 +27,7 @@ from cliploc_ros.core.keyframes.localization import (
 )
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.maps.joined_map import join_maps
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import join_maps
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import crops_on_demand, localize_on_demand
 from cliploc_ros.core.options import RelocalizerOptions

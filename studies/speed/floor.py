@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations, save_observations
 from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.mapping.building import build_map

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.cache_folder import resolve_cache_dir
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

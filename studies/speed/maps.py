@@ -12,23 +12,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.matching import match_frame
-from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.index.culling import SortedLandmarks, make_groups
-from cliploc_ros.core.index.similarities import (
+from cliploc_ros.core.map.culling import SortedLandmarks, make_groups
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import (
     CropSimilarities,
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.leaders import Leaders
+from cliploc_ros.core.search.matching import match_frame
 from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.screening import set_up
 from cliploc_ros.core.search.strategies import search_samples
 

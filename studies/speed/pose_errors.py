@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.building import BuiltMap, build_map
 from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors

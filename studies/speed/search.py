@@ -22,20 +22,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.candidates import (
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.search.candidates import (
     balanced_order,
     class_candidates,
     joined,
     nearest_candidates,
 )
-from cliploc_ros.core.association.scene import Scene, make_scene
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
     Progress,

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations, save_observations
 
 

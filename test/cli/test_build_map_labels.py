@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.build_map import main
-from cliploc_ros.core.maps.landmark_embeddings import embeddings_path, load_embeddings_of_map
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_embeddings_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations, save_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scene import make_room
 
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.map_file import write_map
 
 FAST = ('--positions', 4, '--headings', 2)
 

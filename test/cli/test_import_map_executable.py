@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from foreign_maps import goreloc_file, msgloc_text, oaslam_text, table_text
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations, save_observations
 
 

@@ -10,7 +10,7 @@ import pytest
 from cliploc_ros.cli.build_map import main, make_parser
 from cliploc_ros.cli.map_layer import write_layer
 from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, remove_layer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, MappingError
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'

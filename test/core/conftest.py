@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.datasets.queries import Queries, load_queries
 

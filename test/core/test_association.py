@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import candidate_mask, same_class
 
-from cliploc_ros.core.association.candidates import (
+from cliploc_ros.core.map.classes import ClassIndex
+from cliploc_ros.core.search.candidates import (
     balanced_order,
     class_candidates,
     joined,
@@ -14,7 +15,6 @@ from cliploc_ros.core.association.candidates import (
     prosac_order,
     rarest_class_candidates,
 )
-from cliploc_ros.core.index.classes import ClassIndex
 from cliploc_ros.errors import OptionsError
 
 SIMILARITIES = np.array([[0.9, 0.1, 0.5], [0.2, 0.8, 0.7]], dtype=np.float32)

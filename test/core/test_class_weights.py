@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.index.culling import FEW
-from cliploc_ros.core.maps.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.culling import FEW
+from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.matching import match_frame
 
 ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')

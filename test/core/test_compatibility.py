@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.search.compatibility import (
     FARTHEST,
@@ -19,6 +18,7 @@ from cliploc_ros.core.search.compatibility import (
 )
 from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import enumerate_compatible_triples
+from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.core.search.strategies import search_exhaustively, search_progressively
 
 

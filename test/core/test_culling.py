@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from reference import sample_pose, verify
 
-from cliploc_ros.core.association.scene import Scene, make_scene
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.projection import Poses
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.index.culling import (
+from cliploc_ros.core.map.culling import (
     make_groups,
     no_landmarks,
     sort_landmarks,
@@ -21,6 +20,7 @@ from cliploc_ros.core.index.culling import (
 )
 from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.strategies import search_samples
 
 HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))

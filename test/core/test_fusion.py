@@ -8,8 +8,6 @@ from reference import verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.association.matching import match_frame
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.box_edges import robust_cost
 from cliploc_ros.core.fit.refinement import (
     linearize_rig,
@@ -26,10 +24,12 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.matching import match_frame
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
+from cliploc_ros.core.search.scene import make_scene
 
 FRAMES = 4
 

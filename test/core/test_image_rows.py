@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.core.index.similarities import (
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
+from cliploc_ros.core.map.similarities import (
     CropSimilarities,
     LabelEmbeddings,
     nearest_landmarks,
 )
-from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings, with_images
 
 COUNT, SIZE = 50, 64
 

@@ -9,8 +9,8 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.maps.joined_map import MAX_MAPS, join_maps, parts_of, place_of
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import in_its_map

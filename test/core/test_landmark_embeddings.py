@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     load_embeddings_of_map,

@@ -9,8 +9,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.maps import parameter_file
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map import parameter_file
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 
 CUP = {'label': 'a red cup', 'class_id': 'cup', 'center': [1.0, 2.0, 3.0],

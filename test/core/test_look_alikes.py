@@ -14,8 +14,8 @@ from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.index.pairs import find_repeats
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.pairs import find_repeats
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -10,16 +10,16 @@ import pytest
 import yaml
 from scene import make_room
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     load_embeddings_of_map,
 )
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
-from cliploc_ros.core.maps.written_map import parse_written_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.core.map.parameter_file import read_parameter_file
+from cliploc_ros.core.map.written_map import parse_written_map
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],

@@ -14,17 +14,17 @@ import pytest
 from reference import candidate_mask, same_class, verify
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.association import matching
-from cliploc_ros.core.association.candidates import nearest_candidates
-from cliploc_ros.core.association.matching import match_frame
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search import matching
+from cliploc_ros.core.search.candidates import nearest_candidates
+from cliploc_ros.core.search.matching import match_frame
+from cliploc_ros.core.search.scene import make_scene
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 

@@ -9,7 +9,7 @@ import pytest
 from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.index.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import (
     BATCH,

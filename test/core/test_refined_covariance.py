@@ -10,7 +10,6 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.box_edges import LEAST_DEVIATION, RELATIVE_DEVIATION, edge_deviation
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.refined_covariance import refined_covariance
@@ -22,12 +21,13 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_map import DEFAULT_SIGMA_M
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
+from cliploc_ros.core.search.scene import make_scene
 
 ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.index.similarities import (
+from cliploc_ros.core.map.similarities import (
     CropSimilarities,
     LabelEmbeddings,
     nearest_landmarks,

@@ -16,7 +16,6 @@ from cliploc_ros.core.acceptance.confidence import (
 )
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
-from cliploc_ros.core.association.scene import make_scene
 from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
@@ -24,6 +23,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
 

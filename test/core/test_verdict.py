@@ -19,7 +19,7 @@ from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, re
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -25,8 +25,8 @@ from foreign_maps import (
 )
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.map_formats.given_map import (
     COCO,
     GivenMap,

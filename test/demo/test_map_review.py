@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.map_review import (
     Sightings,

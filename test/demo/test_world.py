@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     shape_matrices,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.truth import read_frames

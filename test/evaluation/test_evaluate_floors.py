@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.evaluate import main
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.demo import ASSETS
 from studies.speed.building import main as building
 

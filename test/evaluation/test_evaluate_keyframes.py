@@ -12,7 +12,7 @@ import pytest
 
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum

@@ -7,12 +7,12 @@ import shutil
 import numpy as np
 import pytest
 
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     save_landmark_embeddings,
 )
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum

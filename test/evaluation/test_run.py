@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from clusters import kill_a_worker, local_cluster
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError

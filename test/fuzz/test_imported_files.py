@@ -22,8 +22,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.map_formats.given_map import COCO, Placement, place
 from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
 from cliploc_ros.datasets.map_formats.msgloc import read_msgloc

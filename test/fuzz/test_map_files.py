@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scene import make_room, write_map
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 
 scalar = st.one_of(st.none(), st.booleans(), st.integers(), number, st.text(max_size=20))

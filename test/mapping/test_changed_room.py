@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli import build_map
-from cliploc_ros.core.maps.landmark_embeddings import load_embeddings_of_map
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.demo import ASSETS
 
 ROOM = Path(__file__).parent / 'changed_room'

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, make_table, see, walk_around
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.evaluation.map_check.output import DATA, PAGE, write_report

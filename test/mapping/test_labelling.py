@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from walk import make_table, see, walk_around
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.labelling import Phrases, embed_landmarks, label_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections

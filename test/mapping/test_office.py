@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.landmarks import landmarks_of_map

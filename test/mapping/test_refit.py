@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walk import make_table, see, walk_around
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.refit import refit_map
 

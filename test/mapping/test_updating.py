@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from walk import CLASSES, look_at, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.updating.options import UpdateOptions

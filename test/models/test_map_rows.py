@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scene import make_room
 
-from cliploc_ros.core.maps.joined_map import join_maps
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.joined_map import join_maps
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     save_landmark_embeddings,
 )
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.models import ClipOptions, load_encoder
 from cliploc_ros.models.clip_weights import resolve_clip_weights
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map

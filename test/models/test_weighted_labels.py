@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.models import label_embeddings
 from cliploc_ros.models.label_embeddings import mixed_rows
 

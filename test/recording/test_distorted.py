@@ -14,7 +14,7 @@ from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.demo.truth import read_objects
 from cliploc_ros.mapping.options import MappingOptions

@@ -16,7 +16,7 @@ from cliploc_ros.core.keyframes.features import DIMENSIONS
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

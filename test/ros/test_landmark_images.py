@@ -11,14 +11,14 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     load_landmark_embeddings,
     save_landmark_embeddings,
 )
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum

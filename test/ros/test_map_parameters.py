@@ -7,8 +7,8 @@ import pytest
 import yaml
 from scene import make_room, write_map
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.map_file import write_map as write_whole_map
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.map_file import write_map as write_whole_map
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import load_map
 

@@ -6,7 +6,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.ros.outputs.visualization import (
     MAX_SHOWN,
     class_color,

@@ -15,7 +15,7 @@ from cliploc_ros.core.acceptance.confidence import (
     utilities,
 )
 from cliploc_ros.core.acceptance.support import Support
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries

@@ -12,7 +12,7 @@ import pytest
 from browser import TIMEOUT_S, Person, value_of, wait_for
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.studio.picture import project
 
 # Software rendering needs an idle machine.

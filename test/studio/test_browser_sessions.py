@@ -14,7 +14,7 @@ import pytest
 import yaml
 from browser import Person, value_of, wait_for
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.checking.detector_model import guess_detector
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections

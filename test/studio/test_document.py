@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from studio_map import TEXT
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.parameter_file import read_parameter_file
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.changes import EditError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.evidence import ious_with

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from two_rooms import write_two_rooms
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
 from cliploc_ros.mapping.checking.report import GridCheck

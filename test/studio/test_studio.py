@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.maps.map_file import write_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from studio_map import TEXT
 
-from cliploc_ros.core.maps.landmark_embeddings import (
+from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     load_embeddings_of_map,

@@ -12,7 +12,7 @@ import pytest
 from browser import Person, wait_for
 
 from cliploc_ros.cli.studio import make_parser, open_studio
-from cliploc_ros.core.maps.landmark_embeddings import embeddings_path, load_landmark_embeddings
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
 from cliploc_ros.datasets.observations import save_observations
 from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.errors import OptionsError

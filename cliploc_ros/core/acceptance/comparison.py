@@ -48,7 +48,7 @@ from cliploc_ros.core.fit.finalists import (
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.maps.joined_map import Place, place_of
+from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.search.frame_search import coverage_of, prior_of
 from cliploc_ros.core.search.leaders import MAX_DISTINCT
 

@@ -22,8 +22,8 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER, SAME_MOVE
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.index.pairs import find_repeats
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.pairs import find_repeats
 
 # All constants are chosen on simulated worlds, see studies.worlds: kinds room,
 # office, shop, corridor, hall and two rooms, seeds 0 to 59.

@@ -25,11 +25,11 @@ from cliploc_ros.core.acceptance.candidates import (
     unrefined,
 )
 from cliploc_ros.core.acceptance.confidence import utilities
-from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.fit.finalists import matches_of
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.search.matching import match_frame
 
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])

@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.index.similarities import (
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.map.similarities import (
     Similarities,
     pair_similarities,
     sampled_spread,
 )
-from cliploc_ros.core.maps.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.search.scene import Scene
 
 # Boxes that overlap more than this show the same object, detected twice.
 _SAME_BOX_IOU = 0.8

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Potential, Scene
 from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
-from cliploc_ros.core.index.culling import Groups
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map.culling import Groups
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.search.scene import Potential, Scene
 from cliploc_ros.errors import OptionsError
 
 #: The most frames that are fused. The leaders of each frame are verified on every frame, so the

@@ -17,8 +17,8 @@ from cliploc_ros.core.fit.rig import camera_pose, scene_of
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
 from cliploc_ros.core.geometry.projection import Poses
-from cliploc_ros.core.index.culling import visible_members
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
+from cliploc_ros.core.map.culling import visible_members
 from cliploc_ros.core.search.leaders import same_place
 
 

@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.replace_file import replace_file
 

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From correspondence candidates to the best hypotheses of one frame."""
+"""From the boxes of a frame to correspondence candidates, and on to its best hypotheses."""

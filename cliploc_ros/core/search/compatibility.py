@@ -11,8 +11,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.search.scene import Scene
 
 # Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
 # boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:

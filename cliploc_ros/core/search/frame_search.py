@@ -11,16 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.matching import match_frame
-from cliploc_ros.core.association.scene import Scene
-from cliploc_ros.core.maps.joined_map import parts_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.compatibility import compatible_pairs
 from cliploc_ros.core.search.leaders import MAX_DISTINCT, Leaders
+from cliploc_ros.core.search.matching import match_frame
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN, Prior
 from cliploc_ros.core.search.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
+from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.strategies import (
     Progress,
     search_exhaustively,

@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS, p3p
 from cliploc_ros.core.geometry.projection import Poses, project
 from cliploc_ros.core.geometry.two_point import two_point
-from cliploc_ros.core.index.culling import Groups, project_visible
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
+from cliploc_ros.core.map.culling import Groups, project_visible
 from cliploc_ros.core.search.prior import Prior
+from cliploc_ros.core.search.scene import Scene
 
 
 class Targets(NamedTuple):
@@ -39,7 +39,7 @@ class Targets(NamedTuple):
     landmarks : ndarray (u, 9)
         Centres and shapes of the landmarks that single detections may show.
     starts, detections : ndarray (u + 1,), (p,)
-        Detections of each of these landmarks, see cliploc_ros.core.association.scene.Potential.
+        Detections of each of these landmarks, see cliploc_ros.core.search.scene.Potential.
     sorted_landmarks : ndarray (L, 9)
         Centres and shapes of the map's landmarks, see SortedLandmarks.
     groups : Groups

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.scene import Scene
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.search.leaders import Leaders, remember, worst_score
 from cliploc_ros.core.search.prior import Prior
@@ -20,6 +19,7 @@ from cliploc_ros.core.search.sampling import (
     enumerate_compatible_triples,
     enumerate_triples,
 )
+from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 
 # search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries every

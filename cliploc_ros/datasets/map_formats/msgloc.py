@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,

@@ -16,7 +16,7 @@ scale, and its coordinate frame is the first camera's: z forward, y down.
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,

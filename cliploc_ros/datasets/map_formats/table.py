@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.given_map import GivenLandmark, GivenMap, make_id, read_bytes
 from cliploc_ros.errors import DatasetError
 

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.map_check.page import make_page
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
 from cliploc_ros.evaluation.output import write_text

@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.figures import EDGED
 from cliploc_ros.evaluation.map_check.page import (
     FAINT,

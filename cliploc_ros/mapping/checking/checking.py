@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.cross_validation import (

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.checking.landmark_faults import Witness
 from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.evidence import best_ious

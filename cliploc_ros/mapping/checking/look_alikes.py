@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.look_alikes import find_alike
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 #: Places are so far apart: each is the surroundings of a landmark [m].
 RADIUS_M = 2.0

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.updating.known import Known

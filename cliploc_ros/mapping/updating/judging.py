@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaln, expit
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import join_landmarks

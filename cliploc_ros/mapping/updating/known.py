@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks
 from cliploc_ros.mapping.updating.finding import close_pairs

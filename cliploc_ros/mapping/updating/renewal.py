@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.updating.alignment import deviations
 from cliploc_ros.mapping.updating.fates import Fates
 from cliploc_ros.mapping.updating.known import Known, ellipsoid_numbers

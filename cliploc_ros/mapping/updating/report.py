@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.report import LeftOut
 from cliploc_ros.mapping.updating.fates import Fates
 from cliploc_ros.mapping.updating.judging import Judged

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_embeddings import LandmarkEmbeddings
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.posed_detections import PosedDetections

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.index.similarities import CropSimilarities
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import CropSimilarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalization import Relocalization
 

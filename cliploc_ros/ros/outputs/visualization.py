@@ -19,8 +19,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.maps.joined_map import parts_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg

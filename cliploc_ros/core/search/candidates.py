@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.index.classes import ClassIndex
-from cliploc_ros.core.index.similarities import Similarities, nearest_landmarks
+from cliploc_ros.core.map.classes import ClassIndex
+from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks
 from cliploc_ros.errors import OptionsError
 
 

@@ -6,7 +6,7 @@ PyYAML makes an object of each mark of the file: 100,000 landmarks take it 10 to
 build_map, import_map and the studio repeat one layout, so a regular expression for one landmark
 reads them ten times faster. It accepts a small part of YAML only, in which it agrees with the
 parser. Any other file, a hand-written or invalid one among them, gives None, and the parser reads
-it and names what is wrong (cliploc_ros.core.maps.parameter_file).
+it and names what is wrong (cliploc_ros.core.map.parameter_file).
 """
 
 import json
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 
 # Quoted text whose escapes mean the same in JSON and in YAML; halves of a pair of code units do
 # not. A key of YAML has at most 1024 characters.

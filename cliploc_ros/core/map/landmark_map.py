@@ -16,17 +16,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
-from cliploc_ros.core.index.classes import ClassIndex
-from cliploc_ros.core.index.culling import SortedLandmarks, sort_landmarks
-from cliploc_ros.core.index.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.maps.landmark_details import (
+from cliploc_ros.core.map.classes import ClassIndex
+from cliploc_ros.core.map.culling import SortedLandmarks, sort_landmarks
+from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
     read_details,
 )
-from cliploc_ros.core.maps.parameter_file import parse_parameters, read_text
-from cliploc_ros.core.maps.written_map import WrittenMap, parse_written_map
+from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
+from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
+from cliploc_ros.core.map.written_map import WrittenMap, parse_written_map
 from cliploc_ros.errors import MapError
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.index.culling import Groups, SortedLandmarks, make_groups, no_landmarks
+from cliploc_ros.core.map.culling import Groups, SortedLandmarks, make_groups, no_landmarks
 
 
 class Potential(NamedTuple):

@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.association.candidates import (
+from cliploc_ros.core.map.culling import FEW, SortedLandmarks
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import split_similarities
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.candidates import (
     Candidates,
     balanced_order,
     class_candidates,
@@ -18,13 +24,7 @@ from cliploc_ros.core.association.candidates import (
     prosac_order,
     rarest_class_candidates,
 )
-from cliploc_ros.core.association.scene import Scene, make_scene
-from cliploc_ros.core.index.culling import FEW, SortedLandmarks
-from cliploc_ros.core.index.similarities import split_similarities
-from cliploc_ros.core.maps.joined_map import parts_of
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.errors import OptionsError
 
 #: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.index.similarities import LabelEmbeddings
+from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.replace_file import replace_file
 

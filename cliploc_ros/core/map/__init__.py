@@ -1,0 +1,15 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The map: landmarks, one map or several, their files, and their indices.
+
+landmark_map
+    The map, and how its file is read; landmark_details has its optional fields.
+landmark_embeddings
+    Images of each landmark, as an encoder saw them, and how crops are compared with them.
+joined_map
+    Several maps, searched as one.
+map_file, written_map, parameter_file
+    Writing a map, reading what was written in a second, and any parameter file without ROS.
+classes, similarities, pairs, culling
+    The landmarks by class, by similarity of their labels, by pairs, and by place.
+"""
