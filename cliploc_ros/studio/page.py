@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.replace_file import replace_file
 from cliploc_ros.studio import edits
+from cliploc_ros.studio.images import SELECTED_RGB
 from cliploc_ros.studio.keyframes_panel import KeyframesPanel
 from cliploc_ros.studio.live_panel import LivePanel
 from cliploc_ros.studio.panels import LandmarkPanel, MapPanel, TablePanel, ViewPanel
-from cliploc_ros.studio.picture import SELECTED_RGB
 from cliploc_ros.studio.places_panel import PlacesPanel
 from cliploc_ros.studio.scene import (
     Answers,

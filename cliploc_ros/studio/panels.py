@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import Change
+from cliploc_ros.studio.edits import Change
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M
-from cliploc_ros.studio.map_source import ChangedOnDiskError
+from cliploc_ros.studio.map_file import ChangedOnDiskError
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.page import Page

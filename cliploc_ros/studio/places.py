@@ -8,7 +8,7 @@ those that were tried lie all over the map.
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,7 +28,8 @@ from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, each_pose
 from cliploc_ros.mapping.checking.report import GridCheck
-from cliploc_ros.studio.changes import EditError, Landmarks
+from cliploc_ros.studio.document import fields_of
+from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
 
@@ -223,7 +224,7 @@ class PlacesSearch:
         """Return whether the map was edited since the last result."""
         last, landmarks = self.last, self._studio.document.landmarks
         return last is not None and last.landmarks is not landmarks \
-            and _fields(last.landmarks) != _fields(landmarks)
+            and fields_of(last.landmarks) != fields_of(landmarks)
 
     def _run(self, landmarks: Landmarks) -> None:
         try:
@@ -245,6 +246,3 @@ class PlacesSearch:
             self.share = share
             self._on_change()
 
-
-def _fields(landmarks: Landmarks) -> dict[str, Mapping[str, object]]:
-    return {key: one.fields for key, one in landmarks.items()}

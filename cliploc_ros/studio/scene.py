@@ -15,8 +15,8 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.frustum import frusta
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio.recording import Answer
 from cliploc_ros.studio.studio import Studio, color_of
-from cliploc_ros.studio.trials import Answer
 
 # More labels than these hide the map, and slow the browser down.
 _MAX_LABELS = 150

@@ -33,11 +33,10 @@ from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from cliploc_ros.ros.parameter_tables import relocalizer_options
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import open_images, views_of_folder
 from cliploc_ros.studio.landmark import map_of
-from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.recording import DrawnBox, Recording, fit_boxes
 from cliploc_ros.studio.studio import Studio
 
 ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'

@@ -17,8 +17,8 @@ from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
 from cliploc_ros.mapping.checking.report import GridCheck
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.places import PlacesSearch, find_places
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio

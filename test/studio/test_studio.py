@@ -17,10 +17,9 @@ from cliploc_ros.core.maps.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
-from cliploc_ros.studio.picture import landmark_at
+from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.images import landmark_at, open_images, views_of_folder
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
 
