@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared by all tests: the data beside the project, one ROS domain a process, the summary."""
 
+import faulthandler
 import importlib.util
 import os
 import shutil
 import signal
 import socket
+import sys
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,8 @@ SHARED_DATA = PROJECT.parent / 'shared' / 'data'
 # pytest-xdist hands whole files to its workers in this order. The folders with long files come
 # first, so that all workers end at about the same time.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
+# A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine.
+PATIENCE_S = 300
 #: The tests that do not run here, by the Python module they need.
 NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 
@@ -72,9 +76,31 @@ def pytest_collection_modifyitems(config, items):
     config.hook.pytest_deselected(items=left_out)
     items[:] = sorted((item for item in items if not missing_module(item)), key=place)
     for item in items:
-        # Processes that race on two busy cores fail once in a thousand tests.
-        if item.path.parent.name == 'nodes' and not item.get_closest_marker('clock'):
-            item.add_marker(pytest.mark.flaky(reruns=1))
+        # Processes that race on two busy cores fail once in a thousand tests; a test of anything
+        # else has to pass at once, unless it hangs.
+        if not item.get_closest_marker('clock'):
+            of_nodes = item.path.parent.name == 'nodes'
+            item.add_marker(pytest.mark.flaky(
+                reruns=1, only_rerun=None if of_nodes else 'the test hangs'))
+
+
+def fail_slow_test(_number, _frame):
+    faulthandler.dump_traceback(sys.__stderr__)  # of all threads
+    pytest.fail(f'the test hangs: it took more than {PATIENCE_S} s')
+
+
+@pytest.hookimpl(wrapper=True)
+def limit_time(item):
+    """End a test that hangs, so that the others run. Each attempt has its own time."""
+    signal.signal(signal.SIGALRM, fail_slow_test)
+    signal.alarm(PATIENCE_S)
+    try:
+        return (yield)
+    finally:
+        signal.alarm(0)
+
+
+pytest_runtest_setup = pytest_runtest_call = limit_time
 
 
 def missing_module(item: pytest.Item) -> str | None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fitting the confidence to simulated worlds: ``python -m studies.acceptance.fit``.
+"""The fit of the confidence to simulated worlds.
 
 Each group of images is localized in all modes, by labels and by classes, and in the same map with
 all objects exchanged, where every pose is wrong. For the report, each kind of world is judged by
@@ -9,44 +9,79 @@ offices, shops and bare rooms; corridors, halls and twin rooms only judge, since
 places are the task of cliploc_ros.core.acceptance.look_alikes.
 """
 
-import argparse
 import math
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 
-from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.acceptance.confidence import Calibration, Setting
-from cliploc_ros.core.maps.landmark_map import LandmarkMap
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.evaluation.run import run_all
-from studies.acceptance.confidence_fit import (
-    Case,
-    Judged,
-    draw_judged,
-    fit,
-    judge,
-    outcomes,
-    paste,
-    report,
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Objects
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    confidences,
+    none_right,
+    utilities,
 )
+from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
+from studies.acceptance.places import ALL, MODES, ONE, Simulated
 from studies.acceptance.troubles import exchange_landmarks
-from studies.worlds.modes import MODES, Request, requests
-from studies.worlds.places import KINDS
-from studies.worlds.world import make_world
+from studies.reports import Judged, interval
 
 #: The kinds that fit; the others have places that look alike.
 FITTED_KINDS = ('room', 'office', 'shop', 'bare room')
-_MATCHINGS = ('hybrid', 'class')
+MATCHINGS = ('hybrid', 'class')
 # Deviations of the known vertical [deg], drawn for each world.
 _VERTICALS_DEG = (0.5, 1.0, 2.0, 4.0)
+# So low that evidence which is computed for likely poses only is there for those in doubt, too.
 _IN_DOUBT = 0.3
-# The modes in which objects exchange places.
-_ELSEWHERE = (MODES[0], MODES[-1])
+_THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
+_PRECISION = 0.99
+_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained')
+# Support must not count against a pose, whatever a small data set says. A larger map has more
+# wrong poses, a vertical leaves fewer.
+_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None),
+          (0, None), (None, 0))
+_KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
+_MOST_SLOPE = 3.0
+_RIDGE = 1e-4
+# Poses at a place that the map does not show count in full for the coefficients of the support:
+# they say best what a wrong pose looks like. Robots rarely start there, so they count by this
+# share for the level of the confidence. A guess.
+_ELSEWHERE = 0.1
+
+
+@dataclass(frozen=True)
+class Case:
+    """The m hypotheses of a search, and which of them are right."""
+
+    supports: tuple[Support, ...]
+    poses: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    handicaps: NDArray[np.float64]  # see confidences
+    setting: Setting
+    is_elsewhere: bool = False  # the map shows another place, so that every pose is wrong
+    certainty: float = 1.0  # that nothing but the poses found makes the best one wrong
+
+
+def judge(found: Relocalization, map_from_camera: NDArray[np.float64], setting: Setting,
+          is_elsewhere: bool = False) -> Case:
+    """Return the hypotheses of a search, compared with the true pose (4, 4)."""
+    poses = np.array([one.map_from_camera for one in found.hypotheses])
+    errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
+    return Case(tuple(one.support for one in found.hypotheses), poses,
+                (errors < RIGHT_M) & (not is_elsewhere),
+                np.array([one.handicap for one in found.hypotheses]), setting,
+                is_elsewhere, 1.0 if found.evidence is None
+                else found.evidence.certainty * found.evidence.found)
 
 
 class Searched(NamedTuple):
@@ -58,39 +93,161 @@ class Searched(NamedTuple):
     case: Case
 
 
+def make_search_world() -> Callable[[tuple[str, int]], list[Searched]]:
+    """Return the function that searches a world, for a worker."""
+    return search_world
+
+
 def search_world(world: tuple[str, int]) -> list[Searched]:
     """Return the cases of a world (kind, seed) in all modes."""
     kind, seed = world
-    made, rng = make_world(kind, seed), np.random.default_rng([seed, 7])
+    place, rng = Simulated(kind, seed).load(), np.random.default_rng([seed, 7])
     vertical_deg = float(rng.choice(_VERTICALS_DEG))
     found = []
-    for matching in _MATCHINGS:
-        # so low that what costs time for likely poses only is computed for those in doubt, too
-        options = RelocalizerOptions(matching=matching, vertical_deviation_deg=vertical_deg,
-                                     min_confidence=_IN_DOUBT)
-        for one in requests(made, seed, options):
-            places = [(made.landmark_map, False)]
-            if one.mode in _ELSEWHERE:
-                places.append((exchange_landmarks(made.landmark_map, one.queries, 1.0, rng)[0],
-                               True))
-            found += [Searched(kind, one.mode, matching, case) for its_map, is_elsewhere in places
-                      for case in _search(its_map, one, f'{kind} {seed}', is_elsewhere)]
+    for matching in MATCHINGS:
+        plain = RelocalizerOptions(matching=matching, vertical_deviation_deg=vertical_deg,
+                                   min_confidence=_IN_DOUBT)
+        for mode in MODES:
+            queries, options = place.ask(mode, seed, vertical_deg), place.options(mode, plain)
+            setting = Setting(len(place.landmark_map),
+                              vertical_deg if 'vertical' in mode else math.inf)
+            maps = [(place.landmark_map, False)]
+            if mode in (ONE, ALL):
+                maps.append((exchange_landmarks(place.landmark_map, queries, 1.0, rng)[0], True))
+            for landmark_map, is_elsewhere in maps:
+                relocalizer = Relocalizer(landmark_map, options)
+                for query in queries:
+                    result = relocalizer.relocalize([*query.neighbours, query.observation])
+                    if result.solved:
+                        found.append(Searched(kind, mode, matching, judge(
+                            result, query.map_from_camera, setting, is_elsewhere)))
     return found
 
 
-def _search(landmark_map: LandmarkMap, request: Request, place: str, is_elsewhere: bool
-            ) -> Iterator[Case]:
-    relocalizer = Relocalizer(landmark_map, request.options)
-    setting = Setting(len(landmark_map), request.options.vertical_deviation_deg
-                      if request.knows_vertical else math.inf)
-    for query in request.queries:
-        found = relocalizer.relocalize([*query.neighbours, query.observation])
-        if found.solved:
-            yield judge(found, query.map_from_camera, place, setting, is_elsewhere=is_elsewhere)
+def fit(cases: Sequence[Case]) -> Calibration:
+    """Return the coefficients of maximum likelihood.
+
+    First the utilities. Then the level of the confidence: the utility of the case that none is
+    right, and slope and knee. What all cases have in common, such as the size of a single map,
+    keeps its installed coefficient.
+
+    Raises
+    ------
+    OptionsError
+        All poses are right, or all are wrong.
+    """
+    first = np.array([case.right[0] for case in cases], dtype=bool)
+    if first.all() or not first.any():
+        raise OptionsError(f'{first.sum()} of {len(first)} poses are right; a fit needs right and '
+                           'wrong ones')
+    data = _arrays(cases)
+    scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
+    bounds = list(_SIGNS)
+    installed = CALIBRATION.objects
+    start = np.append(np.zeros(len(_FIELDS)), [1.0, installed.map_size, installed.vertical])
+    for column in (1, 2):  # size of the map, vertical
+        if np.ptp(data.settings[:, column]) == 0.0:
+            row = len(_FIELDS) + column
+            bounds[row] = (start[row], start[row])
+    solved = minimize(_loss, start, (data, scale), jac=True, method='L-BFGS-B', bounds=bounds)
+    return _levelled(cases, CALIBRATION._replace(
+        objects=Objects(*map(float, [*solved.x / scale, 0.0, 0.0]))))
 
 
-def _make_search() -> Callable[[tuple[str, int]], list[Searched]]:
-    return search_world
+class _Arrays(NamedTuple):
+    """Cases as arrays: n of them, of up to h hypotheses each."""
+
+    supports: NDArray[np.float64]  # (n, h, 6)
+    given: NDArray[np.bool_]  # (n, h): which hypotheses exist
+    right: NDArray[np.bool_]  # (n, h)
+    handicaps: NDArray[np.float64]  # (n, h)
+    settings: NDArray[np.float64]  # (n, 3): 1, size of the map, vertical
+
+
+def _arrays(cases: Sequence[Case]) -> _Arrays:
+    shape = (len(cases), max(len(case.supports) for case in cases))
+    supports, handicaps = np.zeros((*shape, len(_FIELDS))), np.zeros(shape)
+    given, right = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for row, case in enumerate(cases):
+        count = len(case.supports)
+        supports[row, :count] = [[getattr(one, name) for name in _FIELDS]
+                                 for one in case.supports]
+        given[row, :count], right[row, :count] = True, case.right
+        handicaps[row, :count] = case.handicaps
+    return _Arrays(supports, given, right, handicaps, np.array(
+        [[1.0, case.setting.map_size, case.setting.vertical] for case in cases]))
+
+
+def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.float64]
+          ) -> tuple[float, NDArray[np.float64]]:
+    """Return the negative log likelihood and its derivatives (9,) by the coefficients."""
+    supports, settings = data.supports / scale[:-3], data.settings / scale[-3:]
+    utility = np.where(data.given, supports @ coefficients[:-3] - data.handicaps, -1e9)
+    utility = np.column_stack([utility, settings @ coefficients[-3:]])
+    odds = np.exp(utility - utility.max(axis=1, keepdims=True))
+    truth = np.column_stack([data.right, ~data.right.any(axis=1)])
+    share = odds / odds.sum(axis=1, keepdims=True)
+    true_share = odds * truth + 1e-300
+    likely = true_share.sum(axis=1) / odds.sum(axis=1)
+    weights = np.ones(len(odds)) / len(odds)
+    pull = share - true_share / true_share.sum(axis=1, keepdims=True)
+    pull *= weights[:, None]
+    gradient = np.append(np.einsum('nh,nhk->k', pull[:, :-1] * data.given, supports),
+                         pull[:, -1] @ settings)
+    shrink = _RIDGE * np.append(coefficients[:-3], np.zeros(3))
+    return float(-weights @ np.log(likely) + shrink @ coefficients / 2), gradient + shrink
+
+
+def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
+    """Return coefficients with the level, knee and slope of maximum likelihood."""
+    weights = np.array([_ELSEWHERE if case.is_elsewhere else 1.0 for case in cases])
+    certainty = np.array([case.certainty for case in cases])
+    right = np.empty(len(cases), dtype=bool)
+    # utilities of the leading place, of the other hypotheses, and of none being right
+    own, others, none = np.empty((3, len(cases)))
+    for row, case in enumerate(cases):
+        lead, odds = _lead(case, raw)
+        right[row] = case.right[lead]
+        own[row] = np.logaddexp.reduce(odds[SAME_ANSWER.agreeing(case.poses)[lead]])
+        every, none[row] = np.logaddexp.reduce(odds), none_right(case.setting, raw)
+        others[row] = every + np.log(max(-np.expm1(min(own[row] - every, 0.0)), 1e-300))
+
+    def surprise(level: NDArray[np.float64], knee: float) -> float:
+        log_odds = own - np.logaddexp(others, none + level[0])
+        log_odds += np.clip(level[1], 0.0, _MOST_SLOPE) * np.maximum(0.0, log_odds - knee)
+        likely = np.clip(certainty / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))), 1e-4,
+                         1.0 - 1e-4)
+        return float(-weights @ np.log(np.where(right, likely, 1.0 - likely)) / weights.sum())
+
+    solutions = [minimize(surprise, [0.0, 0.5], (knee,), method='Nelder-Mead')
+                 for knee in _KNEES]
+    best = int(np.argmin([one.fun for one in solutions]))
+    shift, slope = solutions[best].x
+    return raw._replace(objects=raw.objects._replace(
+        none_right=raw.objects.none_right + float(shift), knee=_KNEES[best],
+        slope=float(np.clip(slope, 0.0, _MOST_SLOPE))))
+
+
+def _lead(case: Case, calibration: Calibration) -> tuple[int, NDArray[np.float64]]:
+    """Return which hypothesis leads, and the utility of each.
+
+    A hypothesis that contradicts a known vertical never leads.
+    """
+    odds = utilities(case.supports, calibration) - case.handicaps
+    is_level = case.handicaps < CALIBRATION.attitude.wrong_mount
+    eligible = np.where(is_level, odds, -np.inf) if case.setting.vertical > 0.0 else odds
+    return int(np.argmax(eligible)), odds
+
+
+def outcomes(cases: Sequence[Case], calibration: Calibration = CALIBRATION) -> Judged:
+    """Return the confidence (n,) in the likeliest pose of each case, and whether it is right."""
+    likely, right = [], []
+    for case in cases:
+        lead, odds = _lead(case, calibration)
+        likely.append(case.certainty * confidences(
+            odds, case.poses, none_right(case.setting, calibration), calibration)[lead])
+        right.append(case.right[lead])
+    return np.array(likely), np.array(right, dtype=bool)
 
 
 def cross_fitted(searched: Sequence[Searched]) -> dict[str, Calibration]:
@@ -109,49 +266,36 @@ def judged(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]
             np.concatenate([part[1] for part in parts]))
 
 
-def _print_report(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]) -> None:
+def print_report(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]) -> None:
+    """Print precision and recall of each kind, mode and matching, and elsewhere."""
     here = [one for one in searched if not one.case.is_elsewhere]
     plain = [one for one in here if one.kind in FITTED_KINDS]
-    for kind in calibrations:
-        print(report(f'{kind}, left out', *judged([one for one in here if one.kind == kind],
-                                                  calibrations)))
-    for matching in _MATCHINGS:
-        for mode in MODES:
-            its = [one for one in plain if (one.mode, one.matching) == (mode, matching)]
-            print(report(f'{mode}, {matching}, kinds that fit, each left out',
-                         *judged(its, calibrations)))
-    print(report('kinds that fit, each left out', *judged(plain, calibrations)))
-    print(report('another place, all kinds', *judged(
-        [one for one in searched if one.case.is_elsewhere], calibrations)))
+    parts = {f'{kind}, left out': [one for one in here if one.kind == kind]
+             for kind in calibrations}
+    parts |= {f'{mode}, {matching}, kinds that fit, each left out': [
+        one for one in plain if (one.mode, one.matching) == (mode, matching)]
+        for matching in MATCHINGS for mode in MODES}
+    parts |= {'kinds that fit, each left out': plain,
+              'another place, all kinds': [one for one in searched if one.case.is_elsewhere]}
+    for name, some in parts.items():
+        likely, right = judged(some, calibrations)
+        print(f'{name}: {len(right)} poses, {right.sum()} of them within {RIGHT_M:g} m')
+        for least in _THRESHOLDS:
+            accepted = likely >= least
+            false, count = int((accepted & ~right).sum()), int(accepted.sum())
+            print(f'  min_confidence {least:5}: {count:4} accepted, {false} of them wrong, '
+                  f'precision {interval(count - false, count, 3)} (95 %), '
+                  f'recall {(accepted & right).sum() / max(int(right.sum()), 1):.3f}')
+        if right.any():
+            recall, least = best_recall(likely, right)
+            print(f'  best at precision {_PRECISION}: {least:5.3f}, recall {recall:.3f}')
 
 
-def run(arguments: list[str]) -> int:
-    """Search, fit, test and print."""
-    parser = argparse.ArgumentParser(prog='fit', description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--worlds', type=positive_int, default=24, metavar='N',
-                        help='of each kind')
-    parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
-    parser.add_argument('--out', type=Path, metavar='DIR', help='draw a reliability diagram there')
-    options = parser.parse_args(arguments)
-    tasks = [(kind, seed) for kind in KINDS for seed in range(options.worlds)]
-    searched = run_all(_make_search, tasks, 'worlds', options.workers)
-    calibrations = cross_fitted(searched)
-    _print_report(searched, calibrations)
-    if options.out is not None:
-        plain = [one for one in searched if one.kind in FITTED_KINDS
-                 and not one.case.is_elsewhere]
-        draw_judged(options.out, 'simulated worlds, each kind left out of the fit', {
-            mode: judged([one for one in plain if one.mode == mode], calibrations)
-            for mode in MODES})
-    print(paste(fit([one.case for one in searched if one.kind in FITTED_KINDS])))
-    return 0
-
-
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the best recall of any threshold with a precision of .99, and the threshold."""
+    order = np.argsort(-likely, kind='stable')
+    hits = np.cumsum(right[order])
+    precise = np.nonzero(hits >= _PRECISION * np.arange(1, len(hits) + 1))[0]
+    if not len(precise):
+        return 0.0, 1.0
+    return float(hits[precise[-1]] / hits[-1]), float(likely[order[precise[-1]]])

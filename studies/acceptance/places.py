@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded and simulated places, and what a robot knows there besides one image."""
+"""Places that are recorded or simulated, what a robot knows there, and options to choose both."""
 
 import argparse
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from cliploc_ros.command import positive_int
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
@@ -15,18 +16,22 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
 from studies.worlds.cameras import GROUP_SIZE
-from studies.worlds.modes import HEIGHT_M, MODES, STEP_DEG, STEP_M
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 
-ONE, UPRIGHT, LEVEL, FIVE, ALL = MODES
-# Deviation of an honest vertical.
-_VERTICAL_DEG = 1.0
-_SEED = 7
+#: What is known besides one image.
+MODES = ('one image', 'vertical', 'vertical, height', 'five images', 'five, vertical, height')
+ONE, VERTICAL, LEVEL, FIVE, ALL = MODES
+#: Errors of the sensors, other than of simulated worlds that have a seed of their own.
+SEED = 7
+#: Deviations of a vertical and of a step of odometry.
+VERTICAL_DEG, STEP_M, STEP_DEG = 1.0, 0.01, 0.5
+# By how much the height range exceeds the true heights.
+_HEIGHT_M = 0.2
 
 
 class Place(NamedTuple):
-    """A map, all frames with the group of each, and which frame of each group is its query.
+    """A map, all frames with the group of each, and which frames are queries.
 
     With every_frame, each frame is a query where one image is localized.
     """
@@ -41,26 +46,27 @@ class Place(NamedTuple):
     def modes(self) -> tuple[str, ...]:
         """Return the modes that are possible: five images need groups of frames."""
         has_groups = len(set(self.groups)) < len(self.groups)
-        return MODES if has_groups else (ONE, UPRIGHT, LEVEL)
+        return MODES if has_groups else (ONE, VERTICAL, LEVEL)
 
-    def ask(self, mode: str) -> list[Query]:
+    def ask(self, mode: str, seed: int = SEED, vertical_deg: float = VERTICAL_DEG) -> list[Query]:
         """Return the queries with what is known in a mode."""
         is_fused = mode in (FIVE, ALL)
         queries: Sequence[Query] = self.frames
-        if mode in (UPRIGHT, LEVEL, ALL):
-            queries = with_vertical(queries, _VERTICAL_DEG, _SEED)
+        if mode in (VERTICAL, LEVEL, ALL):
+            queries = with_vertical(queries, vertical_deg, seed)
         if is_fused:
-            queries = with_neighbours(queries, self.groups, STEP_M, STEP_DEG, _SEED)
+            queries = with_neighbours(queries, self.groups, STEP_M, STEP_DEG, seed)
         return [one for one, is_main in zip(queries, self.is_main, strict=True)
                 if is_main or (self.every_frame and not is_fused)]
 
     def options(self, mode: str, options: RelocalizerOptions) -> RelocalizerOptions:
-        """Return options with the height range that is known in a mode."""
+        """Return options with the height range that is known in a mode, for the place's map."""
+        options = replace(options, k=min(options.k, len(self.landmark_map)))
         if mode not in (LEVEL, ALL):
             return options
         heights = [one.map_from_camera[2, 3] for one in self.frames]
-        return replace(options, height_range_m=(min(heights) - HEIGHT_M,
-                                                max(heights) + HEIGHT_M))
+        return replace(options, height_range_m=(min(heights) - _HEIGHT_M,
+                                                max(heights) + _HEIGHT_M))
 
 
 class Recording(NamedTuple):
@@ -68,14 +74,15 @@ class Recording(NamedTuple):
 
     queries: Path
     landmark_map: Path
-    every_frame: bool
+    every_frame: bool = True
+    seed: int = 0
 
     @property
     def name(self) -> str:
         """Return the name of its rows in a table."""
         return self.queries.stem
 
-    def __call__(self) -> Place:
+    def load(self) -> Place:
         """Return the place."""
         landmark_map = LandmarkMap.from_file(self.landmark_map)
         found = load_queries(self.queries, landmark_map.landmark_ids)
@@ -95,23 +102,30 @@ class Simulated(NamedTuple):
         """Return the name of its rows in a table."""
         return self.kind
 
-    def __call__(self) -> Place:
+    def load(self) -> Place:
         """Return the place."""
         world = make_world(self.kind, self.seed)
         return Place(world.landmark_map, world.queries, world.groups,
                      [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
 
 
-def add_arguments(parser: argparse.ArgumentParser, default_kinds: Sequence[str]) -> None:
-    """Add the options that choose places; chosen_places reads them."""
-    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
+def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(KINDS),
+                  worlds: int = 0, first_seed: int = 0) -> None:
+    """Add the options that choose places, with defaults of a study; chosen_places reads them."""
+    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ',
+                        help='recordings, in place of the worlds unless --worlds is given, too')
     parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
                         help='one for all query files, or one for each')
     parser.add_argument('--frames', choices=('main', 'all'), default='all')
-    parser.add_argument('--worlds', type=int, default=0, metavar='N',
-                        help='simulated worlds of each kind, besides')
-    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(default_kinds))
-    parser.add_argument('--first-seed', type=int, default=1000, metavar='N')
+    parser.add_argument('--worlds', type=int, metavar='N',
+                        help=f'simulated worlds of each kind ({worlds})')
+    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(kinds), metavar='KIND',
+                        help=f'of worlds: {", ".join(KINDS)}')
+    parser.add_argument('--first-seed', type=int, default=first_seed, metavar='N',
+                        help='(%(default)s)')
+    parser.add_argument('--workers', type=positive_int, default=1, metavar='N',
+                        help='processes (%(default)s)')
+    parser.set_defaults(default_worlds=worlds)
 
 
 def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
@@ -122,7 +136,10 @@ def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
     OptionsError
         There are none, maps do not fit query files, or a number is below 0.
     """
-    if options.worlds < 0 or options.first_seed < 0:
+    worlds = options.worlds
+    if worlds is None:
+        worlds = 0 if options.queries else options.default_worlds
+    if worlds < 0 or options.first_seed < 0:
         raise OptionsError('--worlds and --first-seed must not be below 0')
     maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
     if len(maps) != len(options.queries):
@@ -131,7 +148,7 @@ def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
         *(Recording(path, map_path, options.frames == 'all')
           for path, map_path in zip(options.queries, maps, strict=True)),
         *(Simulated(kind, options.first_seed + number) for kind in options.kinds
-          for number in range(options.worlds))]
+          for number in range(worlds))]
     if not places:
         raise OptionsError('nothing to test: give --queries and --map, or --worlds')
     return places

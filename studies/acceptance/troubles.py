@@ -1,23 +1,32 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated errors of a map or a detector, applied to recorded queries."""
+"""Simulated errors of a map, a detector or a sensor, applied to queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.maps.landmark_details import LandmarkDetails
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.evaluation import sensors
 from cliploc_ros.evaluation.trials import Query
+from studies.acceptance.places import ALL, FIVE, LEVEL, ONE
 
 _BOX_SIDE_PX = (20.0, 200.0)
 _MOVED_M = (0.3, 3.0)
 
 World = tuple[LandmarkMap, Sequence[Query]]
+#: A change of map and queries by a level, with a generator.
 Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
+
+
+def unchanged(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+              rng: np.random.Generator) -> World:
+    """Change nothing."""
+    return landmark_map, queries
 
 
 def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
@@ -25,15 +34,7 @@ def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share:
     """Remove a share of the landmarks from the map; their detections stay."""
     count = len(landmark_map)
     kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
-    fewer = replace(landmark_map, landmark_ids=tuple(landmark_map.landmark_ids[row]
-                                                     for row in kept),
-                    labels=tuple(landmark_map.labels[row] for row in kept),
-                    class_ids=tuple(landmark_map.class_ids[row] for row in kept),
-                    centers=landmark_map.centers[kept], semi_axes=landmark_map.semi_axes[kept],
-                    quats_xyzw=landmark_map.quats_xyzw[kept],
-                    details=_of_rows(landmark_map.details, kept))
-    return fewer, [_with_similarities(query, np.asarray(query.observation.similarities)[:, kept])
-                   for query in queries]
+    return landmark_map.select(kept.tolist()), _with_columns(queries, kept)
 
 
 def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
@@ -55,13 +56,6 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     return replace(landmark_map, centers=centers), queries
 
 
-def mirror_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
-                     rng: np.random.Generator) -> World:
-    """Mirror the map left to right, as a robot sees a room in a mirror; the share is ignored."""
-    return replace(landmark_map, centers=landmark_map.centers * (-1.0, 1.0, 1.0),
-                   quats_xyzw=landmark_map.quats_xyzw * (1.0, -1.0, -1.0, 1.0)), queries
-
-
 def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange labels and classes of a share of the landmarks."""
@@ -69,11 +63,9 @@ def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     chosen = rng.permutation(count)[:round(share * count)]
     source = np.arange(count)
     source[chosen] = np.roll(chosen, 1)
-    wrong = replace(landmark_map, labels=tuple(landmark_map.labels[row] for row in source),
-                    class_ids=tuple(landmark_map.class_ids[row] for row in source),
-                    details=_of_rows(landmark_map.details, source))
-    return wrong, [_with_similarities(query, np.asarray(query.observation.similarities)[:, source])
-                   for query in queries]
+    described = landmark_map.select(source.tolist())
+    return (replace(landmark_map, labels=described.labels, class_ids=described.class_ids,
+                    details=described.details), _with_columns(queries, source))
 
 
 def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
@@ -104,98 +96,122 @@ def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[Query], gap_m: f
 
 def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count: float,
                       rng: np.random.Generator) -> World:
-    """Replace the boxes of each query by random ones of the map's classes."""
-    return landmark_map, [replace(query, observation=_random_boxes(
-        query.observation, landmark_map, int(count), rng), neighbours=tuple(
-            _random_boxes(one, landmark_map, int(count), rng) for one in query.neighbours))
-        for query in queries]
+    """Replace the boxes of each query by random ones, each like a random landmark."""
+    def drawn(observation: Observation) -> Observation:
+        boxes = _random_boxes(observation, int(count), rng)
+        shown, looks = rng.integers(len(landmark_map), size=int(count)), None
+        if observation.similarities is not None:
+            known = np.asarray(observation.similarities)
+            rows = known[rng.integers(len(known), size=int(count))] if len(known) \
+                else np.zeros((int(count), len(landmark_map)), dtype=np.float32)
+            looks = np.ascontiguousarray(rng.permuted(rows, axis=1))
+        return replace(observation, similarities=looks, detections=Detections(
+            boxes, tuple(landmark_map.class_ids[row] for row in shown), np.full(len(boxes), 0.8)))
+
+    return landmark_map, [replace(query, observation=drawn(query.observation),
+                                  neighbours=tuple(map(drawn, query.neighbours)))
+                          for query in queries]
 
 
 def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                     rng: np.random.Generator) -> World:
     """Drop a share of the boxes."""
-    return landmark_map, [_without_boxes(query, share, rng) for query in queries]
+    def thinned(observation: Observation) -> Observation:
+        rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
+        return of_rows(observation, rows)
+
+    return landmark_map, [replace(one, observation=thinned(one.observation)) for one in queries]
 
 
 def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
                       rng: np.random.Generator) -> World:
-    """Add random boxes, a number for each true one, that look like random landmarks."""
-    return landmark_map, [_with_invented(query, share, rng) for query in queries]
+    """Add random boxes, a number for each true one, whose looks are permuted true ones."""
+    def extended(observation: Observation) -> Observation:
+        true, similarities = observation.detections, np.asarray(observation.similarities)
+        count = int(rng.binomial(len(true), share)) if len(true) else 0
+        boxes = _random_boxes(observation, count, rng)
+        rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
+        looks = rng.permuted(similarities[rows], axis=1)
+        classes = tuple(true.class_ids[row] for row in rng.permutation(rows))
+        return replace(
+            observation, similarities=np.ascontiguousarray(np.vstack([similarities, looks])),
+            detections=Detections(np.vstack([true.bboxes_xyxy, boxes]), true.class_ids + classes,
+                                  np.concatenate([true.scores, true.scores[rows]])))
+
+    return landmark_map, [replace(one, observation=extended(one.observation)) for one in queries]
+
+
+def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
+    """Return an observation with some of its boxes."""
+    similarities = observation.similarities
+    return replace(
+        observation, detections=observation.detections.select(rows), similarities=None
+        if similarities is None else np.ascontiguousarray(np.asarray(similarities)[rows]))
+
+
+def _random_boxes(observation: Observation, count: int, rng: np.random.Generator
+                  ) -> NDArray[np.float64]:
+    camera = observation.camera
+    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
+    return np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
+
+
+def _with_columns(queries: Sequence[Query], columns: NDArray[np.int64]) -> list[Query]:
+    """Return queries with the similarities of some landmarks."""
+    def chosen(observation: Observation) -> Observation:
+        return observation if observation.similarities is None else replace(
+            observation, similarities=np.ascontiguousarray(
+                np.asarray(observation.similarities)[:, columns]))
+
+    return [replace(one, observation=chosen(one.observation),
+                    neighbours=tuple(map(chosen, one.neighbours))) for one in queries]
 
 
 def _with_copies(landmark_map: LandmarkMap, queries: Sequence[Query], steps: NDArray[np.float64]
                  ) -> World:
     """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
-    count = len(landmark_map)
-    rows = [*range(count), *range(count)]
-    copies = landmark_map.select(rows)
+    rows = np.tile(np.arange(len(landmark_map)), 2)
     ids = (*landmark_map.landmark_ids, *(f'{one}_copy' for one in landmark_map.landmark_ids))
     centers = np.concatenate([landmark_map.centers, landmark_map.centers + steps])
-    return replace(copies, landmark_ids=ids, centers=centers), [
-        replace(query, observation=_of_columns(query.observation, rows),
-                neighbours=tuple(_of_columns(one, rows) for one in query.neighbours))
-        for query in queries]
+    return (replace(landmark_map.select(rows.tolist()), landmark_ids=ids, centers=centers),
+            _with_columns(queries, rows))
 
 
-def _of_columns(observation: Observation, columns: list[int]) -> Observation:
-    """Return an observation with the similarities of some landmarks."""
-    return observation if observation.similarities is None else replace(
-        observation, similarities=np.ascontiguousarray(
-            np.asarray(observation.similarities)[:, columns]))
+class Trouble(NamedTuple):
+    """A change, its levels, and the modes in which it matters."""
+
+    change: Change
+    levels: tuple[float, ...] = (0.0,)
+    modes: tuple[str, ...] = (ONE, LEVEL, ALL)
 
 
-def _random_boxes(observation: Observation, landmark_map: LandmarkMap, count: int,
-                  rng: np.random.Generator) -> Observation:
-    """Return an observation of random boxes, each of which looks like a random landmark."""
-    camera, similarities = observation.camera, observation.similarities
-    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
-    shown = rng.integers(len(landmark_map), size=count)
-    looks = None
-    if similarities is not None:
-        known = np.asarray(similarities)
-        rows = known[rng.integers(len(known), size=count)] if len(known) \
-            else np.zeros((count, len(landmark_map)), dtype=np.float32)
-        looks = np.ascontiguousarray(rng.permuted(rows, axis=1))
-    return replace(observation, detections=Detections(
-        boxes, tuple(landmark_map.class_ids[row] for row in shown), np.full(count, 0.8)),
-        similarities=looks)
+def _of_sensor(change: Callable[[Sequence[Query], float], Sequence[Query]]) -> Change:
+    return lambda landmark_map, queries, level, rng: (landmark_map, change(queries, level))
 
 
-def _of_rows(details: tuple[LandmarkDetails, ...], rows: NDArray[np.int64]
-             ) -> tuple[LandmarkDetails, ...]:
-    """Return the details of some landmarks of a map; none where it has none."""
-    return tuple(details[row] for row in rows) if details else ()
-
-
-def _without_boxes(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query without a random share of its boxes."""
-    observation = query.observation
-    rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
-    similarities = observation.similarities
-    return replace(query, observation=replace(
-        observation, detections=observation.detections.select(rows),
-        similarities=None if similarities is None else np.asarray(similarities)[rows]))
-
-
-def _with_similarities(query: Query, similarities: np.ndarray) -> Query:
-    return replace(query, observation=replace(
-        query.observation, similarities=np.ascontiguousarray(similarities)))
-
-
-def _with_invented(query: Query, share: float, rng: np.random.Generator) -> Query:
-    """Return a query with random boxes, whose similarities are permuted ones of its own."""
-    observation, true = query.observation, query.observation.detections
-    count = int(rng.binomial(len(true), share)) if len(true) else 0
-    camera, similarities = observation.camera, np.asarray(observation.similarities)
-    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
-    rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
-    looks = rng.permuted(similarities[rows], axis=1)
-    detections = Detections(
-        np.vstack([true.bboxes_xyxy, boxes]),
-        true.class_ids + tuple(true.class_ids[row] for row in rng.permutation(rows)),
-        np.concatenate([true.scores, true.scores[rows]]))
-    return replace(query, observation=replace(
-        observation, detections=detections,
-        similarities=np.ascontiguousarray(np.vstack([similarities, looks]))))
+_SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+#: What is wrong, and the robot does not know.
+TROUBLES = {
+    'none': Trouble(unchanged, modes=(ONE, LEVEL, FIVE, ALL)),
+    'share of the landmarks that have exchanged places': Trouble(exchange_landmarks,
+                                                                 (0.2, 0.4, 0.6, 1.0)),
+    'random boxes': Trouble(random_detections, (10,)),
+    'every landmark twice, apart by [m]': Trouble(double_landmarks, (0.01, 0.1)),
+    'two identical rooms, apart by [m]': Trouble(add_equal_room, (2.0,)),
+    'share of the objects moved by .3 to 3 m': Trouble(move_objects, (0.4,)),
+    'mount off by [degrees]': Trouble(_of_sensor(sensors.wrong_mount), (5.0,),
+                                      (LEVEL, FIVE, ALL)),
+    'vertical off by [degrees]': Trouble(_of_sensor(sensors.tilted_vertical), (10.0,),
+                                         (LEVEL, ALL)),
+    'odometry too long by a factor': Trouble(_of_sensor(sensors.scaled_odometry), (1.2, 0.8),
+                                             (FIVE, ALL))}
+#: What gets worse and worse, seen in one image.
+CURVES = {
+    'share of landmarks removed': Trouble(remove_landmarks, _SHARES, (ONE,)),
+    'a third of the landmarks moved by [m]': Trouble(
+        move_landmarks, (0.0, 0.1, 0.2, 0.3, 0.5, 1.0), (ONE,)),
+    'share of landmarks that exchange places': Trouble(
+        exchange_landmarks, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), (ONE,)),
+    'share of landmarks mislabelled': Trouble(mislabel_landmarks, _SHARES, (ONE,)),
+    'share of detections dropped': Trouble(drop_detections, _SHARES, (ONE,)),
+    'invented detections for each true one': Trouble(invent_detections, _SHARES, (ONE,))}

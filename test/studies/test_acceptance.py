@@ -7,9 +7,9 @@ import re
 import pytest
 
 from cliploc_ros.errors import CliplocError
-from studies.acceptance import recorded as acceptance
+from studies.acceptance.__main__ import run
 from studies.acceptance.places import ALL, FIVE, MODES, ONE, Simulated
-from studies.acceptance.recorded import Outcome
+from studies.acceptance.searches import Outcome, acceptance_table
 
 
 def cells(line):
@@ -17,22 +17,22 @@ def cells(line):
 
 
 def test_a_simulated_room_is_searched_in_every_mode(capsys):
-    assert acceptance.run(['--worlds', '1', '--kinds', 'room']) == 0
-    own, _, elsewhere = capsys.readouterr().out.strip().partition('\n\n')
-    rows = [cells(line) for line in own.splitlines()[2:] if line.startswith('| room')]
-    assert [row[1] for row in rows] == [*MODES, *MODES], 'by labels and by classes'
+    assert run(['recorded', '--worlds', '1', '--kinds', 'room']) == 0
+    own, *_, elsewhere = capsys.readouterr().out.strip().split('\n\n')
+    rows = [cells(line) for line in own.splitlines()[2:]]
+    assert [row[2] for row in rows] == [*MODES, *MODES], 'by labels and by classes'
     for row in rows:
-        right, requests = map(int, row[2].split(' of '))
+        right, requests = map(int, row[3].split(' of '))
         assert requests == 4
-        for cell in row[3:-1]:
-            accepted, wrong = map(int, re.match(r'(\d+), (\d+);', cell).groups())
+        for cell in row[4:-1]:
+            accepted, wrong = map(int, re.match(r'(\d+), (\d+) \(', cell).groups())
             assert accepted - wrong <= right
             assert accepted <= requests
-    assert cells(elsewhere.splitlines()[-1])[:2] == ['all', '40']
+    assert cells(elsewhere.splitlines()[-1])[:2] == ['all objects exchanged', '0 of 40']
 
 
 def test_modes_without_further_images_are_left_out():
-    place = Simulated('room', 1000)()
+    place = Simulated('room', 1000).load()
     assert place.modes == MODES
     every = place._replace(every_frame=True)
     assert len(every.ask(FIVE)) == len(place.ask(ONE)) == 4, 'one of each group'
@@ -43,22 +43,26 @@ def test_modes_without_further_images_are_left_out():
 
 @pytest.mark.parametrize(('least', 'cell'), [(0.99, '1, 0; 0.50'), (0.9, '3, 1; 1.00')])
 def test_what_a_threshold_accepts(least, cell):
-    outcomes = [Outcome('room', MODES[0], 'hybrid', False, right, confidence)
+    outcomes = [Outcome('room', ONE, 'hybrid', 'none', 0.0, right, True, confidence)
                 for right, confidence in ((True, 0.995), (True, 0.92), (False, 0.91), (False, 0))]
-    row = cells(acceptance.table(outcomes, [least]).splitlines()[2])
-    assert row[2:] == ['2 of 4', cell, '1.00']
+    row = cells(acceptance_table(outcomes, ['place'], [least]).splitlines()[2])
+    assert row[:2] + row[3:] == ['room', '2 of 4', '1.00']
+    assert re.sub(r' \(.*\)', '', row[2]) == cell
 
 
 def test_a_place_elsewhere_has_false_accepts_only():
-    outcomes = [Outcome('room', MODES[0], 'class', True, False, confidence)
+    outcomes = [Outcome('room', ONE, 'class', 'none', 0.0, False, True, confidence)
                 for confidence in (0.995, 0.2)]
-    row = cells(acceptance.elsewhere_table(outcomes, [0.97]).splitlines()[2])
-    assert row[:2] == ['room', '2']
-    assert row[2].startswith('1 [')
+    row = cells(acceptance_table(outcomes, ['place'], [0.97]).splitlines()[2])
+    assert row[:2] == ['room', '0 of 2']
+    assert row[2].startswith('1, 1 (') and row[2].endswith('; -')
 
 
-@pytest.mark.parametrize('words', [[], ['--worlds', '1', '--min-confidence', 'nan'],
-                                   ['--queries', '/nowhere.npz', '--map', '/nowhere.yaml']])
+@pytest.mark.parametrize('words', [
+    'recorded', 'recorded --worlds 1 --min-confidence nan', 'stress',
+    'recorded --queries /nowhere.npz --map /nowhere.yaml',
+    'stress --worlds 1 --only nothing_of_this', 'stress --queries a.npz b.npz',
+    'stress --worlds -1'])
 def test_bad_options_are_named(words):
     with pytest.raises(CliplocError):
-        acceptance.run(words)
+        run(words.split())

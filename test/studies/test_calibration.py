@@ -24,7 +24,7 @@ from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.evaluation.trust import within_ellipsoid
-from studies.acceptance.confidence_fit import Case, best_recall, fit, judge, outcomes
+from studies.acceptance.fit import Case, best_recall, fit, judge, outcomes
 
 # a fit begins at the installed influence of the map's size and the vertical
 INSTALLED = CALIBRATION.objects
@@ -52,7 +52,7 @@ def make_cases(rng, count):
         right = np.zeros(some, dtype=bool)
         chosen = int(np.searchsorted(np.cumsum(chances), rng.random()))
         right[chosen:chosen + 1] = True
-        cases.append(Case(str(number // 5), supports, poses, right, np.zeros(some), setting))
+        cases.append(Case(supports, poses, right, np.zeros(some), setting))
     return cases
 
 
@@ -119,9 +119,8 @@ def test_confidences_are_true_where_nothing_was_fitted(office):
     landmark_map, recorded = office
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
     found = [judge(relocalizer.relocalize([query.observation]), query.map_from_camera,
-                   str(frame.group), Setting(len(landmark_map)))
-             for query, frame in zip(make_queries(recorded, landmark_map, True), recorded,
-                                     strict=True)]
+                   Setting(len(landmark_map)))
+             for query in make_queries(recorded, landmark_map, True)]
     likely, right = outcomes([one for one in found if len(one.supports)])
     accepted = likely >= 0.9
     print(f'\naccepted {accepted.sum()}, {(accepted & ~right).sum()} of them wrong; of '

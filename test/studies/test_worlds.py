@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import is_rigid
-from studies.acceptance import fit, judge
-from studies.acceptance.confidence_fit import outcomes
+from cliploc_ros.core.options import RelocalizerOptions
+from studies.acceptance import fit
+from studies.acceptance.places import FIVE, MODES, ONE, Simulated
+from studies.acceptance.searches import Task, search
 from studies.worlds import compare
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
@@ -61,21 +63,20 @@ def test_simulation_is_like_the_recordings(record_property):
     assert 0.71 < explained < 0.96  # .71 to .96
 
 
-def test_judge_counts_right_and_wrong_poses(record_property):
-    verdicts = [one for seed in range(3)
-                for one in judge.judge_world('room', seed, 'hybrid', 0.99)]
-    assert len(verdicts) == 3 * 4 * len(judge.MODES)
-    fused = [one for one in verdicts if one.mode == 'five images']
-    alone = [one for one in verdicts if one.mode == 'one image']
-    assert sum(one.error_m < 1.0 for one in fused) > sum(one.error_m < 1.0 for one in alone)
-    assert not [one for one in verdicts if one.accepted and one.error_m > 1.0]
-    assert '| room | five images | 12 |' in judge.table(verdicts)
+def test_several_images_find_more_right_poses():
+    options = RelocalizerOptions(min_confidence=0.99, crops='all')
+    fused, alone = ([one for seed in range(3)
+                     for one in search(Task(Simulated('room', seed), mode, options, seed=seed))]
+                    for mode in (FIVE, ONE))
+    assert len(fused) == len(alone) == 3 * 4
+    assert sum(one.right for one in fused) > sum(one.right for one in alone)
+    assert not [one for one in (*fused, *alone) if one.accepted and not one.right]
 
 
 def test_a_fit_judges_each_kind_by_the_others(record_property):
     searched = [one for kind in ('room', 'shop') for one in fit.search_world((kind, 5))]
     here = [one for one in searched if not one.case.is_elsewhere]
-    assert {one.mode for one in here} == set(judge.MODES)
+    assert {one.mode for one in here} == set(MODES)
     for one in searched:
         assert (one.case.setting.vertical > 0.0) == ('vertical' in one.mode)
         assert not (one.case.is_elsewhere and one.case.right.any())
@@ -83,6 +84,6 @@ def test_a_fit_judges_each_kind_by_the_others(record_property):
     assert calibrations['room'] != calibrations['shop']
     rooms = [one.case for one in here if one.kind == 'room']
     likely, right = fit.judged([one for one in here if one.kind == 'room'], calibrations)
-    assert np.array_equal(likely, outcomes(rooms, calibrations['room'])[0])
+    assert np.array_equal(likely, fit.outcomes(rooms, calibrations['room'])[0])
     elsewhere = fit.judged([one for one in searched if one.case.is_elsewhere], calibrations)[0]
     assert likely[right].mean() > elsewhere.mean()

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How often poses are accepted, rightly and wrongly: ``python -m studies.acceptance``.
+
+``judge`` localizes as robots do, ``recorded`` compares values of min_confidence, in the mapped
+place and in one whose objects have all exchanged places, where every pose is wrong. ``stress`` and
+``robustness`` change map, boxes or sensors, and the robot does not know. In ``retries`` a robot
+looks up to 20 times, in ``growth`` it fuses one to five images. ``fit`` fits the confidence.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.output import make_folder
+from cliploc_ros.evaluation.run import run_all
+from studies.acceptance import fit
+from studies.acceptance.looks import (
+    LOOKS,
+    MakeWalker,
+    growth_tables,
+    judged_after,
+    retries_row,
+    retry,
+)
+from studies.acceptance.places import MODES, ONE, add_arguments, chosen_places
+from studies.acceptance.searches import (
+    Outcome,
+    Task,
+    acceptance_table,
+    confidences_of,
+    draw_curves,
+    make_search,
+    tasks_of,
+)
+from studies.acceptance.troubles import CURVES, TROUBLES, exchange_landmarks
+from studies.reports import draw_judged, table
+from studies.worlds.places import KINDS
+
+# So low that only what has nothing to do with the confidence refuses a pose. All crops are
+# compared: on demand, such a pose would be taken from the first of them.
+_LOWEST = 1e-6
+_EXCHANGED = 'share of the landmarks that have exchanged places'
+
+
+def _judge(options: argparse.Namespace) -> None:
+    plain = RelocalizerOptions(matching=options.matching, crops='all',
+                               min_confidence=options.min_confidence)
+    found: list[Outcome] = run_all(make_search, [
+        Task(place, mode, plain, seed=place.seed)
+        for place in chosen_places(options) for mode in MODES], 'searches', options.workers)
+    for by in (('place', 'mode'), ('mode',)):
+        print(acceptance_table(found, by), end='\n\n')
+    if options.out is not None:
+        draw_judged(options.out, 'confidence of the best pose', {
+            mode: (np.array([one.confidence for one in found if one.mode == mode]),
+                   np.array([one.right for one in found if one.mode == mode])) for mode in MODES})
+
+
+def _recorded(options: argparse.Namespace) -> None:
+    if not all(0.0 <= one <= 1.0 for one in options.min_confidence):
+        raise OptionsError('--min-confidence must be from 0 to 1')
+    tasks = [Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
+                                                  crops='all'), *trouble)
+             for place in chosen_places(options) for matching in fit.MATCHINGS for mode in MODES
+             for trouble in (('none', 0.0), (_EXCHANGED, 1.0))]
+    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    here = [one for one in found if one.trouble == 'none']
+    # in another place no pose is right
+    there = [one._replace(right=False, trouble='all objects exchanged')
+             for one in found if one.trouble != 'none']
+    for some, by in ((here, ('place', 'matching', 'mode')), (here, ('matching', 'mode')),
+                     (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
+                     (there, ('trouble',))):
+        print(acceptance_table(some, by, options.min_confidence), end='\n\n')
+    if options.out is not None:
+        make_folder(options.out)
+        (options.out / 'outcomes.json').write_text(
+            json.dumps([one._asdict() for one in (*here, *there)]))
+        draw_judged(options.out, 'poses that at least three objects support', {
+            mode: confidences_of([one for one in here if one.mode == mode]) for mode in MODES})
+
+
+def _stress(options: argparse.Namespace) -> None:
+    names = [name for name in TROUBLES if any(text in name for text in options.only)]
+    if not names:
+        raise OptionsError('nothing to test: --only must name a trouble')
+    tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching), names)
+    print(acceptance_table(run_all(make_search, tasks, 'searches', options.workers),
+                           ('trouble', 'level', 'mode')))
+
+
+def _robustness(options: argparse.Namespace) -> None:
+    tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching),
+                     [*CURVES], options.seed)
+    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    print(acceptance_table(found, ('trouble', 'level')))
+    print(f'wrote {draw_curves(options.out or Path("robustness"), found)}')
+
+
+def _retries(options: argparse.Namespace) -> None:
+    rows = []
+    for one in chosen_places(options):
+        place = one.load()
+        queries = place.ask(ONE)
+        elsewhere, _ = exchange_landmarks(place.landmark_map, queries, 1.0,
+                                          np.random.default_rng(options.seed))
+        for (name, its_map), least in product(
+                (('true map', place.landmark_map), ('another place', elsewhere)),
+                (RelocalizerOptions.min_confidence, 0.5)):
+            plain = RelocalizerOptions(matching=options.matching, min_confidence=least,
+                                       k=min(RelocalizerOptions.k, len(its_map)))
+            robots = list(tqdm(retry(its_map, queries, plain, options.seed), name, len(queries),
+                               disable=None))
+            rows.append(retries_row(f'{one.name}, {name}', least, robots))
+    print(table(['map', 'min_confidence', 'accepted at the first look',
+                 f'within {LOOKS} looks, each alone', f'within {LOOKS} looks that agree',
+                 'more than 1 m off'], rows))
+
+
+def _growth(options: argparse.Namespace) -> None:
+    make = MakeWalker(options.vertical, RelocalizerOptions(matching=options.matching))
+    groups = run_all(make, chosen_places(options), 'places', options.workers)
+    print(growth_tables(groups))
+    if options.out is not None:
+        draw_judged(options.out, 'after one to five images', {
+            f'{images} image{"s"[:images > 1]}': judged
+            for images, judged in judged_after(groups).items()})
+
+
+def _fit(options: argparse.Namespace) -> None:
+    tasks = [(kind, seed) for kind in KINDS for seed in range(options.worlds)]
+    searched: list[fit.Searched] = run_all(fit.make_search_world, tasks, 'worlds',
+                                           options.workers)
+    calibrations = fit.cross_fitted(searched)
+    fit.print_report(searched, calibrations)
+    if options.out is not None:
+        plain = [one for one in searched if one.kind in fit.FITTED_KINDS
+                 and not one.case.is_elsewhere]
+        draw_judged(options.out, 'simulated worlds, each kind left out of the fit', {
+            mode: fit.judged([one for one in plain if one.mode == mode], calibrations)
+            for mode in MODES})
+    fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS])
+    print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
+        f'{name}: {value:.3g}' for name, value in fitted.objects._asdict().items()))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run a study; return the exit code."""
+    parser = argparse.ArgumentParser(prog='python -m studies.acceptance', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+
+    def add(name: str, command: object, summary: str, out: str = '') -> argparse.ArgumentParser:
+        own = commands.add_parser(name, help=summary, description=summary)
+        own.set_defaults(command=command)
+        if out:
+            own.add_argument('--out', type=Path, metavar='DIR', help=f'{out} there')
+        return own
+
+    judge = add('judge', _judge, 'precision and recall in simulated worlds or recordings',
+                'draw a reliability diagram')
+    add_arguments(judge, worlds=50)
+    judge.add_argument('--min-confidence', type=float, default=RelocalizerOptions.min_confidence)
+    recorded = add('recorded', _recorded, 'precision and recall for several min_confidence',
+                   'write outcomes.json and draw a reliability diagram')
+    add_arguments(recorded, fit.FITTED_KINDS, first_seed=1000)
+    recorded.add_argument('--min-confidence', type=float, nargs='+',
+                          default=(0.99, 0.97, 0.95, 0.9))
+    stress = add('stress', _stress, 'false accepts in a list of troubles')
+    add_arguments(stress, ('room', 'office', 'shop'), first_seed=1000)
+    stress.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
+                        help='troubles whose name contains one of these')
+    robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',
+                     'draw them')
+    add_arguments(robustness, ('room', 'office', 'shop'), first_seed=1000)
+    retries = add('retries', _retries, f'{LOOKS} looks of a robot that does not move')
+    add_arguments(retries, ('room', 'office', 'shop'), first_seed=1000)
+    retries.set_defaults(frames='main')
+    growth = add('growth', _growth, 'confidence after one to five images',
+                 'draw the reliability')
+    add_arguments(growth, fit.FITTED_KINDS, worlds=20)
+    growth.add_argument('--vertical', action='store_true', help='known to 1 degree on each axis')
+    fits = add('fit', _fit, 'the fit of the confidence to simulated worlds',
+               'draw a reliability diagram')
+    fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
+    fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
+    for own in (judge, stress, robustness, retries, growth):
+        own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')
+    for own in (robustness, retries):
+        own.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')
+    options = parser.parse_args(arguments)
+    options.command(options)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(run_command(run))

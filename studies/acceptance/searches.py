@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Searches over places, modes, matchings and troubles, and the table of what was accepted."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import groupby
+from math import ceil
+from pathlib import Path
+from textwrap import fill
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.tolerances import RIGHT_M
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.evaluation.methods import AUTO, Method
+from cliploc_ros.evaluation.trials import run_trial
+from studies.acceptance.fit import best_recall
+from studies.acceptance.places import SEED, Place, Recording, Simulated
+from studies.acceptance.troubles import CURVES, TROUBLES
+from studies.reports import interval, table
+
+_PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
+_PANELS_A_ROW, _LABEL_WIDTH = 3, 22
+
+
+class Task(NamedTuple):
+    """All queries of a place in a mode, with a trouble."""
+
+    place: Recording | Simulated
+    mode: str
+    options: RelocalizerOptions = RelocalizerOptions()
+    trouble: str = 'none'
+    level: float = 0.0
+    seed: int = SEED  # of the sensors and of the trouble
+
+
+class Outcome(NamedTuple):
+    """The best pose of one request."""
+
+    place: str
+    mode: str
+    matching: str
+    trouble: str
+    level: float
+    right: bool  # within 1 m of the truth, where the map shows the place
+    accepted: bool
+    confidence: float
+
+
+def make_search() -> Callable[[Task], list[Outcome]]:
+    """Return the function that searches, for a worker."""
+    return search
+
+
+def search(task: Task) -> list[Outcome]:
+    """Return the outcomes of all queries of a place; none where its mode is impossible."""
+    place = _loaded(task.place)
+    if task.mode not in place.modes:
+        return []
+    trouble = (TROUBLES | CURVES)[task.trouble]
+    landmark_map, queries = trouble.change(
+        place.landmark_map, place.ask(task.mode, task.seed), task.level,
+        np.random.default_rng(task.seed))
+    options = place.options(task.mode, task.options)
+    options = replace(options, k=min(options.k, len(landmark_map)))
+    return [Outcome(task.place.name, task.mode, options.matching, task.trouble, task.level,
+                    one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
+                    one.confidence)
+            for one in run_trial(landmark_map, Method(AUTO, options), 0, queries)]
+
+
+@lru_cache(maxsize=1)
+def _loaded(place: Recording | Simulated) -> Place:
+    return place.load()
+
+
+def tasks_of(places: Sequence[Recording | Simulated], options: RelocalizerOptions,
+             names: Sequence[str], seed: int = SEED) -> list[Task]:
+    """Return a task for each level of some troubles in each of their modes, at each place."""
+    return [Task(place, mode, options, name, level, seed) for name in names
+            for level in (TROUBLES | CURVES)[name].levels for place in places
+            for mode in (TROUBLES | CURVES)[name].modes]
+
+
+def confidences_of(outcomes: Sequence[Outcome]
+                   ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the confidence of each outcome, 0 where another rule refuses it, and if right."""
+    return (np.array([one.confidence * one.accepted for one in outcomes]),
+            np.array([one.right for one in outcomes], dtype=np.bool_))
+
+
+def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
+                     thresholds: Sequence[float] = ()) -> str:
+    """Return what was accepted, as Markdown: a row for each value of some fields.
+
+    A cell has accepted poses, those of them that are wrong by more than 1 m, with the 95 %
+    interval of their share of all requests, and the share of the right poses that is accepted.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+    by : sequence of str
+        Fields; none for one row of all outcomes.
+    thresholds : sequence of float
+        A column for each ``min_confidence``, and one for the greatest recall that any of them
+        reaches at a precision of .99. Without, what the search itself accepted.
+    """
+    def figures(some: Sequence[Outcome]) -> Iterator[str]:
+        likely, right = confidences_of(some)
+        yield f'{right.sum()} of {len(right)}'
+        for accepted in [likely >= least for least in thresholds] if thresholds else [
+                np.array([one.accepted for one in some])]:
+            false = int((accepted & ~right).sum())
+            recall = f'{accepted[right].mean():.2f}' if right.any() else '-'
+            yield (f'{accepted.sum()}, {false} ({interval(false, len(some), 4)}); {recall}')
+        if thresholds:
+            yield f'{best_recall(likely, right)[0]:.2f}' if right.any() else '-'
+
+    columns = [f'{least:g}' for least in thresholds] + ['best'] if thresholds \
+        else ['accepted, wrong (95 % of all); recall']
+    groups: dict[tuple[str, ...], list[Outcome]] = {}
+    for one in outcomes:
+        groups.setdefault(tuple(f'{getattr(one, name)}' for name in by), []).append(one)
+    return table([*by, 'within 1 m', *columns],
+                 [[*key, *figures(some)] for key, some in groups.items()])
+
+
+def draw_curves(folder: Path, outcomes: Sequence[Outcome]) -> Path:
+    """Draw success, accepted poses and false accepts over the levels, with 95 % intervals."""
+    # late, since tables need no matplotlib
+    from matplotlib.figure import Figure
+
+    from cliploc_ros.evaluation.figures import save_figure
+    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.evaluation.summary import wilson_interval
+
+    make_folder(folder)
+    curves = {name: list(some) for name, some in groupby(outcomes, lambda one: one.trouble)}
+    rows, columns = ceil(len(curves) / _PANELS_A_ROW), min(len(curves), _PANELS_A_ROW)
+    figure = Figure(figsize=(_PANEL_SIZE[0] * columns, _PANEL_SIZE[1] * rows),
+                    layout='constrained')
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes, (name, some) in zip(panels.flat, curves.items(), strict=False):
+        levels = {level: list(own) for level, own in groupby(some, lambda one: one.level)}
+        for label, color, marker, counts in (
+                ('within 1 m', '#0072B2', 'o', [sum(one.right for one in own)
+                                                for own in levels.values()]),
+                ('accepted', '#009E73', 's', [sum(one.accepted for one in own)
+                                              for own in levels.values()]),
+                ('false accepts', '#D55E00', 'X', [sum(one.accepted and not one.right
+                                                       for one in own)
+                                                   for own in levels.values()])):
+            totals = [len(own) for own in levels.values()]
+            intervals = np.array([wilson_interval(*one)
+                                  for one in zip(counts, totals, strict=True)])
+            axes.fill_between([*levels], *intervals.T, color=color, alpha=0.15, linewidth=0)
+            axes.plot([*levels], np.divide(counts, totals), color=color, marker=marker,
+                      markersize=5, linewidth=1.4, label=label)
+        axes.set_xlabel(fill(name, _LABEL_WIDTH))
+        axes.grid(alpha=0.3)
+        axes.set_axisbelow(True)
+    for axes in panels[:, 0]:
+        axes.set(ylabel='share of images', ylim=(-0.02, 1.02))
+    for axes in panels.flat[len(curves):]:
+        axes.remove()
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                  frameon=False, fontsize=9)
+    return save_figure(figure, folder / 'robustness.png')
