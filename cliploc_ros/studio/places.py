@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,9 +32,7 @@ from cliploc_ros.studio.document import fields_of
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
-
-if TYPE_CHECKING:
-    from cliploc_ros.studio.studio import Studio
+from cliploc_ros.studio.studio import Studio
 
 #: No position is begun after this [s].
 LIMIT_S = 60.0
@@ -175,7 +173,7 @@ class PlacesSearch:
         Called in any thread when there is something new to show.
     """
 
-    def __init__(self, studio: 'Studio', on_change: Callable[[], None]):
+    def __init__(self, studio: Studio, on_change: Callable[[], None]):
         self._studio, self._on_change = studio, on_change
         self._thread: threading.Thread | None = None
         self._stopped = threading.Event()

@@ -105,7 +105,7 @@ def test_without_landmarks(tmp_path):
 
 @pytest.mark.needs('viser')
 def test_colours_of_positions():
-    from cliploc_ros.studio.places_panel import tile_colors
+    from cliploc_ros.studio.tool_panels import tile_colors
 
     check = GridCheck(np.zeros((4, 3)), np.ones(4, dtype=bool), np.array([4, 0, 0, 3]),
                       np.array([0, 0, 0, 1]), np.array([[5.0] * 4, [5.0] * 4, [1.0] * 4,
