@@ -29,12 +29,7 @@ _MAX_HISTORY = 10_000
 
 
 class Document:
-    """A map that is edited.
-
-    Parameters
-    ----------
-    path : Path
-        Of the map file; it may not exist yet.
+    """A map that is edited. Its file may not exist yet.
 
     Attributes
     ----------
@@ -126,18 +121,10 @@ class Document:
     # ---- edits ----------------------------------------------------------------------------------
 
     def apply(self, change: Change, gesture: object = None) -> None:
-        """Make a change.
+        """Make a change; successive ones of one gesture, as of a drag, are undone together.
 
-        Parameters
-        ----------
-        change : Change
-        gesture : object, optional
-            Successive changes of one gesture, as of a drag, are undone together.
-
-        Raises
-        ------
-        CliplocError
-            The landmarks are not those the change starts from, or the journal cannot be written.
+        CliplocError: the landmarks are not those the change starts from, or the journal cannot be
+        written.
         """
         with self.lock:
             if not change.after:
@@ -209,12 +196,7 @@ class Document:
     # ---- the files ------------------------------------------------------------------------------
 
     def save(self, over: str = NO_FILE) -> None:
-        """Write the map file in one step.
-
-        Parameters
-        ----------
-        over : str
-            The digest of a foreign content that may be overwritten, see ChangedOnDiskError.
+        """Write the map file in one step, over a foreign content only if ``over`` is its digest.
 
         Raises
         ------
@@ -244,10 +226,7 @@ class Document:
     def reload(self) -> None:
         """Take the map from the file; this is an edit that undo takes back.
 
-        Raises
-        ------
-        CliplocError
-            The file is no map.
+        CliplocError: the file is no map.
         """
         with self.lock:
             self._file = read_map_file(self.path)

@@ -48,14 +48,9 @@ Pixel = Sequence[float] | NDArray[np.float64]
 
 
 class Images:
-    """The images of a folder or a recording.
+    """The images of a folder or a recording, taken at stamps (F,) [ns].
 
-    Parameters
-    ----------
-    stamps_ns : ndarray (F,) of int
-        When each was taken [ns].
-    read : callable
-        Returns image and camera of a place, 0 to F - 1.
+    ``read`` returns image and camera of a place, 0 to F - 1.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
@@ -74,13 +69,7 @@ class Images:
 
 
 def open_images(path: Path, topics: BagTopics) -> Images:
-    """Open the images of a TUM folder or of a rosbag2 recording.
-
-    Raises
-    ------
-    DatasetError
-        It is neither, or its images cannot be read.
-    """
+    """Open the images of a TUM folder or of a rosbag2 recording; DatasetError: it is neither."""
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
     if (path / 'rgb.txt').exists():
@@ -92,13 +81,7 @@ def open_images(path: Path, topics: BagTopics) -> Images:
 
 
 def views_of_folder(path: Path) -> PosedDetections:
-    """Return the poses of a TUM folder with ground truth as views without boxes.
-
-    Raises
-    ------
-    DatasetError
-        It is no such folder.
-    """
+    """Return the poses of a TUM folder as views without boxes; DatasetError: it has no poses."""
     if not (path / 'rgb.txt').exists():
         raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
     sequence, camera = read_tum(path), find_camera(None, path)[0]
@@ -170,18 +153,8 @@ def draw(camera: Camera, image: NDArray[np.uint8] | None, boxes_xyxy: NDArray[np
          ) -> NDArray[np.uint8]:
     """Return the picture (h, w, 3) of a view, red first; grey without an image.
 
-    Parameters
-    ----------
-    camera : Camera
-    image : ndarray (h, w, 3), optional
-    boxes_xyxy : ndarray (n, 4)
-        Of the detector [px].
-    drawn_xyxy : sequence of float, optional
-        The box that a person drew [px].
-    outlines : sequence of Outline
-    colors : mapping
-        Of each landmark.
-    selection : sequence of str
+    It shows the detector's boxes (n, 4), the box that a person drew (4,) [px], and the outlines
+    in the colours of their landmarks, or in the selection's.
     """
     picture = np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
     if image is not None and image.shape == picture.shape:

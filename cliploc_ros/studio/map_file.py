@@ -51,17 +51,9 @@ class ChangedOnDiskError(MapError):
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file.
+    """A map file: its text, '' where there is none, and the same as a tree.
 
-    Parameters
-    ----------
-    path : Path
-    text : str
-        Of the file; '' where there is none.
-    node : str
-        The key in the file whose parameters hold the map.
-    tree : mapping
-        The whole file.
+    ``node`` is the key in the file whose parameters hold the map.
     """
 
     path: Path
@@ -92,10 +84,7 @@ class MapFile:
     def with_landmarks(self, landmarks: Mapping[str, Landmark]) -> 'MapFile':
         """Return the file with other landmarks, not yet written.
 
-        Raises
-        ------
-        MapError
-            It holds fields that cannot be written again.
+        MapError: it holds fields that cannot be written again.
         """
         old = self._map['landmarks']
         # undo puts a deleted landmark last; in the file it keeps its place
@@ -117,13 +106,7 @@ class MapFile:
         return MapFile(self.path, text, self.node, tree)
 
     def write(self) -> None:
-        """Write the file in one step.
-
-        Raises
-        ------
-        MapError
-            It cannot be written; nothing was changed.
-        """
+        """Write the file in one step; MapError: it cannot be written, nothing was changed."""
         try:
             with replace_file(self.path) as partial:
                 partial.write_bytes(self.text.encode())
@@ -132,13 +115,7 @@ class MapFile:
                            'changed') from error
 
     def digest_on_disk(self) -> str:
-        """Return the digest of the file as it is now, NO_FILE where there is none.
-
-        Raises
-        ------
-        MapError
-            It cannot be read.
-        """
+        """Return the digest of the file as it is now, NO_FILE where there is none."""
         try:
             return _digest_of(self.path.read_bytes())
         except FileNotFoundError:
@@ -216,18 +193,8 @@ def patch_landmarks(text: str, path: tuple[str, ...], old: Mapping[str, Mapping[
                     new: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a map's text with other landmarks.
 
-    Parameters
-    ----------
-    text : str
-    path : tuple of str
-        The keys that lead to the landmarks.
-    old, new : mapping of str to mapping
-        The fields of each landmark, as the text has them and as it shall have them.
-
-    Raises
-    ------
-    LookupError, ValueError, YAMLError
-        The text does not have these landmarks where they are expected.
+    The keys of ``path`` lead to the landmarks. LookupError, ValueError or YAMLError: the text does
+    not have the old landmarks there.
     """
     node = yaml.compose(text, Loader=_LOADER)
     for name in path:
@@ -352,17 +319,10 @@ def _flow(name: str, value: Any) -> str:
 # ---- the image embeddings -----------------------------------------------------------------------
 
 class LookFile(NamedTuple):
-    """The file of image embeddings next to a map.
+    """The file of image embeddings next to a map, with the looks by id of the landmark.
 
-    Parameters
-    ----------
-    path : Path
-    encoder_key : str
-        Of the encoder that made the looks; '' where the file is missing or cannot be used.
-    looks : dict of str to Look
-        By id of the landmark.
-    state : tuple of int or None
-        Tells whether another program changed the file since; None where there is none.
+    ``encoder_key`` is '' where the file is missing or cannot be used. ``state`` tells whether
+    another program changed the file since; None where there is none.
     """
 
     path: Path
@@ -374,19 +334,8 @@ class LookFile(NamedTuple):
         """Write the looks of all landmarks of the map in one step.
 
         Those of another encoder are left out. Nothing is written where nothing changed, and
-        nothing over the content of another program.
-
-        Returns
-        -------
-        LookFile
-            As it is then.
-        str
-            Why it does not hold these looks; '' if it does.
-
-        Raises
-        ------
-        MapError
-            The file cannot be written; it is as it was.
+        nothing over the content of another program. Return the file as it is then, and why it
+        does not hold these looks, '' if it does. MapError: it cannot be written.
         """
         looks = {key: one.look for key, one in landmarks.items()}
         size = next((len(look.mean) for look in (*self.looks.values(), *looks.values())

@@ -56,19 +56,10 @@ class Row(NamedTuple):
 
 
 class Studio:
-    """The document and what surrounds it.
+    """The document and its surroundings.
 
-    Parameters
-    ----------
-    document : Document
-    recording : Recording, optional
-        Views with boxes and poses.
-    images : Images, optional
-        The images of these views.
-    finder : PhraseFinder, optional
-        Finds phrases for landmarks.
-    layer : KeyframeLayer, optional
-        The keyframes next to the map, to be shown.
+    ``recording`` has views with boxes and poses, ``images`` the images of these views, ``layer``
+    the keyframes next to the map, to be shown.
     """
 
     def __init__(self, document: Document, recording: Recording | None = None,
