@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from browser import TIMEOUT_S, Person, value_of, wait_for
 from scipy.spatial.transform import Rotation
+from studio_map import ASSETS
 
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.studio.images import outlines_of
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
-
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):
