@@ -14,27 +14,32 @@ from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, MapError
-from cliploc_ros.studio.changes import Change, EditError, Landmarks, from_json, to_json
+from cliploc_ros.studio.edits import Change, EditError, Landmarks, change_from_json
 from cliploc_ros.studio.journal import Journal
-from cliploc_ros.studio.landmark import Landmark, map_of
-from cliploc_ros.studio.looks import Look, LookFile, look_from_json, read_look_file
-from cliploc_ros.studio.map_source import (
+from cliploc_ros.studio.landmark import KNOWN_FIELDS, Landmark, Look, look_from_json, map_of
+from cliploc_ros.studio.map_file import (
     NO_FILE,
     ChangedOnDiskError,
-    digest_on_disk,
-    read_source,
+    LookFile,
+    read_look_file,
+    read_map_file,
 )
 
 _MAX_HISTORY = 10_000
 
 
 class Document:
-    """A map that is edited.
+    """A map that is edited. Its file may not exist yet.
 
-    Parameters
+    Attributes
     ----------
-    path : Path
-        Of the map file; it may not exist yet.
+    landmarks : mapping of str to Landmark
+        By id. An edit makes a new mapping and leaves this one alone.
+    selection : tuple of str
+    revision : int
+        Counts the changes of map, selection and file.
+    notes : tuple of str
+        What a person should know of the files.
 
     Raises
     ------
@@ -51,10 +56,10 @@ class Document:
         self._done: list[Change] = []
         self._undone: list[Change] = []
         self._gesture: object = None
-        self._source = read_source(path)
+        self._file = read_map_file(path)
         self._look_file = self._read_looks()
-        self._landmarks: Landmarks = self._landmarks_of_file()
-        self._saved: Landmarks = self._landmarks
+        self.landmarks: Landmarks = self._landmarks_of_file()
+        self._saved: Landmarks = self.landmarks
         self._journal = Journal(self.path.with_name(f'.{self.path.name}.studio'))
         try:
             self._replay(self._journal.read())
@@ -67,78 +72,59 @@ class Document:
 
     @property
     def path(self) -> Path:
-        """Return the map file."""
-        return self._source.path
+        """The map file."""
+        return self._file.path
 
     @property
     def frame_id(self) -> str:
-        """Return the coordinate frame of the map."""
-        return self._source.frame_id
-
-    @property
-    def landmarks(self) -> Landmarks:
-        """Return the landmarks by id. An edit makes a new mapping and leaves this one alone."""
-        return self._landmarks
+        """The coordinate frame of the map."""
+        return self._file.frame_id
 
     @property
     def encoder_key(self) -> str:
-        """Return the encoder of the landmarks' looks; '' where the map has none."""
+        """The encoder of the landmarks' looks; '' where the map has none."""
         return self._look_file.encoder_key
 
     def take_encoder(self, encoder_key: str) -> None:
         """Let a map that starts empty have looks of an encoder; any other map stays as it is."""
         with self.lock:
-            if not self._source.landmarks and self._look_file.state is None:
+            if not self._file.landmarks and self._look_file.state is None:
                 self._look_file = self._look_file._replace(encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
-        """Return id and landmark of a selection of exactly one."""
+        """Id and landmark of a selection of exactly one."""
         with self.lock:
             if len(self.selection) != 1:
                 return None
-            return self.selection[0], self._landmarks[self.selection[0]]
+            return self.selection[0], self.landmarks[self.selection[0]]
 
     @property
     def is_saved(self) -> bool:
-        """Return whether the file holds all edits."""
-        return _fields(self._saved) == _fields(self._landmarks)
+        """Whether the file holds all edits."""
+        return fields_of(self._saved) == fields_of(self.landmarks)
 
     @property
     def to_undo(self) -> str | None:
-        """Return what the next undo undoes."""
+        """The edit that the next undo takes back."""
         return self._done[-1].what if self._done else None
 
     @property
     def to_redo(self) -> str | None:
-        """Return what the next redo does again."""
+        """The edit that the next redo does again."""
         return self._undone[-1].what if self._undone else None
 
     def to_map(self) -> LandmarkMap:
-        """Return the map as the relocalizer knows it.
-
-        Raises
-        ------
-        MapError
-            It has no landmarks.
-        """
-        return map_of(self._landmarks, self.frame_id, self.path.name)
+        """Return the map as the relocalizer knows it; MapError where it has no landmarks."""
+        return map_of(self.landmarks, self.frame_id, self.path.name)
 
     # ---- edits ----------------------------------------------------------------------------------
 
     def apply(self, change: Change, gesture: object = None) -> None:
-        """Make a change.
+        """Make a change; successive ones of one gesture, as of a drag, are undone together.
 
-        Parameters
-        ----------
-        change : Change
-        gesture : object, optional
-            Successive changes of one gesture, as of a drag, are undone together.
-
-        Raises
-        ------
-        CliplocError
-            The landmarks are not those the change starts from, or the journal cannot be written.
+        CliplocError: the landmarks are not those the change starts from, or the journal cannot be
+        written.
         """
         with self.lock:
             if not change.after:
@@ -156,7 +142,7 @@ class Document:
             return False
 
     def redo(self) -> bool:
-        """Do again what was undone last; return whether there was anything."""
+        """Do again the edit that was undone last; return whether there was one."""
         with self.lock:
             if self._undone:
                 self._do('redo', self._undone[-1])
@@ -167,22 +153,31 @@ class Document:
         """Select landmarks; unknown ids are left out."""
         with self.lock:
             self.selection = tuple(dict.fromkeys(
-                key for key in landmark_ids if key in self._landmarks))
+                key for key in landmark_ids if key in self.landmarks))
             self._tell()
 
+    def subscribe(self, listener: Callable[[], None]) -> None:
+        """Call a function after each change of map, selection or file, with the lock held."""
+        self._listeners.append(listener)
+
+    def _tell(self) -> None:
+        self.revision += 1
+        for listener in self._listeners:
+            listener()
+
     def _do(self, kind: str, change: Change) -> None:
-        landmarks: Landmarks = change.apply(self._landmarks)
+        landmarks = change.apply(self.landmarks)
         for one in change.after.values():
             if one is not None and one.look is not None and one.look.key not in self._kept_looks:
                 self._journal.append(one.look.to_json())
                 self._kept_looks.add(one.look.key)
-        self._journal.append({'do': kind, **to_json(change)})
+        self._journal.append({'do': kind, **change.to_json()})
         self._take(kind, change, landmarks)
         self._tell()
 
     def _take(self, kind: str, change: Change, landmarks: Landmarks) -> None:
         """Take over a change that was applied, and write history."""
-        self._landmarks = landmarks
+        self.landmarks = landmarks
         self._gesture = None
         if kind == 'join' and self._done:
             self._done[-1] = self._done[-1].then(change)
@@ -198,26 +193,10 @@ class Document:
             self._undone.clear()
         self.selection = tuple(key for key in self.selection if key in landmarks)
 
-    # ---- listeners ------------------------------------------------------------------------------
-
-    def subscribe(self, listener: Callable[[], None]) -> None:
-        """Call a function after each change of map, selection or file, with the lock held."""
-        self._listeners.append(listener)
-
-    def _tell(self) -> None:
-        self.revision += 1
-        for listener in self._listeners:
-            listener()
-
-    # ---- file and journal -----------------------------------------------------------------------
+    # ---- the files ------------------------------------------------------------------------------
 
     def save(self, over: str = NO_FILE) -> None:
-        """Write the map file in one step.
-
-        Parameters
-        ----------
-        over : str
-            The digest of a foreign content that may be overwritten, see ChangedOnDiskError.
+        """Write the map file in one step, over a foreign content only if ``over`` is its digest.
 
         Raises
         ------
@@ -227,18 +206,19 @@ class Document:
             The map is empty, or a file cannot be written; that one is as it was.
         """
         with self.lock:
-            if not self._landmarks:
+            if not self.landmarks:
                 raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
                                 'or delete the file')
             self.to_map()
-            found = digest_on_disk(self.path)
-            if found not in (NO_FILE, self._source.digest, over):
+            found = self._file.digest_on_disk()
+            if found not in (NO_FILE, self._file.digest, over):
                 raise ChangedOnDiskError(self.path, found)
-            new = self._source.with_landmarks(self._landmarks)
-            self._journal.append({'writing': new.digest, 'looks': self._changed_looks()})
-            self._source = new.write()
+            file = self._file.with_landmarks(self.landmarks)
+            self._journal.append({'writing': file.digest, 'looks': self._changed_looks()})
+            file.write()
+            self._file = file
             self._write_looks()
-            self._saved = self._landmarks
+            self._saved = self.landmarks
             self._gesture = None
             self._restart_journal()
             self._tell()
@@ -246,22 +226,17 @@ class Document:
     def reload(self) -> None:
         """Take the map from the file; this is an edit that undo takes back.
 
-        Raises
-        ------
-        CliplocError
-            The file is no map.
+        CliplocError: the file is no map.
         """
         with self.lock:
-            self._source = read_source(self.path)
+            self._file = read_map_file(self.path)
             self._look_file = self._read_looks()
-            found: Landmarks = {key: replace(one, is_locked=key in self._landmarks
-                                             and self._landmarks[key].is_locked)
-                                for key, one in self._landmarks_of_file().items()}
-            change = Change('reload the file', self._landmarks,
-                            {**dict.fromkeys(self._landmarks), **found})
-            change = Change(change.what, {key: self._landmarks.get(key) for key in change.after},
-                            change.after)
-            self._take('edit', change, found)
+            before = self.landmarks
+            found = {key: replace(one, is_locked=key in before and before[key].is_locked)
+                     for key, one in self._landmarks_of_file().items()}
+            after = {**dict.fromkeys(before), **found}
+            self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
+                                      after), found)
             self._saved = found
             self._restart_journal()
             self._note_unknown_fields()
@@ -273,6 +248,17 @@ class Document:
             is_needed = not self.is_saved or self._locked()
             self._journal.close() if is_needed else self._journal.remove()
 
+    def _landmarks_of_file(self) -> dict[str, Landmark]:
+        return {key: replace(one, look=self._look_file.looks.get(key))
+                for key, one in self._file.landmarks.items()}
+
+    def _note_unknown_fields(self) -> None:
+        unknown = {name: key for key, one in self.landmarks.items()
+                   for name in one.fields if name not in KNOWN_FIELDS}
+        for name, landmark_id in list(unknown.items())[:5]:
+            self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
+                           'relocalizer refuses a map with unknown fields',)
+
     def _read_looks(self) -> LookFile:
         found, fault = read_look_file(self.path)
         self.notes += (fault,) if fault else ()
@@ -280,54 +266,70 @@ class Document:
         return found
 
     def _write_looks(self) -> None:
-        self._look_file, fault = self._look_file.write(_looks(self._landmarks))
+        self._look_file, fault = self._look_file.write(self.landmarks)
         self.notes += (fault,) if fault and fault not in self.notes else ()
 
-    def _landmarks_of_file(self) -> dict[str, Landmark]:
-        return {key: replace(one, look=self._look_file.looks.get(key))
-                for key, one in self._source.landmarks.items()}
-
     def _changed_looks(self) -> dict[str, str]:
-        """Return the keys of looks that the file does not hold so, '' for none."""
-        old = _look_keys(_looks(self._landmarks_of_file()))
-        return {key: look for key, look in _look_keys(_looks(self._landmarks)).items()
-                if look != old.get(key, '')}
+        """Return the keys of looks that the file holds otherwise, '' for none."""
+        old, new = ({key: '' if one.look is None else one.look.key
+                     for key, one in landmarks.items()}
+                    for landmarks in (self._landmarks_of_file(), self.landmarks))
+        return {key: look for key, look in new.items() if look != old.get(key, '')}
+
+    # ---- the journal ----------------------------------------------------------------------------
 
     def _restart_journal(self) -> None:
         self._kept_looks = {look.key for look in self._look_file.looks.values()}
         self._journal.restart([self._header()])
 
     def _header(self) -> dict[str, Any]:
-        return {'base': self._source.digest, 'locked': self._locked()}
+        return {'base': self._file.digest, 'locked': self._locked()}
 
     def _locked(self) -> list[str]:
-        return [key for key, one in self._landmarks.items() if one.is_locked]
+        return [key for key, one in self.landmarks.items() if one.is_locked]
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
-        """Do again what the journal holds, from the content that the file has."""
-        digest = self._source.digest
+        """Do again the edits in the journal, from the content that the file has."""
+        digest = self._file.digest
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
         edits = [entry for entry in entries if 'do' in entry]
-        if not starts and edits:
-            aside = self._journal.set_aside()
-            self.notes += (f'{len(edits)} edits of an earlier session do not fit the file, which '
-                           f'another program changed; they lie in {aside.name}',)
         if not starts:
+            if edits:
+                aside = self._journal.set_aside()
+                self.notes += (f'{len(edits)} edits of an earlier session do not fit the file, '
+                               f'which another program changed; they lie in {aside.name}',)
             self._journal.restart([self._header()])
             return
         kept = [*self._look_file.looks.values(), *map(look_from_json, entries)]
         looks = {look.key: look for look in kept if look is not None}
         self._kept_looks = set(looks)
-        self._restore_locks(entries[:starts[-1] + 1])
-        self._restore_looks(entries[starts[-1]].get('looks'), looks)
-        count = self._replay_edits(
-            [entry for entry in entries[starts[-1] + 1:] if 'do' in entry], looks)
+        start = starts[-1]
+        self._restore_start(entries[:start + 1], looks)
+        edits = [entry for entry in entries[start + 1:] if 'do' in entry]
+        count = 0
+        try:
+            for entry in edits:
+                change = change_from_json(entry, looks)
+                self._take(str(entry['do']), change, change.apply(self.landmarks))
+                count += 1
+        except (ValueError, CliplocError) as error:
+            aside = self._journal.set_aside()
+            in_file = {look.key for look in self._look_file.looks.values()}
+            self._journal.restart([
+                self._header(), *(look.to_json() for key, look in looks.items()
+                                  if key not in in_file), *edits[:count]])
+            self.notes += (f'the last {len(edits) - count} edits of an earlier session cannot be '
+                           f'restored ({error}); they lie in {aside.name}',)
         if count:
             self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
 
-    def _restore_locks(self, entries: list[dict[str, Any]]) -> None:
-        # locks before a content that was written come from the header and the edits up to it
+    def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Look]) -> None:
+        """Restore the state that belongs to the file's content: its locks and looks.
+
+        Locks before a content that was written come from the header and the edits up to it. A
+        save that ended between the map and its image embeddings is finished.
+        """
         locked: dict[str, bool] = {}
         for entry in entries:
             if isinstance(ids := entry.get('locked'), list):
@@ -335,53 +337,19 @@ class Document:
             if isinstance(after := entry.get('after'), dict):
                 locked |= {key: isinstance(one, dict) and one.get('locked') is True
                            for key, one in after.items()}
-        self._landmarks = {key: replace(one, is_locked=locked.get(key, False))
-                           for key, one in self._landmarks.items()}
-        self._saved = self._landmarks
-
-    def _restore_looks(self, keys: object, looks: Mapping[str, Look]) -> None:
-        """Finish a save that ended between the map and its image embeddings."""
-        if not isinstance(keys, dict) or not keys:
-            return
-        self._landmarks = {key: replace(one, look=looks.get(str(keys[key]))) if key in keys
-                           else one for key, one in self._landmarks.items()}
-        self._saved = self._landmarks
-        try:
-            self._write_looks()
-        except MapError as error:
-            self.notes += (str(error),)
-
-    def _replay_edits(self, edits: list[dict[str, Any]], looks: Mapping[str, Look]) -> int:
-        for row, entry in enumerate(edits):
+        keys = entries[-1].get('looks')
+        keys = keys if isinstance(keys, dict) else {}
+        self.landmarks = self._saved = {
+            key: replace(one, is_locked=locked.get(key, False),
+                         look=looks.get(str(keys[key])) if key in keys else one.look)
+            for key, one in self.landmarks.items()}
+        if keys:
             try:
-                change = from_json(entry, looks)
-                self._take(str(entry['do']), change, change.apply(self._landmarks))
-            except (ValueError, CliplocError) as error:
-                aside = self._journal.set_aside()
-                in_file = {look.key for look in self._look_file.looks.values()}
-                self._journal.restart([
-                    self._header(), *(look.to_json() for key, look in looks.items()
-                                      if key not in in_file), *edits[:row]])
-                self.notes += (f'the last {len(edits) - row} edits of an earlier session cannot '
-                               f'be restored ({error}); they lie in {aside.name}',)
-                return row
-        return len(edits)
-
-    def _note_unknown_fields(self) -> None:
-        unknown = {name: key for key, one in self._landmarks.items()
-                   for name in one.unknown_fields}
-        for name, landmark_id in list(unknown.items())[:5]:
-            self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
-                           'relocalizer refuses a map with unknown fields',)
+                self._write_looks()
+            except MapError as error:
+                self.notes += (str(error),)
 
 
-def _fields(landmarks: Landmarks) -> Mapping[str, Mapping[str, Any]]:
+def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
+    """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
     return {key: one.fields for key, one in landmarks.items()}
-
-
-def _looks(landmarks: Landmarks) -> dict[str, Look | None]:
-    return {key: one.look for key, one in landmarks.items()}
-
-
-def _look_keys(looks: Mapping[str, Look | None]) -> dict[str, str]:
-    return {key: '' if look is None else look.key for key, look in looks.items()}

@@ -1,15 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a recording, one at a time, by the time of a view."""
+"""The images of a recording, and the picture of a view: its image with boxes and landmarks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipses_in_pixels,
+    outline_points,
+    project_ellipsoids,
+    shape_matrices,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.frames import read_color, undistorted
@@ -18,22 +27,30 @@ from cliploc_ros.datasets.poses import TrajectoryPoses
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.units import NS_PER_S
 
+SELECTED_RGB = (255, 220, 0)
+_DRAWN_RGB = (255, 0, 220)
+_DETECTED_RGB = (255, 255, 255)
+_BLANK = 70
 # A view and its image have the same stamp; files hold it to a microsecond or so.
 _MAX_DELAY_NS = 20_000_000
 _IMAGES_KEPT = 32
+# More outlines hide the image, and a drag would wait for them.
+_MAX_OUTLINES = 200
+# Subpixel bits of OpenCV's drawing functions; larger coordinates overflow its integers.
+_SHIFT = 4
+_MAX_PIXEL = 20_000.0
+
+#: x and y [px].
+Pixel = Sequence[float] | NDArray[np.float64]
 
 
 class Images:
-    """The images of a folder or a recording.
+    """The images of a folder or a recording, taken at stamps (F,) [ns].
 
-    Parameters
-    ----------
-    stamps_ns : ndarray (F,) of int
-        When each was taken [ns].
-    read : callable
-        Returns image and camera of a place, 0 to F - 1.
+    ``read`` returns image and camera of a place, 0 to F - 1.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
@@ -52,13 +69,7 @@ class Images:
 
 
 def open_images(path: Path, topics: BagTopics) -> Images:
-    """Open the images of a TUM folder or of a rosbag2 recording.
-
-    Raises
-    ------
-    DatasetError
-        It is neither, or its images cannot be read.
-    """
+    """Open the images of a TUM folder or of a rosbag2 recording; DatasetError: it is neither."""
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
     if (path / 'rgb.txt').exists():
@@ -70,13 +81,7 @@ def open_images(path: Path, topics: BagTopics) -> Images:
 
 
 def views_of_folder(path: Path) -> PosedDetections:
-    """Return the poses of a TUM folder with ground truth as views without boxes.
-
-    Raises
-    ------
-    DatasetError
-        It is no such folder.
-    """
+    """Return the poses of a TUM folder as views without boxes; DatasetError: it has no poses."""
     if not (path / 'rgb.txt').exists():
         raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
     sequence, camera = read_tum(path), find_camera(None, path)[0]
@@ -86,9 +91,92 @@ def views_of_folder(path: Path) -> PosedDetections:
              if (pose := poses.pose_at(stamp)) is not None]
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
-    none = np.empty(0, dtype=np.int64)
     return PosedDetections(
         camera=camera.pinhole, map_from_camera=np.array([pose for _, pose in posed]),
         stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
-        class_names=(), classes=none, scores=np.empty(0))
+        class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0))
+
+
+class Outline(NamedTuple):
+    """The outline of a landmark in a view: cx, cy, exx, exy, eyy [px]."""
+
+    landmark_id: str
+    ellipse: NDArray[np.float64]
+    distance_m: float
+
+
+def outlines_of(landmarks: Mapping[str, Landmark], camera: Camera,
+                map_from_camera: NDArray[np.float64]) -> list[Outline]:
+    """Return the outlines of the landmarks in a view, the nearest first."""
+    if not landmarks:
+        return []
+    centers = np.array([one.center for one in landmarks.values()])
+    shapes = shape_matrices(np.array([one.semi_axes for one in landmarks.values()]),
+                            np.array([one.quat_xyzw for one in landmarks.values()]))
+    camera_from_map = invert_transform(map_from_camera)
+    ellipses = ellipses_in_pixels(project_ellipsoids(camera_from_map, centers, shapes), camera)
+    distances = np.linalg.norm(centers - map_from_camera[:3, 3], axis=1)
+    half = np.sqrt(ellipses[:, [2, 4]])
+    with np.errstate(invalid='ignore'):
+        inside = ((ellipses[:, :2] + half > 0.0).all(axis=1)
+                  & (ellipses[:, :2] - half < (camera.width, camera.height)).all(axis=1))
+    ids = list(landmarks)
+    return sorted((Outline(ids[row], ellipses[row], float(distances[row]))
+                   for row in np.nonzero(inside)[0]), key=lambda one: one.distance_m)
+
+
+def landmark_at(outlines: Sequence[Outline], pixel: Pixel) -> str | None:
+    """Return the landmark with the smallest outline around a pixel (2,)."""
+    around = []
+    for one in outlines:
+        cx, cy, exx, exy, eyy = one.ellipse
+        x, y = pixel[0] - cx, pixel[1] - cy
+        determinant = exx * eyy - exy * exy
+        if (eyy * x * x - 2.0 * exy * x * y + exx * y * y) <= determinant:
+            around.append((determinant, one.landmark_id))
+    return min(around)[1] if around else None
+
+
+def box_at(boxes_xyxy: NDArray[np.float64], pixel: Pixel) -> int | None:
+    """Return the row of the smallest box (n, 4) around a pixel (2,)."""
+    x, y = pixel
+    left, top, right, bottom = boxes_xyxy.T
+    rows = np.nonzero((left <= x) & (x <= right) & (top <= y) & (y <= bottom))[0]
+    areas = (right - left) * (bottom - top)
+    return int(rows[np.argmin(areas[rows])]) if len(rows) else None
+
+
+def draw(camera: Camera, image: NDArray[np.uint8] | None, boxes_xyxy: NDArray[np.float64],
+         drawn_xyxy: Sequence[float] | None, outlines: Sequence[Outline],
+         colors: Mapping[str, tuple[int, int, int]], selection: Sequence[str]
+         ) -> NDArray[np.uint8]:
+    """Return the picture (h, w, 3) of a view, red first; grey without an image.
+
+    It shows the detector's boxes (n, 4), the box that a person drew (4,) [px], and the outlines
+    in the colours of their landmarks, or in the selection's.
+    """
+    picture = np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
+    if image is not None and image.shape == picture.shape:
+        picture = image.copy()
+    for box in boxes_xyxy:
+        _rectangle(picture, box, _DETECTED_RGB, 1)
+    # the farthest first, so that the nearest lie on top
+    shown = [one for number, one in enumerate(outlines)
+             if number < _MAX_OUTLINES or one.landmark_id in selection]
+    for one in reversed(shown):
+        is_selected = one.landmark_id in selection
+        points = outline_points(one.ellipse)
+        if np.abs(points).max() < _MAX_PIXEL:
+            cv2.polylines(picture, [np.round(points * 2**_SHIFT).astype(np.int32)], True,
+                          SELECTED_RGB if is_selected else colors[one.landmark_id],
+                          3 if is_selected else 2, cv2.LINE_AA, _SHIFT)
+    if drawn_xyxy is not None:
+        _rectangle(picture, np.array(drawn_xyxy), _DRAWN_RGB, 2)
+    return picture
+
+
+def _rectangle(picture: NDArray[np.uint8], box: NDArray[np.float64], rgb: tuple[int, int, int],
+               width: int) -> None:
+    left, top, right, bottom = (int(value) for value in np.clip(box, -_MAX_PIXEL, _MAX_PIXEL))
+    cv2.rectangle(picture, (left, top), (right, bottom), rgb, width, cv2.LINE_AA)

@@ -3,12 +3,12 @@
 """The journal of a map: edits that the file does not hold yet, one line of JSON each.
 
 It lies beside the map. A studio that was killed replays it. Before the map is written, the journal
-says which content the file is about to have: whichever of the two the file then has, replay
-starts at the right edit.
+gets the digest of its next content: replay starts at the right edit with either content.
 """
 
 import errno
 import fcntl
+import itertools
 import json
 import os
 import time
@@ -24,17 +24,9 @@ _SYNC_INTERVAL_S = 0.5
 
 
 class Journal:
-    """An append-only file that one process at a time has open.
+    """An append-only file that one process at a time has open; it is created where it is missing.
 
-    Parameters
-    ----------
-    path : Path
-        It is created where it is missing.
-
-    Raises
-    ------
-    DatasetError
-        Another studio has it open, or it cannot be written.
+    DatasetError: another studio has it open, or it cannot be written.
     """
 
     def __init__(self, path: Path):
@@ -51,12 +43,11 @@ class Journal:
                                'folder of the map writable') from error
 
     def read(self) -> list[dict[str, Any]]:
-        """Return the entries, and cut off what follows the last valid one.
+        """Return the entries, and cut off the rest after the last valid one.
 
         A kill leaves half a line. Anything more is copied to another file first.
         """
-        self._file.seek(0)
-        content = self._file.readall()
+        content = self._content()
         entries: list[dict[str, Any]] = []
         end = 0
         for line in content.split(b'\n')[:-1]:
@@ -76,10 +67,7 @@ class Journal:
     def append(self, entry: dict[str, Any]) -> None:
         """Add an entry; it is on the disk after at most half a second of further edits.
 
-        Raises
-        ------
-        DatasetError
-            The disk is full or gone. The entry is not there.
+        DatasetError: the disk is full or gone, and the entry is not there.
         """
         line = json.dumps(entry).encode() + b'\n'
         end = self._file.seek(0, os.SEEK_END)
@@ -97,13 +85,7 @@ class Journal:
                                'room and repeat it') from error
 
     def restart(self, entries: Sequence[dict[str, Any]]) -> None:
-        """Replace all entries.
-
-        Raises
-        ------
-        DatasetError
-            The disk is full or gone.
-        """
+        """Replace all entries; DatasetError: the disk is full or gone."""
         try:
             self._file.truncate(0)
         except OSError as error:
@@ -113,19 +95,22 @@ class Journal:
 
     def set_aside(self) -> Path:
         """Copy the entries to another file, which is never overwritten; return its path."""
-        self._file.seek(0)
-        content = self._file.readall()
-        number = 1
-        while True:
+        content = self._content()
+        for number in itertools.count(1):
             path = self.path.with_name(f'{self.path.name}.{number}')
             try:
                 with path.open('xb') as file:
                     file.write(content)
-                return path
+                break
             except FileExistsError:
-                number += 1
+                pass
             except OSError as error:
                 raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
+        return path
+
+    def _content(self) -> bytes:
+        self._file.seek(0)
+        return self._file.readall()
 
     def close(self) -> None:
         """Close the file; it stays."""

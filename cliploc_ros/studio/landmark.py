@@ -1,13 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One landmark as the studio holds it: the fields of the map file, unknown ones included.
+"""One landmark as the studio holds it: its fields of the map file, and its look.
 
 The relocalizer refuses a map with unknown fields, since a misspelled field would be silently
 without effect. The studio opens such a map, keeps these fields, and says that they are refused.
+
+A look is what an image encoder saw of a landmark. It is a part of the landmark, so it follows its
+landmark through merge, split, delete, undo and redo.
 """
 
+import base64
+import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -17,15 +22,100 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.studio.looks import Look
+from cliploc_ros.mapping.labelling import choose_medoids, embed_landmarks
+from cliploc_ros.mapping.posed_detections import PosedDetections
 
-REQUIRED_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
-KNOWN_FIELDS = REQUIRED_FIELDS + OPTIONAL_FIELDS
+KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
 #: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
 DECIMALS = 6
-#: Limits of a semi-axis that an edit may set [m]; the file format allows more.
+#: The least semi-axis that an edit may set [m]; the file format allows less.
 LEAST_SEMI_AXIS_M = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What an image encoder saw of one landmark.
+
+    Parameters
+    ----------
+    mean : ndarray (d,) float16
+        The mean direction of its crops, of unit length.
+    medoids : ndarray (m, d) float16
+        Crops that stand for all of its crops, unit rows; at most five.
+    encoder_key : str
+    """
+
+    mean: NDArray[np.float16]
+    medoids: NDArray[np.float16]
+    encoder_key: str
+
+    @cached_property
+    def key(self) -> str:
+        """The digest that tells one look from another."""
+        content = self.encoder_key.encode() + self.mean.tobytes() + self.medoids.tobytes()
+        return hashlib.sha256(content).hexdigest()[:24]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the look as JSON holds it."""
+        return {'look': self.key, 'encoder': self.encoder_key,
+                'mean': base64.b64encode(self.mean.tobytes()).decode(),
+                'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
+
+
+def look_from_json(tree: Mapping[str, Any]) -> Look | None:
+    """Return a look from JSON; None where it is damaged."""
+    try:
+        mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
+                         for name in ('mean', 'medoids'))
+        look = Look(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
+    except (KeyError, TypeError, ValueError):
+        return None
+    return look if look.key == tree.get('look') else None
+
+
+def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look | None:
+    """Return the look of one landmark that several become; None where no look is known.
+
+    The weights are, for example, the numbers of boxes. Looks of another encoder than the first
+    one's do not count.
+    """
+    known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
+             if look is not None]
+    known = [(look, weight) for look, weight in known
+             if (look.encoder_key, len(look.mean)) == (known[0][0].encoder_key,
+                                                       len(known[0][0].mean))]
+    if len(known) < 2:
+        return known[0][0] if known else None
+    mean = np.sum([weight * look.mean.astype(np.float32) for look, weight in known], axis=0)
+    length = float(np.linalg.norm(mean))
+    if not length > 0.0:
+        return None
+    crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
+    shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
+                             for look, weight in known])
+    return Look((mean / length).astype(np.float16),
+                crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
+
+
+def look_of_boxes(detections: PosedDetections, rows: NDArray[np.int64]) -> Look | None:
+    """Return the look of the objects in some boxes of a recording; None without embeddings."""
+    if detections.embeddings is None or not len(rows):
+        return None
+    shown = np.full(len(detections.classes), -1, dtype=np.int64)
+    shown[rows] = 0
+    return looks_of(embed_landmarks([''], detections, shown)).get('')
+
+
+def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
+    """Return the known looks by id of the landmark."""
+    offsets = embeddings.medoid_offsets
+    return {landmark_id: Look(embeddings.means[row],
+                              embeddings.medoids[offsets[row]:offsets[row + 1]],
+                              embeddings.encoder_key)
+            for row, landmark_id in enumerate(embeddings.landmark_ids)
+            if embeddings.is_known[row]}
 
 
 @dataclass(frozen=True)
@@ -39,7 +129,7 @@ class Landmark:
     is_locked : bool
         Edits are refused. The map file does not hold it.
     look : Look, optional
-        What an image encoder saw of it, from the file next to the map.
+        From the file next to the map.
     """
 
     fields: Mapping[str, Any]
@@ -48,51 +138,46 @@ class Landmark:
 
     @cached_property
     def details(self) -> LandmarkDetails:
-        """Return the optional fields."""
+        """The optional fields."""
         return read_details(self.fields, 'landmark')
 
     @property
     def label(self) -> str:
-        """Return the label; of several, the one with the greatest weight."""
+        """The label; of several, the one with the greatest weight."""
         if 'label' in self.fields:
             return str(self.fields['label'])
         return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]
 
     @property
     def class_id(self) -> str:
-        """Return the detector class."""
+        """The detector class."""
         return str(self.fields['class_id'])
 
     @cached_property
     def center(self) -> NDArray[np.float64]:
-        """Return the centre (3,) [m]."""
-        return _fixed(np.array(self.fields['center'], dtype=np.float64))
+        """The centre (3,) [m]."""
+        return _read_only(np.array(self.fields['center'], dtype=np.float64))
 
     @cached_property
     def semi_axes(self) -> NDArray[np.float64]:
-        """Return the semi-axes (3,) [m]."""
-        return _fixed(np.array(self.fields['semi_axes'], dtype=np.float64))
+        """The semi-axes (3,) [m]."""
+        return _read_only(np.array(self.fields['semi_axes'], dtype=np.float64))
 
     @cached_property
     def quat_xyzw(self) -> NDArray[np.float64]:
-        """Return the unit quaternion (4,) from landmark axes to map axes."""
+        """The unit quaternion (4,) from landmark axes to map axes."""
         quat_xyzw = np.array(self.fields['orientation'], dtype=np.float64)
-        return _fixed(quat_xyzw / np.linalg.norm(quat_xyzw))
+        return _read_only(quat_xyzw / np.linalg.norm(quat_xyzw))
 
     @property
     def basis(self) -> NDArray[np.float64]:
-        """Return the basis (3, 3), whose columns are the semi-axes in the map [m]."""
+        """The basis (3, 3), whose columns are the semi-axes in the map [m]."""
         return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
 
     @property
     def volume(self) -> float:
-        """Return the volume [m^3]."""
+        """The volume [m^3]."""
         return float(4.0 / 3.0 * math.pi * self.semi_axes.prod())
-
-    @property
-    def unknown_fields(self) -> tuple[str, ...]:
-        """Return the fields that the relocalizer refuses."""
-        return tuple(name for name in self.fields if name not in KNOWN_FIELDS)
 
     def changed(self, **fields: Any) -> 'Landmark':
         """Return the landmark with other values; a field that is None is left out."""
@@ -101,20 +186,9 @@ class Landmark:
                                      if value is not None or name not in fields})
 
 
-def _fixed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
     values.setflags(write=False)
     return values
-
-
-def check_landmark(landmark_id: str, landmark: Landmark, source: str) -> None:
-    """Refuse a landmark that no map may hold, unknown fields excepted.
-
-    Raises
-    ------
-    MapError
-        Names the source, the landmark and the field.
-    """
-    map_of({landmark_id: landmark}, 'map', source)
 
 
 def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> LandmarkMap:
@@ -123,7 +197,7 @@ def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> Lan
     Raises
     ------
     MapError
-        There are none, or one is invalid.
+        There are none, or one is invalid. Names the source, the landmark and the field.
     """
     known = {landmark_id: {name: value for name, value in one.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}
@@ -136,19 +210,15 @@ def rounded(values: Iterable[float]) -> list[float]:
 
 
 def shape_fields(center: NDArray[np.float64], basis: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the fields of an ellipsoid.
+    """Return the fields of an ellipsoid with a centre (3,) and a basis (3, 3) in the map.
 
-    Parameters
-    ----------
-    center, basis : ndarray (3,), (3, 3)
-        In the map; the basis' columns are orthogonal semi-axes [m].
+    The basis' columns are orthogonal semi-axes [m].
     """
-    lengths = np.maximum(np.linalg.norm(basis, axis=0), LEAST_SEMI_AXIS_M)
-    rotation = basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-12)
+    lengths = np.linalg.norm(basis, axis=0)
+    rotation = basis / np.maximum(lengths, 1e-12)
     if np.linalg.det(rotation) < 0.0:
         rotation = rotation * (1.0, 1.0, -1.0)
-    quat_xyzw = Rotation.from_matrix(rotation).as_quat()
-    if quat_xyzw[3] < 0.0:
-        quat_xyzw = -quat_xyzw
-    return {'center': rounded(center), 'semi_axes': rounded(lengths),
+    quat_xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return {'center': rounded(center),
+            'semi_axes': rounded(np.maximum(lengths, LEAST_SEMI_AXIS_M)),
             'orientation': rounded(quat_xyzw)}

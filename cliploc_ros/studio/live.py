@@ -65,20 +65,11 @@ class LivePose(NamedTuple):
 
 
 class LiveState(NamedTuple):
-    """What is known of the running relocalizer.
+    """The last reports of the running relocalizer.
 
-    Parameters
-    ----------
-    is_heard : bool
-        It reported within the last seconds.
-    pose : LivePose, optional
-        The last one that it accepted.
-    verdict : str
-        Its last answer in one line; '' before the first.
-    lifecycle, map_text, map_file, base_frame : str
-        Of its diagnostics; '' where they say nothing.
-    is_busy : bool
-        A request of this studio waits for its answer.
+    ``is_heard``: it reported within the last seconds. ``pose``: the last accepted one.
+    ``verdict``: its last answer in one line. ``is_busy``: a request of this studio waits for its
+    answer. The others are of its diagnostics; '' where they say nothing.
     """
 
     is_heard: bool = False
@@ -92,19 +83,12 @@ class LiveState(NamedTuple):
 
     @property
     def is_current(self) -> bool:
-        """Return whether the pose is the last answer, and its node still reports."""
+        """Whether the pose is the last answer, and its node still reports."""
         return self.is_heard and self.verdict.startswith(('accepted', 'withheld'))
 
 
 class LiveRelocalizer:
-    """A client of the running relocalizer.
-
-    Parameters
-    ----------
-    node : Node
-    name : str
-        The relocalizer's name with its namespace: '/relocalizer'.
-    """
+    """A client of the running relocalizer, whose name has its namespace: '/relocalizer'."""
 
     def __init__(self, node: Node, name: str):
         self.name, self._node = name, node
@@ -126,10 +110,7 @@ class LiveRelocalizer:
     def relocalize(self) -> str:
         """Request a relocalization; return the answer.
 
-        Raises
-        ------
-        LiveError
-            There is no relocalizer, it fails or ends, or another request waits.
+        LiveError: there is no relocalizer, it fails or ends, or another request waits.
         """
         answer = self._request(self._relocalize)
         self._change(verdict=answer.message)
@@ -138,12 +119,9 @@ class LiveRelocalizer:
         raise LiveError(f'the relocalizer gave no answer: {answer.message}')
 
     def reload_map(self) -> str:
-        """Let the relocalizer read its map file again; return what it loaded.
+        """Let the relocalizer read its map file again; return its report.
 
-        Raises
-        ------
-        LiveError
-            As above, or the map is invalid: the relocalizer keeps its old one.
+        LiveError: as above, or the map is invalid, and the relocalizer keeps its old one.
         """
         answer = self._request(self._reload)
         if answer.success:
@@ -161,32 +139,27 @@ class LiveRelocalizer:
         if self._turn.acquire(timeout=_GRACE_S):
             self._turn.release()
 
-    # ---- requests -------------------------------------------------------------------------------
-
     def _request(self, client: Any) -> Any:
+        """Call a service and wait for its answer, as long as the relocalizer is alive."""
         if not self._turn.acquire(blocking=False):
             raise LiveError('a request waits for its answer: repeat yours after it')
         try:
             if not client.service_is_ready():
                 raise LiveError(self._absent())
             self._change(is_busy=True)
-            return self._call(client)
+            answered, begin = threading.Event(), time.monotonic()
+            future = client.call_async(Trigger.Request())
+            future.add_done_callback(lambda _: answered.set())
+            try:
+                while not answered.wait(_POLL_S):
+                    self._check_alive(client, begin)
+            finally:
+                if not future.done():
+                    client.remove_pending_request(future)
+            return future.result()
         finally:
             self._change(is_busy=False)
             self._turn.release()
-
-    def _call(self, client: Any) -> Any:
-        answered = threading.Event()
-        begin = time.monotonic()
-        future = client.call_async(Trigger.Request())
-        future.add_done_callback(lambda _: answered.set())
-        try:
-            while not answered.wait(_POLL_S):
-                self._check_alive(client, begin)
-        finally:
-            if not future.done():
-                client.remove_pending_request(future)
-        return future.result()
 
     def _check_alive(self, client: Any, begin: float) -> None:
         now = time.monotonic()
@@ -208,8 +181,6 @@ class LiveRelocalizer:
         return (f'no relocalizer found at {self.name}: start it with ros2 run cliploc_ros '
                 'relocalizer --ros-args -p map_file:=MAP, in the ROS domain of the studio'
                 f'{known}')
-
-    # ---- what it says ---------------------------------------------------------------------------
 
     def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
@@ -251,12 +222,7 @@ class LiveRelocalizer:
 def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[LiveRelocalizer]:
     """Follow the running relocalizer in a thread for as long as the block lasts.
 
-    Parameters
-    ----------
-    name : str
-        Of the relocalizer, with its namespace.
-    ros_args : sequence of str
-        '--ros-args' and what follows.
+    ``ros_args`` are '--ros-args' and the arguments after it.
 
     Raises
     ------

@@ -35,32 +35,25 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Which phrases describe a landmark.
-
-    Parameters
-    ----------
-    landmark_id : str
-    landmarks : mapping of str to Landmark
-        Of the whole map.
-    """
+    """Which phrases describe a landmark? The landmarks are those of the whole map."""
 
     landmark_id: str
     landmarks: Mapping[str, Landmark]
 
     @property
     def landmark(self) -> Landmark:
-        """Return the landmark in question."""
+        """The landmark in question."""
         return self.landmarks[self.landmark_id]
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Return all classes that the landmark was detected as."""
+        """All classes that the landmark was detected as."""
         weights = self.landmark.details.class_weights or ()
         return tuple(dict.fromkeys([self.landmark.class_id, *(name for name, _ in weights)]))
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return what the answer depends on. Dragging a landmark asks nothing new."""
+        """What the answer depends on; a drag changes none of it."""
         look = self.landmark.look
         return self.landmark_id, self.class_names, None if look is None else look.key
 
@@ -72,24 +65,13 @@ class FoundPhrases(NamedTuple):
     note: str
 
 
-def _nothing(reason: object) -> FoundPhrases:
-    return FoundPhrases((), f'CLIP offers no phrases: {reason}')
-
-
 _PENDING = FoundPhrases((), 'CLIP looks for phrases; the map offers its own until then')
 
 
 class PhraseFinder:
     """Answers questions one at a time.
 
-    Parameters
-    ----------
-    clip : ClipOptions
-    vocabulary : Vocabulary
-    recording : Recording, optional
-        Its embeddings or views show what landmarks without a look are.
-    images : Images, optional
-        Of the recording.
+    Landmarks without a look are looked at in the recording: in its embeddings, or its images.
     """
 
     def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None,
@@ -137,10 +119,11 @@ class PhraseFinder:
             try:
                 found = self._find(question)
             except CliplocError as error:
-                found = _nothing(error)
+                found = FoundPhrases((), f'CLIP offers no phrases: {error}')
             except Exception as error:  # of torch, open_clip: the page shows it and goes on
                 logger.exception('CLIP finds no phrases for %s', question.landmark_id)
-                found = _nothing(f'{type(error).__name__}: {error}')
+                found = FoundPhrases((), f'CLIP offers no phrases: {type(error).__name__}: '
+                                     f'{error}')
             with self._condition:
                 if len(self._answers) >= _MOST_KEPT:
                     self._answers.clear()
@@ -160,7 +143,8 @@ class PhraseFinder:
             self._weights = resolve_clip_weights(self._clip)
         mean = self._mean(question, self._weights)
         if mean is None:
-            return _nothing('neither embeddings nor images show all of this landmark')
+            return FoundPhrases((), 'CLIP offers no phrases: neither embeddings nor images show '
+                                'all of this landmark')
         names = question.class_names
         phrases = phrases_of_classes(
             self._weights, self._clip,
@@ -175,23 +159,19 @@ class PhraseFinder:
         if look is not None and look.encoder_key != weights.key:
             look = None
         if look is None and self._recording is not None:
-            rows = self._recording.boxes_of(question.landmarks)[question.landmark_id]
-            look = self._recording.look_of(rows, weights.key)
+            boxes = self._recording.boxes_of(question.landmarks)[question.landmark_id]
+            look = self._recording.look_of(boxes, weights.key)
         if look is not None and len(look.mean) == weights.embed_dim:
             return look.mean.astype(np.float32)
-        return self._mean_of_crops(question.landmark, weights)
-
-    def _mean_of_crops(self, landmark: Landmark, weights: ClipWeights
-                       ) -> NDArray[np.float32] | None:
         if self._recording is None or self._images is None:
             return None
-        rows = []
-        for view, box in self._recording.best_views(landmark)[:_CROPS]:
+        embeddings = []
+        for view, box in self._recording.best_views(question.landmark)[:_CROPS]:
             image = self._images.near(float(self._recording.detections.stamps_s[view]))
             if image is not None:
                 if self._encoder is None:
                     self._encoder = ClipEncoder(weights, self._clip)
-                rows.append(self._encoder.encode_crops(image, box[None])[0])
-        mean = np.sum(rows, axis=0)
+                embeddings.append(self._encoder.encode_crops(image, box[None])[0])
+        mean = np.sum(embeddings, axis=0)
         length = float(np.linalg.norm(mean))
         return np.asarray(mean / length, dtype=np.float32) if length > 0.0 else None

@@ -8,9 +8,9 @@ those that were tried lie all over the map.
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,12 +28,11 @@ from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
 from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, each_pose
 from cliploc_ros.mapping.checking.report import GridCheck
-from cliploc_ros.studio.changes import EditError, Landmarks
+from cliploc_ros.studio.document import fields_of
+from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
-
-if TYPE_CHECKING:
-    from cliploc_ros.studio.studio import Studio
+from cliploc_ros.studio.studio import Studio
 
 #: No position is begun after this [s].
 LIMIT_S = 60.0
@@ -41,7 +40,7 @@ _OPTIONS = CheckOptions(max_positions=100, headings=8)
 
 
 class Places(NamedTuple):
-    """What was found in a map.
+    """The coverage and the look-alikes of a map.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ class Places(NamedTuple):
         Of the tried positions.
     look_alikes : tuple of LookAlike
     detector : str
-        Where the detector's errors are from.
+        The source of the detector's errors, in words.
     """
 
     landmarks: Landmarks
@@ -64,7 +63,7 @@ class Places(NamedTuple):
 
     @property
     def figures(self) -> dict[str, str]:
-        """Return the figures by name."""
+        """The figures by name."""
         count, verdicts = len(self.check.positions), count_verdicts(self.check.trials)
         views = len(self.check.trials)
         return {'positions with an accepted heading':
@@ -83,30 +82,22 @@ class Places(NamedTuple):
         return [*lines, f'{self.detector}; similarities are simulated']
 
 
-class StoppedError(CliplocError):
-    """The person stopped it."""
-
-
 def find_places(landmarks: Landmarks, recording: Recording | None, before: Places | None,
                 tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Places:
-    """Return what a robot may expect in a map.
+    """Return the places of a map where a robot would be accepted, refused or misled.
 
     Parameters
     ----------
     landmarks : mapping of str to Landmark
+        One at least, or else MapError is raised.
     recording : Recording, optional
         Gives the camera's height and the detector's errors.
     before : Places, optional
         Its positions are tried again where they suit, so that only edits change the figures.
     tell : callable
-        Told the share that is done; what it raises ends the search.
+        Called with the share that is done; an error that it raises ends the search.
     limit_s : float
         No position is begun after this [s].
-
-    Raises
-    ------
-    MapError
-        There are no landmarks.
     """
     tell(0.0)
     landmark_map = map_of(landmarks, 'map', 'studio')
@@ -145,60 +136,45 @@ def _detector(landmark_map: LandmarkMap, recording: Recording | None
 
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Places | None) -> Grid:
-    """Return positions all over the map, those of the time before if they cover it as well."""
+    """Return positions all over the map, those of the time before if their corners agree."""
     poses = None if recording is None else recording.detections.map_from_camera
     grid = make_grid(landmark_map, poses, _OPTIONS)
-    if before is not None and _extent_differs(grid, before.grid) <= grid.spacing_m:
-        return before.grid
+    if before is not None and len(grid.positions) and len(before.grid.positions):
+        offset_m = max(np.abs(corner(grid.positions, axis=0)
+                              - corner(before.grid.positions, axis=0)).max()
+                       for corner in (np.min, np.max))
+        if offset_m <= grid.spacing_m:
+            return before.grid
     order = np.random.default_rng(_OPTIONS.random_seed).permutation(len(grid.positions))
     by_position = grid.poses.reshape(len(order), _OPTIONS.headings, 4, 4)
     return Grid(grid.positions[order], grid.is_near[order],
                 by_position[order].reshape(-1, 4, 4), grid.spacing_m)
 
 
-def _extent_differs(grid: Grid, other: Grid) -> float:
-    """Return by how much the corners of two grids differ [m]."""
-    if not len(grid.positions) or not len(other.positions):
-        return np.inf
-    return float(max(np.abs(one(grid.positions, axis=0) - one(other.positions, axis=0)).max()
-                     for one in (np.min, np.max)))
-
-
 class PlacesSearch:
     """A search in a thread of its own, one at a time.
 
-    Parameters
-    ----------
-    studio : Studio
-    on_change : callable
-        Called in any thread when there is something new to show.
+    ``on_change`` is called in any thread when there is something new to show.
     """
 
-    def __init__(self, studio: 'Studio', on_change: Callable[[], None]):
+    def __init__(self, studio: Studio, on_change: Callable[[], None]):
         self._studio, self._on_change = studio, on_change
         self._thread: threading.Thread | None = None
         self._stopped = threading.Event()
         self._lock = threading.Lock()
         self.share = 0.0
-        #: The last two results, the older one first.
+        # the last two results, and why the last search found nothing
         self.before: Places | None = None
         self.last: Places | None = None
-        #: Why the last search found nothing.
         self.failure = ''
 
     @property
     def is_running(self) -> bool:
-        """Return whether a search is under way."""
+        """Whether a search is under way."""
         return self._thread is not None and self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin a search in the map as it is now.
-
-        Raises
-        ------
-        EditError
-            One is under way, or the map is empty.
-        """
+        """Begin a search in the map as it is; EditError: one is under way, or the map is empty."""
         with self._lock:
             if self.is_running:
                 raise EditError('a search of places is under way: wait for it, or stop it')
@@ -223,7 +199,7 @@ class PlacesSearch:
         """Return whether the map was edited since the last result."""
         last, landmarks = self.last, self._studio.document.landmarks
         return last is not None and last.landmarks is not landmarks \
-            and _fields(last.landmarks) != _fields(landmarks)
+            and fields_of(last.landmarks) != fields_of(landmarks)
 
     def _run(self, landmarks: Landmarks) -> None:
         try:
@@ -240,11 +216,8 @@ class PlacesSearch:
 
     def _tell(self, share: float) -> None:
         if self._stopped.is_set():
-            raise StoppedError('stopped')
+            raise CliplocError('stopped')
         if share - self.share >= 0.01:
             self.share = share
             self._on_change()
 
-
-def _fields(landmarks: Landmarks) -> dict[str, Mapping[str, object]]:
-    return {key: one.fields for key, one in landmarks.items()}

@@ -1,43 +1,83 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the studio knows of a recording: boxes and poses, and what they say of landmarks."""
+"""What a recording says of landmarks: its boxes, boxes that a person drew, and relocalizations.
 
-from collections.abc import Iterable, Mapping
+Relocalizations have the recording's boxes and poses. Similarities are simulated, as check_map does
+it. The views are not held out: a landmark that was fitted to them fits them better than new
+images.
+"""
+
+from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.checking.label_model import LabelModel
 from cliploc_ros.mapping.checking.landmark_faults import (
     LandmarkCheck,
     check_landmarks,
     find_map_overlaps,
     hear_witness,
 )
+from cliploc_ros.mapping.evidence import widest_angle_deg
 from cliploc_ros.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.mapping.landmarks import group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.refit import RefitMap, refit_map
-from cliploc_ros.mapping.views import Views, make_views
-from cliploc_ros.studio.changes import EditError
-from cliploc_ros.studio.landmark import Landmark, map_of
-from cliploc_ros.studio.looks import Look, look_of_boxes
-from cliploc_ros.studio.picture import project
+from cliploc_ros.mapping.views import Views, camera_centers, make_views
+from cliploc_ros.studio.edits import EditError, Landmarks
+from cliploc_ros.studio.images import outlines_of
+from cliploc_ros.studio.landmark import Landmark, Look, look_of_boxes, map_of
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
+#: Views nearer to one another leave the distance of the object open.
+LEAST_ANGLE_DEG = 25.0
+MIN_BOX_PX = 4.0
+_STRETCH = 2.0
+#: An accepted pose farther off than this is wrong [m].
+WRONG_M = 1.0
+
+
+class Answer(NamedTuple):
+    """The relocalizer's answer in one view; the errors are of the best pose, accepted or not."""
+
+    view: int
+    verdict: Literal['accepted', 'refused', 'wrong']
+    error_m: float | None
+    error_deg: float | None
+    result: Relocalization
+
+    def text(self, landmark_map: LandmarkMap) -> str:
+        """Return the answer in one line."""
+        result = self.result
+        found = ', '.join(landmark_map.landmark_ids[match.landmark] for match in result.matches)
+        parts = [f'view {self.view}: {self.verdict}']
+        if result.reason:
+            parts.append(result.reason)
+        if self.error_m is not None and self.error_deg is not None:
+            parts.append(f'pose off by {self.error_m:.2f} m, {self.error_deg:.1f} degrees')
+        parts.append(f'confidence {result.confidence:.2f}, {len(result.matches)} inliers'
+                     + (f' ({found})' if found else ''))
+        parts.append(f'{max(0, len(result.hypotheses) - 1)} rivals; similarities are simulated')
+        return '; '.join(parts)
 
 
 class Recording:
-    """Boxes and poses of a recording of the mapped place.
-
-    Parameters
-    ----------
-    detections : PosedDetections
-    """
+    """Boxes and poses of a recording of the mapped place."""
 
     def __init__(self, detections: PosedDetections):
         self.detections = detections
@@ -45,10 +85,10 @@ class Recording:
 
     @cached_property
     def views(self) -> Views:
-        """Return what the kernels of mapping read."""
+        """The arrays that the kernels of mapping read."""
         return make_views(self.detections, self.options)
 
-    def boxes_of(self, landmarks: Mapping[str, Landmark]) -> dict[str, NDArray[np.int64]]:
+    def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
         """Return the boxes that show each landmark; a box shows one at most."""
         if not landmarks:
             return {}
@@ -61,7 +101,7 @@ class Recording:
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Look | None:
-        """Return what an encoder saw in some boxes; None where this recording does not know it."""
+        """Return the look that an encoder has of some boxes; None where it saw none of them."""
         if self.detections.encoder_key != encoder_key:
             return None
         return look_of_boxes(self.detections, rows)
@@ -69,50 +109,160 @@ class Recording:
     def best_views(self, landmark: Landmark) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the views that show all of a landmark, and the box (4,) there; largest first."""
         camera = self.detections.camera
-        size = np.array([camera.width, camera.height], dtype=np.float64)
         found = []
         for view, pose in enumerate(self.detections.map_from_camera):
-            for one in project({'': landmark}, camera, pose):
+            for one in outlines_of({'': landmark}, camera, pose):
                 half = np.sqrt(one.ellipse[[2, 4]])
                 box = np.concatenate([one.ellipse[:2] - half, one.ellipse[:2] + half])
-                if box.min() >= 0.0 and (box[2:] <= size).all():
+                if box.min() >= 0.0 and (box[2:] <= (camera.width, camera.height)).all():
                     found.append((view, box))
         return sorted(found, key=lambda pair: -float((pair[1][2:] - pair[1][:2]).prod()))
 
-    def refit(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str]) -> RefitMap:
-        """Fit some of the landmarks to their boxes.
+    def refit(self, landmarks: Landmarks, landmark_ids: Iterable[str]) -> RefitMap:
+        """Fit some of the landmarks to their boxes; MappingError where none can be fitted.
 
         The others keep their boxes, so that none takes those of its neighbour.
-
-        Raises
-        ------
-        MappingError
-            None can be fitted.
         """
         chosen = set(landmark_ids)
         return refit_map(self.detections, map_of(landmarks, 'map', 'studio'),
                          np.array([key in chosen for key in landmarks]), self.options)
 
-    def fit_together(self, landmarks: Mapping[str, Landmark], landmark_ids: Iterable[str],
-                     center: NDArray[np.float64], basis: NDArray[np.float64]) -> Fit:
+    def fit_together(self, landmarks: Landmarks, landmark_ids: Iterable[str],
+                     center: NDArray[np.float64], basis: NDArray[np.float64]) -> Fit | None:
         """Return one ellipsoid fitted to the boxes of several landmarks, from a start.
 
-        Raises
-        ------
-        EditError
-            They have too few boxes.
+        None where they have too few boxes.
         """
         boxes = self.boxes_of(landmarks)
         rows = np.unique(np.concatenate([boxes[key] for key in landmark_ids]))
-        if len(rows) < LEAST_BOXES:
-            raise EditError(f'merge: {len(rows)} boxes show these landmarks, {LEAST_BOXES} are '
-                            'needed for a fit')
-        return fit_ellipsoid(self.views, rows, center, basis)
+        return fit_ellipsoid(self.views, rows, center, basis) if len(rows) >= LEAST_BOXES else None
 
-    def check(self, landmarks: Mapping[str, Landmark]) -> list[LandmarkCheck]:
+    def check(self, landmarks: Landmarks) -> list[LandmarkCheck]:
         """Return the check of each landmark, the worst first."""
         landmark_map = map_of(landmarks, 'map', 'studio')
         witness = hear_witness(self.views, landmark_map, self.detections.class_names,
                                self.options)
         overlaps = find_map_overlaps(landmark_map, witness, self.views)
         return check_landmarks(landmark_map, witness, overlaps, self.options)
+
+    def relocalize(self, landmarks: Landmarks, views: Sequence[int]) -> list[Answer]:
+        """Return the relocalizer's answers in some views; MapError without landmarks.
+
+        An accepted pose that is off by more than a metre is wrong.
+        """
+        landmark_map = map_of(landmarks, 'map', 'studio')
+        relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
+            k=min(RelocalizerOptions().k, len(landmark_map))))
+        labels, detections = LabelModel.of(landmark_map), self.detections
+        shown = np.full(len(detections.classes), -1, dtype=np.int64)
+        for landmark, box_rows in enumerate(self.boxes_of(landmarks).values()):
+            shown[box_rows] = landmark
+        answers = []
+        for view in views:
+            rows = slice(*detections.frame_offsets[view:view + 2])
+            class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
+            boxes = detections.bboxes_xyxy[rows]
+            # equal noise each time, so that only edits change the answer
+            similarities = labels.similarities(shown[rows], class_ids, boxes,
+                                               np.random.default_rng([0, view]))
+            result = relocalizer.relocalize([Observation(
+                detections.camera, Detections(boxes, class_ids, detections.scores[rows]),
+                similarities)])
+            if result.map_from_camera is None:
+                answers.append(Answer(view, 'refused', None, None, result))
+                continue
+            error_m, error_deg = pose_error(result.map_from_camera,
+                                            detections.map_from_camera[view])
+            answers.append(Answer(view, 'refused' if not result.accepted else
+                                  'wrong' if error_m > WRONG_M else 'accepted',
+                                  error_m, error_deg, result))
+        return answers
+
+
+# ---- a landmark from boxes that a person drew ---------------------------------------------------
+
+class DrawnBox(NamedTuple):
+    """A box in an undistorted image [px], and the pose (4, 4) of this image."""
+
+    map_from_camera: NDArray[np.float64]
+    bbox_xyxy: tuple[float, float, float, float]
+
+
+class BoxFit(NamedTuple):
+    """An ellipsoid that fits drawn boxes.
+
+    Parameters
+    ----------
+    center, basis : ndarray (3,), (3, 3)
+        The basis' columns are the semi-axes [m].
+    warning : str
+        What is doubtful about it; empty if nothing is.
+    """
+
+    center: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    warning: str
+
+
+def fit_boxes(camera: Camera, boxes: Sequence[DrawnBox]) -> BoxFit:
+    """Return the ellipsoid that fits boxes of one object.
+
+    Raises
+    ------
+    EditError
+        There are fewer than two boxes, one is too small, or their rays do not meet in front of
+        the cameras.
+    """
+    if len(boxes) < 2:
+        raise EditError(f'create: {len(boxes)} boxes drawn; draw one in each of two images or '
+                        'more, best three')
+    for box in boxes:
+        left, top, right, bottom = box.bbox_xyxy
+        if not (right - left >= MIN_BOX_PX and bottom - top >= MIN_BOX_PX):
+            raise EditError(f'create: the box {box.bbox_xyxy} is smaller than {MIN_BOX_PX:g} '
+                            'pixels; draw it around the whole object')
+    count = len(boxes)
+    views = make_views(PosedDetections(
+        camera=camera, map_from_camera=np.array([box.map_from_camera for box in boxes]),
+        stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
+        bboxes_xyxy=np.array([box.bbox_xyxy for box in boxes], dtype=np.float64),
+        class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
+        scores=np.ones(count)), MappingOptions())
+    # each box was drawn for itself: none shares the error of a detector that stood still
+    views = views._replace(weights=np.ones(count))
+    origins = camera_centers(views, np.arange(count))
+    start, radius = _meeting_point(views, origins)
+    # a sphere, one stretched along each axis of the map, and one along a diagonal
+    sphere = radius * np.eye(3)
+    bases = [sphere, *(sphere * np.where(np.arange(3) == axis, _STRETCH, 1.0 / np.sqrt(_STRETCH))
+                       for axis in range(3)),
+             Rotation.from_euler('z', 45, degrees=True).as_matrix()
+             @ (sphere * (_STRETCH, 1.0 / _STRETCH, 1.0))]
+    fit = min((fit_ellipsoid(views, np.arange(count), start, basis) for basis in bases),
+              key=lambda one: one.cost)
+    offsets = fit.center - origins
+    angle_deg = widest_angle_deg(offsets / np.linalg.norm(offsets, axis=1, keepdims=True))
+    return BoxFit(fit.center, fit.basis, '' if angle_deg >= LEAST_ANGLE_DEG else (
+        f'the views are only {angle_deg:.0f} degrees apart, expected {LEAST_ANGLE_DEG:.0f} or '
+        'more: distance and depth are uncertain; draw a box in a view from another side'))
+
+
+def _meeting_point(views: Views, origins: NDArray[np.float64]
+                   ) -> tuple[NDArray[np.float64], float]:
+    """Return the point nearest to the rays of all boxes' centres, and the radius they suggest."""
+    middles = 0.5 * (views.edges[:, :2] + views.edges[:, 2:])
+    rays = np.column_stack([middles, np.ones(len(middles))])
+    rays = np.einsum('fji,fj->fi', views.rotations, rays)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    try:
+        point = np.linalg.solve(across.sum(axis=0), np.einsum('fij,fj->i', across, origins))
+    except np.linalg.LinAlgError:
+        raise EditError('create: the views look along one line; draw a box in a view from '
+                        'another side') from None
+    depths = np.einsum('fij,j->fi', views.rotations, point)[:, 2] + views.translations[:, 2]
+    if not depths.min() > 0.05:
+        raise EditError('create: the boxes do not show one object: their rays meet behind a '
+                        'camera; draw the same object in all views')
+    extents = views.edges[:, 2:] - views.edges[:, :2]
+    return point, float(np.median(0.5 * np.sqrt(extents.prod(axis=1)) * depths))

@@ -11,11 +11,13 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera, frusta
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio.edits import Landmarks
 from cliploc_ros.studio.landmark import Landmark
-from cliploc_ros.studio.studio import Studio, color_of
-from cliploc_ros.studio.trials import Answer
+from cliploc_ros.studio.recording import Answer
+from cliploc_ros.studio.studio import color_of
 
 # More labels than these hide the map, and slow the browser down.
 _MAX_LABELS = 150
@@ -24,24 +26,15 @@ _LABEL_M = 0.035
 _MAX_CAMERAS = 1000
 _FRUSTUM_M = 0.08
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
-#: The image of the selected view lies this far in front of its camera [m].
-IMAGE_DEPTH_M = 0.3
-#: Landmarks with their ids.
-Pairs = list[tuple[str, Landmark]]
+# The image of the selected view lies this far in front of its camera [m].
+_IMAGE_DEPTH_M = 0.3
 _SPHERE = trimesh.creation.icosphere(subdivisions=2)
 
 
 class Ellipsoids:
     """Landmarks as one node of many equal spheres, each with its own scale.
 
-    Parameters
-    ----------
-    scene : viser.SceneApi
-    name : str
-        Of the node.
-    on_click : callable
-        Called with the event and the landmark's id.
-    opacity : float, optional
+    A click calls a function with the event and the landmark's id.
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, on_click: Callable[[Any, str], None],
@@ -97,10 +90,9 @@ class Labels:
         self._handles: dict[str, tuple[Landmark, Any]] = {}
         self._count = 0
 
-    def show(self, studio: Studio) -> None:
+    def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
         """Show the labels of all landmarks, or of the selection if there are too many."""
-        landmarks = studio.document.landmarks
-        keys = list(landmarks) if len(landmarks) <= _MAX_LABELS else studio.document.selection
+        keys = list(landmarks) if len(landmarks) <= _MAX_LABELS else selection
         for key in self._handles.keys() - set(keys):
             self._handles.pop(key)[1].remove()
         for key in keys:
@@ -121,23 +113,17 @@ class Labels:
 
 
 class ViewImage:
-    """The picture of the selected view, in the scene in front of its camera.
-
-    Parameters
-    ----------
-    scene : viser.SceneApi
-    camera : Camera
-    """
+    """The picture of the selected view, in the scene in front of its camera."""
 
     def __init__(self, scene: viser.SceneApi, camera: Camera):
         self._camera = camera
         half = (camera.width / 2.0, camera.height / 2.0)
         self._middle = np.array([(half[0] - camera.cx) / camera.fx,
-                                 (half[1] - camera.cy) / camera.fy, 1.0]) * IMAGE_DEPTH_M
+                                 (half[1] - camera.cy) / camera.fy, 1.0]) * _IMAGE_DEPTH_M
         blank = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
         self.handle = scene.add_image(
-            '/view/image', blank, camera.width / camera.fx * IMAGE_DEPTH_M,
-            camera.height / camera.fy * IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
+            '/view/image', blank, camera.width / camera.fx * _IMAGE_DEPTH_M,
+            camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
             receive_shadow=False)
         self.pose = np.eye(4)
 
@@ -155,8 +141,8 @@ class ViewImage:
         first, second = ((np.asarray(point) - self.pose[:3, 3]) @ self.pose[:3, :3]
                          for point in (origin, through))
         step = second - first
-        along = (IMAGE_DEPTH_M - first[2]) / step[2] if abs(step[2]) > 1e-9 else 0.0
-        x, y, _ = (first + along * step) / IMAGE_DEPTH_M
+        along = (_IMAGE_DEPTH_M - first[2]) / step[2] if abs(step[2]) > 1e-9 else 0.0
+        x, y, _ = (first + along * step) / _IMAGE_DEPTH_M
         camera = self._camera
         return np.array([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
 
@@ -217,13 +203,3 @@ def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
     def _(event: Any) -> None:
         if event.instance_index is not None:
             on_click(event, int(shown[event.instance_index]))
-
-
-def selection_parts(studio: Studio) -> tuple[Pairs, Pairs]:
-    """Return the landmarks that are not selected, and those that are."""
-    chosen = set(studio.document.selection)
-    rest: Pairs = []
-    selected: Pairs = []
-    for pair in studio.document.landmarks.items():
-        (selected if pair[0] in chosen else rest).append(pair)
-    return rest, selected

@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The server of the page."""
+"""The server of the page, and who may open it: a check of each request before viser sees it.
+
+viser 1.1 lets everyone in who reaches its port. On the loopback interface these include every
+page that this machine's browsers show, since a browser opens WebSockets to any host. So a request
+needs a loopback name as its host, a WebSocket needs the studio's own page as its origin, and
+beyond the loopback interface each request needs the token that the studio prints.
+"""
 
 import hmac
 import http
@@ -19,18 +25,14 @@ from websockets.http11 import Request, Response
 from cliploc_ros.studio.page import Page
 from cliploc_ros.studio.studio import Studio
 
-LOOPBACK = '127.0.0.1'
-_LOOPBACK_NAMES = (LOOPBACK, 'localhost', '::1')
+if TYPE_CHECKING:
+    from cliploc_ros.studio.live import LiveRelocalizer
+
+_LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 
 
 class Gate:
-    """The check of a server.
-
-    Parameters
-    ----------
-    host : str
-        The address that the server listens at.
-    """
+    """The check of a server that listens at an address."""
 
     def __init__(self, host: str):
         self.is_local = host in _LOOPBACK_NAMES
@@ -38,7 +40,7 @@ class Gate:
 
     @property
     def path(self) -> str:
-        """Return the path of the page: the token, if one is needed."""
+        """The path of the page: the token, if one is needed."""
         return f'/{self.token}/' if self.token else '/'
 
     def admit(self, request: Request) -> str | None:
@@ -83,10 +85,6 @@ class Gate:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-if TYPE_CHECKING:
-    from cliploc_ros.studio.live import LiveRelocalizer
-
-
 class Served(NamedTuple):
     """A server that runs, and the URL to open."""
 
@@ -113,7 +111,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     with gate.guard(), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
         server = viser.ViserServer(host, port, verbose=False)
     # viser would open a tunnel to a server on the Internet for any browser that asks
-    server.request_share_url = _share_nothing  # type: ignore[method-assign]
+    server.request_share_url = lambda *args, **options: None  # type: ignore[method-assign]
     page = Page(studio, server, live)
     try:
         shown_host = f'[{host}]' if ':' in host else host
@@ -121,7 +119,3 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     finally:
         page.stop()
         server.stop()
-
-
-def _share_nothing(*args: Any, **options: Any) -> None:
-    """Refuse to share: no request leaves the machine."""

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a person does in the studio, without the page: views, drawn boxes, and the actions.
+"""The actions of a person in the studio, without the page.
 
-Every action returns a line that says what it did. What it refuses is a CliplocError.
+Every action returns a line that says what it did, or raises a CliplocError.
 """
 
 import zlib
@@ -16,18 +16,30 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.checking.relocalization import sample_frames
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import Images
+from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.images import (
+    Images,
+    Outline,
+    Pixel,
+    box_at,
+    draw,
+    landmark_at,
+    outlines_of,
+)
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
-from cliploc_ros.studio.picture import Outline, Pixel, box_at, draw, landmark_at, project
-from cliploc_ros.studio.recording import LEAST_BOXES, Recording
-from cliploc_ros.studio.trials import Answer, relocalize
+from cliploc_ros.studio.recording import (
+    LEAST_BOXES,
+    MIN_BOX_PX,
+    Answer,
+    DrawnBox,
+    Recording,
+    fit_boxes,
+)
 
 Rgb = tuple[int, int, int]
-# Views of the whole recording that the relocalizer is asked in.
+# Views of the whole recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
 # Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
 _PALETTE: tuple[Rgb, ...] = (
@@ -44,19 +56,10 @@ class Row(NamedTuple):
 
 
 class Studio:
-    """The document and what surrounds it.
+    """The document and its surroundings.
 
-    Parameters
-    ----------
-    document : Document
-    recording : Recording, optional
-        Views with boxes and poses.
-    images : Images, optional
-        The images of these views.
-    finder : PhraseFinder, optional
-        Finds phrases for landmarks.
-    layer : KeyframeLayer, optional
-        The keyframes next to the map, to be shown.
+    ``recording`` has views with boxes and poses, ``images`` the images of these views, ``layer``
+    the keyframes next to the map, to be shown.
     """
 
     def __init__(self, document: Document, recording: Recording | None = None,
@@ -75,6 +78,7 @@ class Studio:
         self._row = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
+        # of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
@@ -83,12 +87,12 @@ class Studio:
 
     @property
     def views(self) -> int:
-        """Return the number of views."""
+        """The number of views."""
         return 0 if self.recording is None else len(self.recording.detections)
 
     @property
     def map_from_camera(self) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of the selected view."""
+        """The pose (4, 4) of the selected view."""
         pose: NDArray[np.float64] = self._recording().detections.map_from_camera[self.view]
         return pose
 
@@ -113,18 +117,18 @@ class Studio:
 
     def outlines(self) -> list[Outline]:
         """Return the landmarks' outlines in the selected view, the nearest first."""
-        return project(self.document.landmarks, self._recording().detections.camera,
-                       self.map_from_camera)
+        return outlines_of(self.document.landmarks, self._recording().detections.camera,
+                           self.map_from_camera)
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the selected view with boxes and outlines (h, w, 3), red first."""
         detections = self._recording().detections
-        stamp_s = float(detections.stamps_s[self.view])
-        return draw(detections.camera, None if self._images is None else
-                    self._images.near(stamp_s), self.boxes_in_view(), self.drawn.get(self.view),
-                    self.outlines(),
-                    {key: color_of(one.class_id) for key, one in self.document.landmarks.items()},
-                    self.document.selection)
+        image = None
+        if self._images is not None:
+            image = self._images.near(float(detections.stamps_s[self.view]))
+        colors = {key: color_of(one.class_id) for key, one in self.document.landmarks.items()}
+        return draw(detections.camera, image, self.boxes_in_view(), self.drawn.get(self.view),
+                    self.outlines(), colors, self.document.selection)
 
     def _recording(self) -> Recording:
         if self.recording is None:
@@ -197,11 +201,9 @@ class Studio:
         if self.recording is not None:
             merged = change.after[ids[0]]
             assert merged is not None
-            try:
-                fit = self.recording.fit_together(landmarks, ids, merged.center, merged.basis)
+            fit = self.recording.fit_together(landmarks, ids, merged.center, merged.basis)
+            if fit is not None:
                 change, how = edits.merge(landmarks, ids, (fit.center, fit.basis)), 'by boxes'
-            except EditError:
-                pass  # too few boxes
         self.document.apply(change)
         self.document.select([ids[0]])
         return f'merged {", ".join(ids)} {how}'
@@ -235,8 +237,9 @@ class Studio:
         size = np.array([camera.width, camera.height], dtype=np.float64)
         low, high = (np.clip(select(np.asarray(corner), np.asarray(other)), 0.0, size)
                      for select in (np.minimum, np.maximum))
-        if (high - low).min() < 4.0:
-            raise EditError('the box is smaller than 4 pixels; drag from corner to corner')
+        if (high - low).min() < MIN_BOX_PX:
+            raise EditError(f'the box is smaller than {MIN_BOX_PX:g} pixels; drag from corner to '
+                            'corner')
         self.drawn[self.view] = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         return f'{len(self.drawn)} boxes drawn'
 
@@ -257,14 +260,14 @@ class Studio:
 
     def create(self, label: str, class_id: str) -> str:
         """Create a landmark from the drawn boxes, and select it."""
-        detections = self._recording().detections
+        recording, landmarks = self._recording(), self.document.landmarks
+        detections = recording.detections
         fit = fit_boxes(detections.camera, [DrawnBox(detections.map_from_camera[view], box)
                                             for view, box in sorted(self.drawn.items())])
-        landmarks = self.document.landmarks
         change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
         (landmark_id,) = change.after
-        rows = self._recording().boxes_of(change.apply(landmarks))[landmark_id]
-        look = self._recording().look_of(rows, self.document.encoder_key)
+        rows = recording.boxes_of(change.apply(landmarks))[landmark_id]
+        look = recording.look_of(rows, self.document.encoder_key)
         self.document.apply(edits.create(landmarks, label, class_id, fit.center, fit.basis, look))
         self.document.select([landmark_id])
         self.drawn.clear()
@@ -283,7 +286,7 @@ class Studio:
         return f'checked {len(found)} landmarks: {serious} with a serious fault'
 
     def faults(self, landmark_id: str) -> tuple[str, ...]:
-        """Return what the last check found wrong with a landmark."""
+        """Return the faults of a landmark that the last check found."""
         return self._checks[landmark_id].faults if landmark_id in self._checks else ()
 
     def rows(self, search: str = '') -> list[Row]:
@@ -301,7 +304,7 @@ class Studio:
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""
         ids = self._selected()
-        following = self._following()  # acceptance sorts the table anew
+        following = self._following()  # acceptance changes the order of the table
         self.accepted.update(ids)
         return f'accepted {", ".join(ids)}; {self._select_row(following)}'
 
@@ -323,15 +326,15 @@ class Studio:
     # ---- the relocalizer ------------------------------------------------------------------------
 
     def relocalize_here(self) -> str:
-        """Ask the relocalizer in the selected view."""
-        self.answers = tuple(relocalize(self.document.landmarks, self._recording(), [self.view]))
+        """Relocalize in the selected view."""
+        self.answers = tuple(self._recording().relocalize(self.document.landmarks, [self.view]))
         return self.answers[0].text(self.document.to_map())
 
     def relocalize_all(self) -> str:
-        """Ask in views along the trajectory, and compare with the time before."""
+        """Relocalize in views along the trajectory, and compare with the time before."""
         recording = self._recording()
         views = sample_frames(self.views, _MAX_TRIALS).tolist()
-        self.answers = tuple(relocalize(self.document.landmarks, recording, views))
+        self.answers = tuple(recording.relocalize(self.document.landmarks, views))
         before = self._counts
         self._counts = {verdict: sum(one.verdict == verdict for one in self.answers)
                         for verdict in ('accepted', 'refused', 'wrong')}
@@ -353,7 +356,7 @@ class Studio:
 
     @property
     def phrase_note(self) -> str:
-        """Return what a person should know of CLIP's phrases; '' for nothing."""
+        """A line about CLIP's phrases for the person who edits; '' for none."""
         return self._ask_clip().note
 
     def _ask_clip(self) -> FoundPhrases:

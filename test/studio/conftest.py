@@ -2,18 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of the browser tests: Chromium, a studio of the demo's map, a person at its page."""
 
-import shutil
-from pathlib import Path
-
 import pytest
 from browser import Person, running_chromium
-
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
-from cliploc_ros.studio.recording import Recording
-from cliploc_ros.studio.studio import Studio
-
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+from studio_map import demo_studio, open_page
 
 
 @pytest.fixture(scope='module')
@@ -24,21 +15,14 @@ def chromium():
 
 @pytest.fixture
 def path(tmp_path):
-    path = tmp_path / 'map.yaml'
-    shutil.copy(ASSETS / 'map.yaml', path)
-    return path
+    return tmp_path / 'map.yaml'
 
 
 @pytest.fixture
 def studio(path):
-    from cliploc_ros.studio.server import serve_studio
-
-    folder = ASSETS / 'sequence'
-    studio = Studio(Document(path), Recording(views_of_folder(folder)),
-                    open_images(folder, None))
-    with serve_studio(studio, '127.0.0.1', 0) as (studio.url, studio.server):
+    studio = demo_studio(path)
+    with open_page(studio) as (studio.url, studio.server):
         yield studio
-    studio.document.close()
 
 
 @pytest.fixture

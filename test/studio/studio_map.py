@@ -1,7 +1,26 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map file with comments and all styles of YAML, for the tests of the studio."""
+"""Maps and studios for the tests of the studio."""
 
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import open_images, views_of_folder
+from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.studio import Studio
+
+ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+_ROOM = np.array([[0.0, 0.0, 0.4], [0.9, 0.2, 0.6], [0.3, 1.1, 0.5], [1.2, 1.3, 0.8],
+                  [-0.5, 0.8, 0.3]])
+_CLASSES = ('cup', 'book', 'plant', 'cup', 'chair')
+
+# Comments and all styles of YAML.
 TEXT = """\
 # The office on the second floor.   Measured by hand.
 other_node:
@@ -44,3 +63,43 @@ other_node:
           orientation: [0.0, 0.0, 0.0, 1.0]
     map_file: ''  # the relocalizer's own
 """
+
+
+def demo_studio(path):
+    """Return a studio of the demo's map, written to a path, with its walk: images and poses."""
+    shutil.copy(ASSETS / 'map.yaml', path)
+    folder = ASSETS / 'sequence'
+    return Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+
+
+@contextmanager
+def open_page(studio, host='127.0.0.1'):
+    """Serve the page of a studio; yield its URL and the server, and close the document."""
+    from cliploc_ros.studio.server import serve_studio
+
+    try:
+        with serve_studio(studio, host, 0) as (url, server):
+            yield url.replace('0.0.0.0', '127.0.0.1'), server
+    finally:
+        studio.document.close()
+
+
+def write_two_rooms(path):
+    """Write the map; its rooms are 7 m apart, and labels in them are equal."""
+    centers = np.concatenate([_ROOM, _ROOM + np.array([7.0, 0.0, 0.0])])
+    count = len(centers)
+    classes = _CLASSES * 2
+    write_map(path, LandmarkMap(
+        'map', tuple(f'{name}_{row}' for row, name in enumerate(classes)),
+        tuple(f'a {name}' for name in classes), classes, centers, np.full((count, 3), 0.15),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+
+
+def write_hall(path, labels, class_ids):
+    """Write a map of landmarks all over a hall of 60 m."""
+    count = len(labels)
+    rng = np.random.default_rng(0)
+    write_map(path, LandmarkMap(
+        'map', tuple(f'id_{row}' for row in range(count)), tuple(labels), tuple(class_ids),
+        rng.uniform(-30.0, 30.0, (count, 3)) * (1.0, 1.0, 0.05), np.full((count, 3), 0.1),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from browser import TIMEOUT_S, Person, value_of, wait_for
 from scipy.spatial.transform import Rotation
+from studio_map import ASSETS
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.studio.picture import project
+from cliploc_ros.studio.images import outlines_of
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
-
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):
@@ -60,7 +59,7 @@ def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
     camera = studio.recording.detections.camera
     poses = studio.recording.detections.map_from_camera
     seen = [(view, outline[0].ellipse) for view, pose in enumerate(poses)
-            if (outline := project({'mug_2': truth}, camera, pose))]
+            if (outline := outlines_of({'mug_2': truth}, camera, pose))]
     directions = np.array([truth.center - poses[view][:3, 3] for view, _ in seen])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     far = np.unravel_index(np.argmin(directions @ directions.T), (len(seen), len(seen)))

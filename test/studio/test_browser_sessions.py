@@ -4,6 +4,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from browser import Person, value_of, wait_for
+from studio_map import ASSETS, open_page
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.checking.detector_model import guess_detector
@@ -99,11 +101,9 @@ def test_another_program_changes_the_file(person, studio, path):
 
 
 def test_a_token_opens_the_page_from_elsewhere(chromium, path):
-    from cliploc_ros.studio.server import serve_studio
-
+    shutil.copy(ASSETS / 'map.yaml', path)
     document = Document(path)
-    with serve_studio(Studio(document), '0.0.0.0', 0) as (url, _):
-        url = url.replace('0.0.0.0', '127.0.0.1')
+    with open_page(Studio(document), '0.0.0.0') as (url, _):
         base, token = url.rstrip('/').rsplit('/', 1)
         page = chromium.new_page()
         for wrong in (base, f'{base}/{token[:-1]}x/', f'{base}/{"x" * 1000}/'):
@@ -114,16 +114,13 @@ def test_a_token_opens_the_page_from_elsewhere(chromium, path):
         person.click(re.compile('^mug_1 '))
         wait_for(lambda: document.selection == ('mug_1',), 'the selection')
         person.page.close()
-    document.close()
 
 
 def test_a_hostile_map_is_shown_as_text(chromium, path):
     """Ids, labels, classes, unknown fields and the coordinate frame hold HTML and long texts."""
-    from cliploc_ros.studio.server import serve_studio
-
     # an id holds no dots
     attack = '<img src=x onerror="self[`hacked`]=1"><script>self[`hacked`]=1</script>'
-    tree = yaml.safe_load(path.read_text())
+    tree = yaml.safe_load((ASSETS / 'map.yaml').read_text())
     one = tree['/**']['ros__parameters']['map']
     one['frame_id'] = f'map{attack}'
     landmarks = one['landmarks']
@@ -133,7 +130,7 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
     landmarks['i' * 100_000] = landmarks.pop('can_1')
     path.write_text(yaml.safe_dump(tree))
     studio = Studio(Document(path))
-    with serve_studio(studio, '127.0.0.1', 0) as (url, _):
+    with open_page(studio) as (url, _):
         person = Person(chromium, url)
         for text in ('<img', 'long', 'iiiiiiii'):
             person.find(text)
@@ -151,7 +148,6 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
         assert person.page.evaluate('window.hacked') is None
         assert person.page.locator('img[src=x]').count() == 0
         person.page.close()
-    studio.document.close()
 
 
 def test_a_killed_studio_comes_back_with_the_edits(chromium, path, tmp_path):
@@ -166,6 +162,7 @@ def test_a_killed_studio_comes_back_with_the_edits(chromium, path, tmp_path):
                  'the studio')
         return process, re.search(r'studio: (\S+)', log.read_text())[1]
 
+    shutil.copy(ASSETS / 'map.yaml', path)
     port = 8100 + os.getpid() % 800
     process, url = start()
     try:

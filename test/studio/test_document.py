@@ -17,9 +17,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.map_source import ChangedOnDiskError
+from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.map_file import ChangedOnDiskError
 
 
 @pytest.fixture
@@ -90,6 +90,19 @@ def test_new_landmarks_follow_the_last_one(path):
     assert lost == ['center: [3.0, 2.0, 0.5]', 'semi_axes: [0.1, 0.15, 0.3]'] or all(
         'map_file' not in line for line in lost)
     assert "map_file: ''  # the relocalizer's own" in path.read_text()
+
+
+def test_the_last_landmark_gets_a_field_and_a_landmark_after_it(path):
+    text = TEXT.replace('label: >\n            a plant\n            in a pot',
+                        'labels: {text: [fern, tree], weight: [0.5, 0.5]}')
+    path.write_text(text)
+    document = Document(path)
+    document.apply(edits.relabel(document.landmarks, ['plant_1'], 'a tree \U0001f333'))
+    document.apply(edits.create(document.landmarks, 'a lamp', 'lamp', np.ones(3), np.eye(3)))
+    document.save()
+    lost, _ = changed_lines(path, text)
+    assert lost == ['labels: {text: [fern, tree], weight: [0.5, 0.5]}']
+    assert LandmarkMap.from_file(path).labels[2:] == ('a tree \U0001f333', 'a lamp')
 
 
 def test_unknown_fields_stay_and_the_relocalizer_refuses_them(path):

@@ -15,10 +15,9 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.projection import project_box
 from cliploc_ros.mapping.views import camera_centers, make_views
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
-from cliploc_ros.studio.changes import EditError
+from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import Landmark, shape_fields
-from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.recording import DrawnBox, Recording, fit_boxes
 
 TRIALS_PER_LANDMARK = 6
 

@@ -9,11 +9,11 @@ demo's world recorded, with each edge off by 3 % of the box. The labels are that
 import re
 from collections import defaultdict
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import Person, value_of, wait_for
+from studio_map import ASSETS, open_page
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
@@ -33,14 +33,12 @@ from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from cliploc_ros.ros.parameter_tables import relocalizer_options
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.boxes import DrawnBox, fit_boxes
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import open_images, views_of_folder
 from cliploc_ros.studio.landmark import map_of
-from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.recording import DrawnBox, Recording, fit_boxes
 from cliploc_ros.studio.studio import Studio
 
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 OBJECTS = 12
 BOXES_EACH = 3
 EDGE_ERROR = 0.03
@@ -166,15 +164,13 @@ def wake_ups(maps):
 @pytest.mark.clock
 @pytest.mark.needs('viser', 'playwright', 'chromium')
 def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
-    from cliploc_ros.studio.server import serve_studio
-
     walk, path = ASSETS / 'mapping', tmp_path / 'map.yaml'
     views = views_of_folder(walk)
     more = drawings(walk, views, np.random.default_rng(0))
     drawn = more[:OBJECTS]
     objects = [one for one, _ in drawn]
     studio = Studio(Document(path), Recording(views), open_images(walk, None))
-    with serve_studio(studio, '127.0.0.1', 0) as (url, server):
+    with open_page(studio) as (url, server):
         person = Person(chromium, url)
         person.page.set_viewport_size({'width': 800, 'height': 240})  # less to render
         for one, boxes in drawn:
@@ -184,7 +180,6 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
         person.click('Save')
         wait_for(lambda: studio.document.is_saved, 'saving')
         person.page.close()
-    studio.document.close()
     made, true = LandmarkMap.from_file(path), LandmarkMap.from_file(ASSETS / 'map.yaml')
     assert len(made) == len(only(made, objects)) == OBJECTS
     offsets_m = np.linalg.norm(made.centers - [one.center for one in objects], axis=1)

@@ -9,16 +9,14 @@ import time
 
 import numpy as np
 import pytest
-from two_rooms import write_two_rooms
+from studio_map import write_hall, write_two_rooms
 
-from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
 from cliploc_ros.mapping.checking.report import GridCheck
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.places import PlacesSearch, find_places
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
@@ -105,7 +103,7 @@ def test_without_landmarks(tmp_path):
 
 @pytest.mark.needs('viser')
 def test_colours_of_positions():
-    from cliploc_ros.studio.places_panel import tile_colors
+    from cliploc_ros.studio.tool_panels import tile_colors
 
     check = GridCheck(np.zeros((4, 3)), np.ones(4, dtype=bool), np.array([4, 0, 0, 3]),
                       np.array([0, 0, 0, 1]), np.array([[5.0] * 4, [5.0] * 4, [1.0] * 4,
@@ -118,12 +116,9 @@ def test_a_large_map_takes_no_longer_than_it_may(tmp_path):
     """Prints the processor time: 5,000 landmarks in a hall of 60 m."""
     rng, count = np.random.default_rng(0), 5000
     words = rng.choice(['red', 'blue', 'green', 'small'], count)
-    classes = tuple(rng.choice(['cup', 'book', 'tv', 'plant'], count))
-    write_map(tmp_path / 'map.yaml', LandmarkMap(
-        'map', tuple(f'id_{row}' for row in range(count)),
-        tuple(f'a {word} {name}' for word, name in zip(words, classes, strict=True)), classes,
-        rng.uniform(-30.0, 30.0, (count, 3)) * (1.0, 1.0, 0.05), np.full((count, 3), 0.1),
-        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    classes = rng.choice(['cup', 'book', 'tv', 'plant'], count).tolist()
+    write_hall(tmp_path / 'map.yaml', [f'a {word} {name}' for word, name in zip(
+        words, classes, strict=True)], classes)
     document = Document(tmp_path / 'map.yaml')
     begin_s, limit_s = time.process_time(), 2.0
     places = find_places(document.landmarks, None, None, silent, limit_s)

@@ -7,33 +7,23 @@ import shutil
 import time
 import urllib.error
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
+from studio_map import ASSETS, demo_studio, open_page, write_hall
 
-from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.changes import EditError
 from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
-from cliploc_ros.studio.picture import landmark_at
+from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.images import landmark_at, views_of_folder
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
-
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 
 
 @pytest.fixture
 def studio(tmp_path):
-    """The demo's map with its walk: images and poses, no boxes."""
-    path = tmp_path / 'map.yaml'
-    shutil.copy(ASSETS / 'map.yaml', path)
-    folder = ASSETS / 'sequence'
-    studio = Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+    studio = demo_studio(tmp_path / 'map.yaml')
     yield studio
     studio.document.close()
 
@@ -156,31 +146,16 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 
-@pytest.mark.parametrize('folder', ['missing', '.'])
-def test_images_that_are_none(tmp_path, folder):
-    from cliploc_ros.datasets.bag_frames import BagTopics
-
-    with pytest.raises(CliplocError):
-        open_images(tmp_path / folder, BagTopics())
-
-
 @pytest.mark.needs('viser')
 def test_a_large_map_with_many_views(tmp_path):
     """Prints the processor time of the server's side: 5,000 landmarks, 1,000 views."""
-    from cliploc_ros.studio.server import serve_studio
-
-    rng = np.random.default_rng(0)
-    path = tmp_path / 'map.yaml'
-    count = 5000
-    write_map(path, LandmarkMap(
-        'map', tuple(f'id_{number}' for number in range(count)), ('a cup',) * count,
-        ('cup',) * count, rng.uniform(-30, 30, (count, 3)) * (1, 1, 0.05),
-        np.full((count, 3), 0.1), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
+    path, count = tmp_path / 'map.yaml', 5000
+    write_hall(path, ['a cup'] * count, ['cup'] * count)
     one = views_of_folder(ASSETS / 'sequence')
     views = one.select_frames(np.arange(1000) % len(one))
     times = [time.process_time()]
     studio = Studio(Document(path), Recording(views))
-    with serve_studio(studio, '127.0.0.1', 0):
+    with open_page(studio):
         times.append(time.process_time())
         for step in range(5):
             here = studio.document.landmarks['id_7'].center
@@ -193,7 +168,6 @@ def test_a_large_map_with_many_views(tmp_path):
     print(f'{count} landmarks, 1000 views: open {opened_s:.2f} s, one step of a drag with its '
           f'picture {dragged_s / 5 * 1000:.0f} ms; peak memory of the whole test process '
           f'{peak_mb:.0f} MB')
-    studio.document.close()
 
 
 # ---- who may open the page
@@ -222,29 +196,20 @@ def opens(host, origin, path='/'):
 
 @pytest.mark.needs('viser')
 def test_the_page_is_for_this_machine_only(tmp_path):
-    from cliploc_ros.studio.server import serve_studio
-
-    document = Document(tmp_path / 'map.yaml')
-    with serve_studio(Studio(document), '127.0.0.1', 0) as (url, _):
+    with open_page(Studio(Document(tmp_path / 'map.yaml'))) as (url, _):
         assert answer(url) == 200
         assert answer(url, Host='evil.example') == 403, 'a name that points here'
         host = url.removeprefix('http://').rstrip('/')
         assert opens(host, None) is False
         assert opens(host, 'http://evil.example') is False, 'a foreign page'
         assert opens(host, f'http://{host}') is True
-    document.close()
 
 
 @pytest.mark.needs('viser')
 def test_beyond_this_machine_the_url_has_a_token(tmp_path):
-    from cliploc_ros.studio.server import serve_studio
-
-    document = Document(tmp_path / 'map.yaml')
-    with serve_studio(Studio(document), '0.0.0.0', 0) as (url, _):
-        url = url.replace('0.0.0.0', '127.0.0.1')
+    with open_page(Studio(Document(tmp_path / 'map.yaml')), '0.0.0.0') as (url, _):
         base, token = url.rstrip('/').rsplit('/', 1)
         assert len(token) >= 32 and answer(url) == 200
         assert answer(base) == answer(f'{base}/{token[:-1]}/') == 403
         host = base.removeprefix('http://')
         assert opens(host, base) is False and opens(host, base, f'/{token}') is True
-    document.close()

@@ -69,9 +69,9 @@ def test_replay_between_announcing_and_writing(path):
     """A studio that was killed while it saved: either content has the right edits."""
     document = Document(path)
     document.apply(edits.relabel(document.landmarks, ['cup_1'], 'first'))
-    document._journal.append({'writing': document._source.with_landmarks(
+    document._journal.append({'writing': document._file.with_landmarks(
         document.landmarks).digest})
-    written = document._source.with_landmarks(document.landmarks).text
+    written = document._file.with_landmarks(document.landmarks).text
     document._journal.close()
     again = Document(path)
     assert again.landmarks['cup_1'].label == 'first' and not again.is_saved

@@ -133,7 +133,7 @@ def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows):
     document._journal.close()
     # as a kill leaves it after the map was written
     embeddings_path(path).write_bytes(old)
-    journal.write_text(kept + json.dumps({'writing': document._source.digest, 'looks': looks})
+    journal.write_text(kept + json.dumps({'writing': document._file.digest, 'looks': looks})
                        + '\n')
     Document(path).close()
     check_all(path, rows)

@@ -5,11 +5,11 @@
 import re
 import shutil
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import Person, wait_for
+from studio_map import ASSETS, open_page
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
@@ -22,7 +22,6 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.images import open_images, views_of_folder
 
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 WALK = ASSETS / 'mapping'
 CLIP = ('--clip-model', str(ASSETS / 'clip.json'),
         '--clip-pretrained', str(ASSETS / 'clip.safetensors'))
@@ -73,12 +72,10 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
 @pytest.mark.needs('viser', 'playwright', 'chromium')
 def test_a_person_chooses_a_phrase(chromium, path):
     """The page goes on while CLIP loads."""
-    from cliploc_ros.studio.server import serve_studio
-
     studio = opened(path, '--images', WALK, *CLIP)
     document, truth = studio.document, studio.document.landmarks['bowl_1'].label
     document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
-    with serve_studio(studio, '127.0.0.1', 0) as (url, _):
+    with open_page(studio) as (url, _):
         person = Person(chromium, url)
         person.find('bowl_1')
         person.click(re.compile('^bowl_1 '))
@@ -89,7 +86,6 @@ def test_a_person_chooses_a_phrase(chromium, path):
         wait_for(lambda: document.landmarks['bowl_1'].label == truth, 'the label')
         person.page.close()
     studio.finder.close()
-    document.close()
 
 
 def observed(tmp_path, object_id):

@@ -72,12 +72,12 @@ def _lines(landmark_map: LandmarkMap) -> Iterator[str]:
     yield '/**:'
     yield '  ros__parameters:'
     yield '    map:'
-    yield f'      frame_id: {_quoted(landmark_map.frame_id)}'
+    yield f'      frame_id: {quoted(landmark_map.frame_id)}'
     yield '      landmarks:'
     for row, landmark_id in enumerate(landmark_map.landmark_ids):
-        yield f'        {_quoted(landmark_id)}:'
-        yield f'{_INDENT}label: {_quoted(landmark_map.labels[row])}'
-        yield f'{_INDENT}class_id: {_quoted(landmark_map.class_ids[row])}'
+        yield f'        {quoted(landmark_id)}:'
+        yield f'{_INDENT}label: {quoted(landmark_map.labels[row])}'
+        yield f'{_INDENT}class_id: {quoted(landmark_map.class_ids[row])}'
         yield f'{_INDENT}center: {_floats(landmark_map.centers[row])}'
         yield f'{_INDENT}semi_axes: {_floats(landmark_map.semi_axes[row])}'
         yield f'{_INDENT}orientation: {_floats(landmark_map.quats_xyzw[row])}'
@@ -88,12 +88,12 @@ def _lines(landmark_map: LandmarkMap) -> Iterator[str]:
 def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
     if details.labels is not None:
         yield f'{_INDENT}labels:'
-        yield f'{_INDENT}  text: [{", ".join(_quoted(text) for text, _ in details.labels)}]'
+        yield f'{_INDENT}  text: [{", ".join(quoted(text) for text, _ in details.labels)}]'
         yield f'{_INDENT}  weight: {_floats(_weight(weight) for _, weight in details.labels)}'
     if details.class_weights is not None:
         yield f'{_INDENT}class_weights:'
         for name, weight in details.class_weights:
-            yield f'{_INDENT}  {_quoted(name)}: {_weight(weight):.4f}'
+            yield f'{_INDENT}  {quoted(name)}: {_weight(weight):.4f}'
     if details.support is not None:
         yield f'{_INDENT}support: {details.support}'
     for name, digits in (('position_sigma', 4), ('shared_sigma', 4), ('shared_sigma_deg', 3),
@@ -101,7 +101,7 @@ def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
         if (value := getattr(details, name)) is not None:
             yield f'{_INDENT}{name}: {value:.{digits}f}'
     if details.source is not None:
-        yield f'{_INDENT}source: {_quoted(details.source)}'
+        yield f'{_INDENT}source: {quoted(details.source)}'
 
 
 def _weight(weight: float) -> float:
@@ -109,7 +109,7 @@ def _weight(weight: float) -> float:
     return max(weight, 1e-4)
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """Return text as YAML: a JSON string is one, except beyond 16 bits, as of an emoji."""
     if max(text, default='') <= '\uffff':
         return json.dumps(text)

@@ -1,20 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a recording, in any order."""
+"""The images of a recording, in any order, and the keyframes next to a map."""
 
 import shutil
 
 import numpy as np
 import pytest
+from scene import CAMERA, make_room, write_map
 
+from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.rosbag import BagWriter
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.studio.images import open_images
 
-CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
+BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
 COUNT = 20
@@ -28,7 +32,7 @@ def bag(request, tmp_path):
         writer.add_topic('/camera_info', bag_messages.CAMERA_INFO)
         writer.add_topic('/image', bag_messages.IMAGE)
         writer.write('/camera_info', START_NS, bag_messages.camera_info_message(
-            START_NS, 'camera', CAMERA))
+            START_NS, 'camera', BAG_CAMERA))
         for number in range(COUNT):
             taken_ns = START_NS + number * STEP_NS
             recorded_ns = START_NS + min(number, COUNT - 2) * STEP_NS + 4 * STEP_NS
@@ -50,3 +54,31 @@ def test_a_recording_that_is_gone_is_named(bag):
     shutil.rmtree(bag)
     with pytest.raises(DatasetError, match='no such recording'):
         images.read(3)
+
+
+@pytest.mark.parametrize('folder', ['missing', '.'])
+def test_images_that_are_none(tmp_path, folder):
+    with pytest.raises(CliplocError):
+        open_images(tmp_path / folder, BagTopics())
+
+
+def layer_of(path):
+    studio = open_studio(make_parser().parse_args([str(path)]))
+    studio.document.close()
+    return studio.layer
+
+
+def test_the_layer_comes_with_its_map(tmp_path, capsys):
+    path, room = tmp_path / 'room.yaml', make_room()
+    assert layer_of(path) is None, 'an empty map has none'
+    write_map(room, path)
+    assert layer_of(path) is None
+    save_layer(layer_path(path), KeyframeLayer(
+        'map', room.landmark_ids, room.centers.astype(np.float32), CAMERA, np.eye(4)[None],
+        np.array([0, 5]), np.zeros((5, 2), np.uint16), np.ones((5, 3), np.float32),
+        np.ones((5, 128), np.uint8), np.zeros(5, np.uint16), np.ones((1, 128), np.uint8)))
+    assert len(layer_of(path)) == 1
+    assert capsys.readouterr().out == ''
+    layer_path(path).write_bytes(b'no layer')
+    assert layer_of(path) is None
+    assert 'without keyframes: ' in capsys.readouterr().out

@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layers of the page: coverage, places that look alike, and keyframes."""
+
+import shutil
+
+import numpy as np
+import pytest
+from browser import Person, value_of, wait_for
+from studio_map import ASSETS, open_page, write_two_rooms
+
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import views_of_folder
+from cliploc_ros.studio.studio import Studio
+
+pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
+KEYFRAMES, POINTS = 12, 50
+
+
+def test_coverage_and_look_alikes(chromium, path):
+    """They are found, stale after an edit, and found again with what has changed."""
+    write_two_rooms(path)
+    document = Document(path)
+    with open_page(Studio(document)) as (url, _):
+        person = Person(chromium, url)
+        page = person.page
+        person.click('Find coverage and look-alikes')
+        person.click('cup_0')
+        wait_for(lambda: document.selection == ('cup_0',), 'the page answers meanwhile')
+        page.get_by_text('pairs of places that look alike: 1').wait_for()
+        person.picture('places')
+        person.click('Delete')
+        page.get_by_text('of the map before the last edits').wait_for()
+        person.click('Find coverage and look-alikes')
+        page.get_by_text('(was 1)').wait_for()
+        assert page.get_by_text('of the map before the last edits').count() == 0
+        page.close()
+        assert person.foreign == []
+
+
+def studio_with_keyframes(path):
+    """Return the demo's map with keyframes along its wake-ups, which see points on landmarks."""
+    shutil.copy(ASSETS / 'map.yaml', path)
+    detections = views_of_folder(ASSETS / 'sequence')
+    document = Document(path)
+    landmark_map = document.to_map()
+    poses = detections.map_from_camera[::4][:KEYFRAMES]
+    rng = np.random.default_rng(0)
+    seen = landmark_map.centers[rng.integers(0, len(landmark_map), (KEYFRAMES, POINTS))]
+    points = np.concatenate([(some - pose[:3, 3]) @ pose[:3, :3]
+                             for some, pose in zip(seen, poses, strict=True)])
+    count = len(points)
+    layer = KeyframeLayer(
+        landmark_map.frame_id, landmark_map.landmark_ids,
+        landmark_map.centers.astype(np.float32), detections.camera, poses,
+        np.arange(KEYFRAMES + 1) * POINTS, np.zeros((count, 2), np.uint16),
+        points.astype(np.float32), np.ones((count, 128), np.uint8), np.zeros(count, np.uint16),
+        np.ones((1, 128), np.uint8))
+    return Studio(document, layer=layer)
+
+
+def nodes_of(server):
+    return {name: handle for name, handle in server.scene._handle_from_node_name.items()
+            if name.startswith('/keyframes/')}
+
+
+def test_keyframes_are_shown_and_hidden(chromium, path):
+    studio = studio_with_keyframes(path)
+    with open_page(studio) as (url, server):
+        person = Person(chromium, url)
+        page = person.page
+        assert not nodes_of(server), 'nothing is sent before it is wanted'
+        box = page.get_by_label('Show keyframes')
+        box.wait_for()
+        box.check(force=True)
+        wait_for(lambda: len(nodes_of(server)) == 2, 'frusta and points')
+        nodes = nodes_of(server)
+        points = nodes['/keyframes/points'].points
+        assert points.shape == (KEYFRAMES * POINTS, 3)
+        centers = studio.document.to_map().centers
+        assert np.abs(points[:, None] - centers[None]).max(axis=2).min(axis=1).max() < 0.01
+        assert nodes['/keyframes/cameras'].points.shape == (8 * KEYFRAMES, 2, 3)
+        person.picture('keyframes')
+        box.uncheck(force=True)
+        wait_for(lambda: not any(node.visible for node in nodes.values()), 'they are hidden')
+        box.check(force=True)
+        wait_for(lambda: all(node.visible for node in nodes.values()), 'they are shown again')
+        assert value_of(server, 'Show keyframes') is True
+        page.close()
+        assert person.foreign == []
