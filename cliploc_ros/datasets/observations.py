@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import CameraError, DatasetError
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.replace_file import replace_file
 
 #: Arrays of the file, by name: shape in terms of F frames and n boxes, and kinds of dtype.
 LAYOUT = {

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.units import NS_PER_S
 
 #: Arrays of the file by name: shape (F frames, n boxes, L landmarks), and kind of dtype.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 
 
 def make_folder(folder: Path) -> None:

@@ -13,7 +13,7 @@ import yaml
 
 from cliploc_ros.core.maps.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.studio.landmark import Landmark, map_of
 from cliploc_ros.studio.map_text import patch_landmarks, write_tree
 

@@ -16,7 +16,7 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError, MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.keyframes_panel import KeyframesPanel
 from cliploc_ros.studio.live_panel import LivePanel

@@ -23,7 +23,7 @@ from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 
 VERSION = 1
 # Arrays of the file: shape in terms of K keyframes, n points, L landmarks and W words; type.

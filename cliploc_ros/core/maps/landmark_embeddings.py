@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 
 #: The most medoids of one landmark.
 MOST_MEDOIDS = 5
