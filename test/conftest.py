@@ -71,6 +71,10 @@ def pytest_collection_modifyitems(config, items):
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)
     config.hook.pytest_deselected(items=left_out)
     items[:] = sorted((item for item in items if not missing_module(item)), key=place)
+    for item in items:
+        # Processes that race on two busy cores fail once in a thousand tests.
+        if item.path.parent.name == 'nodes' and not item.get_closest_marker('clock'):
+            item.add_marker(pytest.mark.flaky(reruns=1))
 
 
 def missing_module(item: pytest.Item) -> str | None:
