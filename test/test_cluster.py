@@ -16,7 +16,7 @@ from clusters import TIMEOUT_S, kill_a_worker, local_cluster
 from distributed import Client
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.parallel import WorkersError, package_state, run_tasks
+from cliploc_ros.files.parallel import WorkersError, package_state, run_tasks
 
 PROJECT = Path(__file__).resolve().parents[1]
 

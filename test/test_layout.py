@@ -15,7 +15,8 @@ MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffi
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('cache_folder', 'errors', 'replace_file', 'units'),
+    ('errors', 'units'),
+    ('files',),
     ('core.kernels',),
     ('core.geometry',),
     ('core.map',),
@@ -26,7 +27,7 @@ LAYERS = (
     ('core.acceptance',),
     ('core',),
     ('mapping',),
-    ('messages', 'command', 'parallel'),
+    ('messages', 'command'),
     ('models', 'datasets', 'vocabulary'),
     ('recording',),
     ('evaluation',),

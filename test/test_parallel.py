@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import pytest
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.parallel import run_tasks
+from cliploc_ros.files.parallel import run_tasks
 
 
 @dataclass(frozen=True)

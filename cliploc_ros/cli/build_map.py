@@ -282,7 +282,7 @@ def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]'
 
 
 def _write_report(path: Path, report: dict[str, Any]) -> None:
-    from cliploc_ros.replace_file import replace_file
+    from cliploc_ros.files.storage import replace_file
 
     try:
         with replace_file(path) as partial:

@@ -215,7 +215,7 @@ def _refit_lines(imported: 'ImportedMap', refit: 'RefitMap', observations: Path)
 
 
 def _write_report(path: Path, result: _Result) -> None:
-    from cliploc_ros.replace_file import replace_file
+    from cliploc_ros.files.storage import replace_file
 
     report = {'landmarks': len(result.landmark_map), 'lines': result.lines,
               'left_out': [one._asdict() for one in result.left_out]}

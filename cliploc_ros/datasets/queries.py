@@ -3,42 +3,79 @@
 """Query files: recorded boxes and similarities, identical input for every method."""
 
 import math
-import zipfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.arrays import (
+    BOX,
+    FINITE,
+    SHARE,
+    UNIQUE,
+    ArrayError,
+    Arrays,
+    Check,
+    Field,
+    Offsets,
+    Schema,
+)
 from cliploc_ros.units import NS_PER_S
 
-#: Arrays of the file by name: shape (F frames, n boxes, L landmarks), and kind of dtype.
-LAYOUT = {
-    'landmark_ids': (('L',), 'string'),
-    'intrinsics_fx_fy_cx_cy': ((4,), 'number'),
-    'frame_offsets': (('F+1',), 'integer'),
-    'boxes_xyxy': (('n', 4), 'number'),
-    'class_ids': (('n',), 'string'),
-    'scores': (('n',), 'number'),
-    'similarities': (('n', 'L'), 'number'),
-    'true_landmark': (('n',), 'integer'),
-    'map_from_camera': (('F', 4, 4), 'number'),
-    'timestamps': (('F',), 'number'),
-    'query_group': (('F',), 'integer'),
-    'is_main': (('F',), 'boolean'),
-}
-#: An optional array of exact stamps [ns]; a float64 of seconds cannot hold them.
-STAMPS_NS = 'stamps_ns'
-#: Optional arrays: the time that detector and CLIP took [ms], NaN where unknown.
+#: A check of poses (n, 4, 4).
+RIGID = Check('is no rigid transform', lambda poses: ~are_rigid(poses))
 _STAGES = ('detector_ms', 'clip_ms')
-_OPTIONAL = {STAMPS_NS: (('F',), 'integer')} | dict.fromkeys(_STAGES, (('F',), 'number'))
 
-_KINDS = {'string': 'US', 'number': 'fiu', 'integer': 'iu', 'boolean': 'b'}
-_MAX_SIMILARITY = 1.001  # half precision rounds some cosines to just above 1
+
+def _check_truth(name: str, arrays: Arrays) -> None:
+    landmarks = len(arrays['landmark_ids'])
+    Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
+
+
+def _check_stamps(name: str, arrays: Arrays) -> None:
+    seconds = arrays['timestamps']
+    Check('contradicts timestamps',
+          lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
+
+
+def _check_groups(name: str, arrays: Arrays) -> None:
+    groups = arrays['query_group']
+    for group in np.unique(groups):
+        mains = int(arrays[name][groups == group].sum())
+        if mains != 1:
+            raise ArrayError(f'array {name} marks {mains} frames of query_group {group}, not 1')
+
+
+# F frames, n boxes, L landmarks.
+_SCHEMA = Schema('query file', {
+    'landmark_ids': Field('text', ('L',), (UNIQUE, Check('is empty', lambda ids: ids == ''))),
+    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE, Check(
+        'is a focal length that is not above 0',
+        lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
+    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
+    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
+    'class_ids': Field('text', ('n',)),
+    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
+    # half precision rounds some cosines to just above 1
+    'similarities': Field('numbers', ('n', 'L'), (FINITE, Check(
+        'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
+    'true_landmark': Field('integers', ('n',), (_check_truth,)),
+    'timestamps': Field('numbers', ('F',), (
+        FINITE, Check('is negative', lambda seconds: seconds < 0))),
+    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, RIGID)),
+    'query_group': Field('integers', ('F',)),
+    'is_main': Field('booleans', ('F',), (_check_groups,)),
+    # exact, which a float64 of seconds is not [ns]
+    'stamps_ns': Field('integers', ('F',), (_check_stamps,), is_optional=True),
+    # time that the networks took [ms], NaN where unknown
+    **dict.fromkeys(_STAGES, Field('numbers', ('F',), is_optional=True)),
+}, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
 
 
 @dataclass(frozen=True)
@@ -125,9 +162,7 @@ class Queries:
         return tuple(frame for frame in self.frames if frame.group == group)
 
 
-def load_queries(
-    path: str | Path, landmark_ids: Collection[str] | None = None
-) -> Queries:
+def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
     """Read and validate a query file.
 
     Parameters
@@ -137,36 +172,24 @@ def load_queries(
     landmark_ids : collection of str, optional
         The map's landmarks; the file must contain no others.
 
-    Returns
-    -------
-    Queries
-
     Raises
     ------
     DatasetError
         If the file is invalid; the message names file, array and error.
     """
     path = Path(path)
-    try:
-        arrays = _load_arrays(path)
-        _check_layout(arrays)
-        _check_values(arrays)
-        if landmark_ids is not None:
-            _check_landmarks(arrays, landmark_ids)
-    except _ArrayError as error:
-        raise DatasetError(f'{path}: {error}') from error
+    arrays = _SCHEMA.read(path)
+    unknown = [one for one in map(str, arrays['landmark_ids'])
+               if landmark_ids is not None and one not in landmark_ids]
+    if unknown:
+        more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
+        raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
+                           f'not know{more}')
     return _make_queries(arrays)
 
 
 def save_queries(path: str | Path, queries: Queries) -> None:
-    """Write a query file atomically.
-
-    Parameters
-    ----------
-    path : str or Path
-        The npz file; an existing one is replaced.
-    queries : Queries
-        What to write; validated like a file that is read.
+    """Write a query file atomically; an existing one is replaced.
 
     Raises
     ------
@@ -176,192 +199,53 @@ def save_queries(path: str | Path, queries: Queries) -> None:
     path = Path(path)
     try:
         arrays = _make_arrays(queries)
-        _check_layout(arrays)
-        _check_values(arrays)
-    except (_ArrayError, ValueError) as error:
+    except ValueError as error:  # arrays of different widths
         raise DatasetError(f'{path}: cannot be written: {error}') from error
-    try:
-        with replace_file(path) as partial, partial.open('wb') as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-    except OSError as error:
-        raise DatasetError(
-            f'{path}: cannot be written: {error.strerror}; no partial file remains'
-        ) from error
+    _SCHEMA.write(path, arrays, compress=True)
 
 
-class _ArrayError(Exception):
-    """An invalid array; the caller adds the file's name."""
-
-
-def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    if not path.is_file():
-        raise _ArrayError('no such query file')
-    try:
-        content = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _ArrayError('is no npz file') from error
-    if not isinstance(content, np.lib.npyio.NpzFile):
-        raise _ArrayError('is a single array, not an npz file of named arrays')
-    with content:
-        if missing := [name for name in LAYOUT if name not in content.files]:
-            raise _ArrayError(f'array {missing[0]} is missing')
-        names = [name for name in (*LAYOUT, *_OPTIONAL) if name in content.files]
-        return {name: _load_array(content, name) for name in names}
-
-
-def _load_array(content: Any, name: str) -> NDArray[Any]:
-    try:
-        array = np.asarray(content[name])
-        return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
-    except Exception as error:  # numpy's and zipfile's own, in a damaged file
-        raise _ArrayError(f'array {name} cannot be read: {error}') from error
-
-
-def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
-    sizes: dict[str, int] = {}
-    for name, letter in (('landmark_ids', 'L'), ('boxes_xyxy', 'n'), ('timestamps', 'F')):
-        if arrays[name].ndim == 0:
-            raise _ArrayError(f'array {name} is a single value')
-        sizes[letter] = len(arrays[name])
-    sizes['F+1'] = sizes['F'] + 1
-    layout = LAYOUT | {name: one for name, one in _OPTIONAL.items() if name in arrays}
-    for name, (letters, kind) in layout.items():
-        array = arrays[name]
-        shape = tuple(sizes.get(str(letter), letter) for letter in letters)
-        if array.shape != shape:
-            raise _ArrayError(f'array {name} has shape {array.shape}, expected {shape}')
-        if array.dtype.kind not in _KINDS[kind]:
-            raise _ArrayError(f'array {name} has type {array.dtype}, expected {kind}s')
-    for letter, what in (('F', 'frames'), ('L', 'landmarks')):
-        if sizes[letter] == 0:
-            raise _ArrayError(f'holds no {what}')
-
-
-def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
-    for name, (_, kind) in LAYOUT.items():
-        if kind == 'number' and not np.isfinite(arrays[name]).all():
-            row = np.argwhere(~np.isfinite(arrays[name]))[0][0]
-            raise _ArrayError(f'array {name} is not finite in row {row}')
-    ids = arrays['landmark_ids']
-    repeated = np.ones(len(ids), dtype=np.bool_)
-    repeated[np.unique(ids, return_index=True)[1]] = False
-    _refuse('landmark_ids', 'repeats an id', repeated)
-    _refuse('landmark_ids', 'is empty', ids == '')
-    if (arrays['intrinsics_fx_fy_cx_cy'][:2] <= 0).any():
-        raise _ArrayError('array intrinsics_fx_fy_cx_cy has a focal length that is not above 0')
-    _check_offsets(arrays['frame_offsets'], len(arrays['boxes_xyxy']))
-    boxes = arrays['boxes_xyxy']
-    _refuse(
-        'boxes_xyxy', 'is not left, top, right, bottom', (boxes[:, :2] >= boxes[:, 2:]).any(axis=1)
-    )
-    scores, similarities = arrays['scores'], arrays['similarities']
-    _refuse('scores', 'is outside 0 to 1', (scores < 0) | (scores > 1))
-    _refuse(
-        'similarities',
-        'is no cosine, outside -1 to 1',
-        (np.abs(similarities) > _MAX_SIMILARITY).any(axis=1),
-    )
-    truth = arrays['true_landmark']
-    _refuse('true_landmark', 'is no landmark', (truth < -1) | (truth >= len(ids)))
-    poses = arrays['map_from_camera']
-    rotations = poses[:, :3, :3]
-    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    no_rotation = (error > 1e-3) | (np.linalg.det(rotations) < 0)
-    no_rotation |= (poses[:, 3] != [0, 0, 0, 1]).any(axis=1)
-    _refuse('map_from_camera', 'is no rigid transform', no_rotation)
-    timestamps = arrays['timestamps']
-    _refuse('timestamps', 'is negative', timestamps < 0)
-    if STAMPS_NS in arrays:
-        difference_s = np.abs(arrays[STAMPS_NS] / NS_PER_S - timestamps)
-        _refuse(STAMPS_NS, 'contradicts timestamps', difference_s > 1e-6)
-    groups = arrays['query_group']
-    is_main = arrays['is_main']
-    for group in np.unique(groups):
-        mains = int(is_main[groups == group].sum())
-        if mains != 1:
-            raise _ArrayError(f'array is_main marks {mains} frames of query_group {group}, not 1')
-
-
-def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
-    if is_wrong.any():
-        raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
-
-
-def _check_offsets(offsets: NDArray[Any], boxes: int) -> None:
-    if offsets[0] != 0 or offsets[-1] != boxes:
-        raise _ArrayError(
-            f'array frame_offsets goes from {offsets[0]} to {offsets[-1]}, '
-            f'expected 0 to {boxes}, the number of boxes'
-        )
-    _refuse('frame_offsets', 'decreases', np.diff(offsets.astype(np.int64), prepend=0) < 0)
-
-
-def _check_landmarks(arrays: dict[str, NDArray[Any]], known: Collection[str]) -> None:
-    if unknown := [str(one) for one in arrays['landmark_ids'] if str(one) not in known]:
-        raise _ArrayError(
-            f'array landmark_ids has {unknown[0]!r}, which the map does not know'
-            + (f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else '')
-        )
-
-
-def _make_queries(arrays: dict[str, NDArray[Any]]) -> Queries:
-    fx, fy, cx, cy = (float(value) for value in arrays['intrinsics_fx_fy_cx_cy'])
-    offsets = arrays['frame_offsets']
-    return Queries(
-        landmark_ids=tuple(str(one) for one in arrays['landmark_ids']),
-        intrinsics_fx_fy_cx_cy=(fx, fy, cx, cy),
-        frames=tuple(
-            _make_frame(arrays, index, slice(int(offsets[index]), int(offsets[index + 1])))
-            for index in range(len(offsets) - 1)
-        ),
-    )
-
-
-def _make_frame(arrays: dict[str, NDArray[Any]], index: int, rows: slice) -> QueryFrame:
-    return QueryFrame(
-        stamp_ns=_stamp_ns(arrays, index),
-        bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
-        class_ids=tuple(str(one) for one in arrays['class_ids'][rows]),
-        scores=arrays['scores'][rows].astype(np.float64),
-        similarities=arrays['similarities'][rows].astype(np.float64),
-        true_landmark=arrays['true_landmark'][rows].astype(np.int64),
-        map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
-        group=int(arrays['query_group'][index]),
-        is_main=bool(arrays['is_main'][index]),
-        **{name: float(arrays[name][index]) for name in _STAGES if name in arrays},
-    )
-
-
-def _stamp_ns(arrays: dict[str, NDArray[Any]], index: int) -> int:
-    if STAMPS_NS in arrays:
-        return int(arrays[STAMPS_NS][index])
+def _make_queries(arrays: Arrays) -> Queries:
+    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
     # A float64 of today's seconds resolves 0.24 us: round to microseconds.
-    return round(float(arrays['timestamps'][index]) * 1e6) * 1000
+    stamps_ns = (arrays['stamps_ns'].tolist() if 'stamps_ns' in arrays else
+                 [round(float(seconds) * 1e6) * 1000 for seconds in arrays['timestamps']])
+    frames = []
+    for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
+        rows = slice(begin, end)
+        frames.append(QueryFrame(
+            stamp_ns=stamps_ns[index],
+            bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
+            class_ids=tuple(map(str, arrays['class_ids'][rows])),
+            scores=arrays['scores'][rows].astype(np.float64),
+            similarities=arrays['similarities'][rows].astype(np.float64),
+            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
+            map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
+            group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
+            **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
+    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
 
 
 def _make_arrays(queries: Queries) -> dict[str, NDArray[Any]]:
     frames = queries.frames
-    landmarks = len(queries.landmark_ids)
-    no_rows = np.empty((0, landmarks))
-    stamps_ns = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+
+    def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([none, *(getattr(one, name) for one in frames)])
+
     return {
         'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
         'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
-        'frame_offsets': np.cumsum([0, *(len(frame) for frame in frames)], dtype=np.int64),
-        'boxes_xyxy': np.concatenate([np.empty((0, 4)), *(one.bboxes_xyxy for one in frames)]),
+        'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
+        'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
         'class_ids': np.array([name for one in frames for name in one.class_ids], dtype=np.str_),
-        'scores': np.concatenate([np.empty(0), *(one.scores for one in frames)]),
-        'similarities': np.concatenate([no_rows, *(one.similarities for one in frames)]).astype(
-            np.float32
-        ),
-        'true_landmark': np.concatenate(
-            [np.empty(0, dtype=np.int64), *(one.true_landmark for one in frames)]
-        ),
+        'scores': rows('scores', np.empty(0)),
+        'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
+                             ).astype(np.float32),
+        'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
         'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
         # Python's division of integers rounds once, NumPy's twice.
         'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
         'query_group': np.array([one.group for one in frames], dtype=np.int64),
         'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
-        STAMPS_NS: stamps_ns,
+        'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
         **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
     }

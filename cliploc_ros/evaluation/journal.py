@@ -10,7 +10,7 @@ from typing import Any
 
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Result
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 
 
 class Journal:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, Result
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.units import NS_PER_S
 
 GROUND_TRUTH = 'ground_truth.txt'

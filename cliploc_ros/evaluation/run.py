@@ -18,7 +18,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
-from cliploc_ros.parallel import MakeWork, run_tasks
+from cliploc_ros.files.parallel import MakeWork, run_tasks
 
 # A stopped run loses at most this many queries of each core.
 _QUERIES_A_PART = 8
@@ -84,7 +84,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     queries : sequence of Query
     trials : int
     workers, scheduler : int, str
-        See cliploc_ros.parallel.run_tasks. Results do not depend on them.
+        See cliploc_ros.files.parallel.run_tasks. Results do not depend on them.
     done : sequence of Result
         Results of an earlier run, which are not run again.
     layer : KeyframeLayer, optional

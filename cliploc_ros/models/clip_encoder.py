@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_towers import cut_padding, load_text_tower, quiet_root_logger
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory, resolve_device

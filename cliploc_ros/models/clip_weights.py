@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import check_inference, check_precision
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import free_memory, import_openvino
 from cliploc_ros.models.files import fingerprint_file, first_line
 

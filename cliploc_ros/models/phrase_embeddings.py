@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.mapping.labelling import Phrases
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights

@@ -27,10 +27,10 @@ from cliploc_ros.datasets.frames import Frames, RawFrame, Wanted
 from cliploc_ros.datasets.observations import Recorded, load_recorded, save_recorded
 from cliploc_ros.datasets.poses import Poses
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.yolo_weights import YoloOptions
-from cliploc_ros.parallel import run_tasks
 from cliploc_ros.recording.journal import Journal
 from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S

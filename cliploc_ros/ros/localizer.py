@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -24,6 +23,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import ObservedCrops, Observer

@@ -30,7 +30,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.studio.landmark import DECIMALS, Landmark, Look, looks_of, map_of
 
 _PARAMETERS = 'ros__parameters'

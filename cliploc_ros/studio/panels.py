@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError, MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M
 from cliploc_ros.studio.map_file import ChangedOnDiskError

@@ -11,8 +11,7 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.camera import frusta
+from cliploc_ros.core.geometry.camera import Camera, frusta
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.edits import Landmarks
 from cliploc_ros.studio.landmark import Landmark

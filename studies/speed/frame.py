@@ -30,13 +30,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory

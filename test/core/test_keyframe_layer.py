@@ -66,7 +66,7 @@ def test_a_layer_comes_back_as_it_was(file):
 
 
 def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
-    monkeypatch.setattr(layer_file, 'MOST_READ', 0)
+    monkeypatch.setattr(layer_file, '_SCHEMA', replace(layer_file._SCHEMA, largest_read=0))
     layer = load_layer_of_map(file, ROOM)
     assert isinstance(layer.descriptors, np.memmap)
     assert np.array_equal(layer.descriptors, make_layer().descriptors)
@@ -127,7 +127,7 @@ def test_malformed_arrays_are_named(file, changes, message):
 def test_a_truncated_file_is_named(file, share):
     content = file.read_bytes()
     file.write_bytes(content[:int(share * len(content))])
-    with pytest.raises(MapError, match='no complete layer'):
+    with pytest.raises(MapError, match='no complete npz file|cannot be read'):
         load_layer_of_map(file, ROOM)
 
 

@@ -118,7 +118,7 @@ def become(name, value):
     (become('timestamps', 3.0), 'array timestamps is a single value'),
     (become('scores', [0.5, 0.5]), 'array scores has shape .2,., expected .3,.'),
     (become('frame_offsets', [0.0, 2, 2, 3]), 'frame_offsets has type float64, expected integers'),
-    (become('class_ids', [1, 2, 3]), 'class_ids has type int64, expected strings'),
+    (become('class_ids', [1, 2, 3]), 'class_ids has type int64, expected text'),
     (become('frame_offsets', [0, 2, 2, 4]), 'goes from 0 to 4, expected 0 to 3, the number'),
     (become('frame_offsets', [0, 2, 1, 3]), 'frame_offsets decreases in row 2'),
     (put('boxes_xyxy', (1, 0), np.nan), 'array boxes_xyxy is not finite in row 1'),

@@ -83,7 +83,7 @@ def become(name, value):
         (become('boxes_xyxy', np.zeros((3, 5))), r'boxes_xyxy has shape \(3, 5\), .*\(3, 4\)'),
         (become('boxes_xyxy', 3.0), 'array boxes_xyxy is a single value'),
         (become('map_from_camera', np.zeros((3, 3, 4))), r'map_from_camera has shape'),
-        (become('class_ids', [1, 2, 3]), 'array class_ids has type int64, expected strings'),
+        (become('class_ids', [1, 2, 3]), 'array class_ids has type int64, expected text'),
         (become('true_landmark', [0.0, 1, 2]), 'true_landmark has type float64, .*integers'),
         (become('is_main', [1, 0, 1]), 'is_main has type int64, expected booleans'),
         (put('boxes_xyxy', (1, 2), np.nan), 'array boxes_xyxy is not finite in row 1'),
@@ -231,7 +231,7 @@ def test_full_disk_keeps_the_old_file(tmp_path):
         [sys.executable, '-c', program, path],
         capture_output=True, text=True, check=True, timeout=300,
     )
-    assert 'cannot be written: File too large; no partial file remains' in run.stdout
+    assert 'cannot be written: File too large; nothing was changed' in run.stdout
     assert [one.name for one in tmp_path.iterdir()] == ['q.npz']
     assert path.read_bytes() == before
 

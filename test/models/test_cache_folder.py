@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.files.storage import resolve_cache_dir
 
 PROJECT = Path(__file__).resolve().parents[2]
 # In a user namespace of its own the process has a user id without an entry in the user database.
 HOMELESS = ['unshare', '--user', '--map-user=54321', 'env', '--unset=HOME']
 RESOLVE = """
 import logging, os, stat, sys
-from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.files.storage import resolve_cache_dir
 logging.basicConfig(format='%(levelname)s %(message)s')
 folder = resolve_cache_dir('')
 assert resolve_cache_dir('') == folder

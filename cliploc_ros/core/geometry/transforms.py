@@ -24,12 +24,16 @@ def invert_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
     """Return whether an array is a finite rigid transform (4, 4)."""
-    if transform.shape != (4, 4) or not np.isfinite(transform).all():
-        return False
-    rotation = transform[:3, :3]
-    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= tolerance
-                and np.linalg.det(rotation) > 0.0
-                and (transform[3] == [0.0, 0.0, 0.0, 1.0]).all())
+    return transform.shape == (4, 4) and bool(are_rigid(transform[None], tolerance)[0])
+
+
+def are_rigid(transforms: NDArray[np.float64], tolerance: float = 1e-3) -> NDArray[np.bool_]:
+    """Return which arrays (k, 4, 4) are finite rigid transforms."""
+    finite = np.isfinite(transforms).all(axis=(1, 2))
+    rotations = np.where(finite[:, None, None], transforms[:, :3, :3], 0.0)
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return np.asarray((errors <= tolerance) & (np.linalg.det(rotations) > 0.0)
+                      & (transforms[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1))
 
 
 def transform_from_pose(position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]

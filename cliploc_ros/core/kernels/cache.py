@@ -32,7 +32,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
-from cliploc_ros.cache_folder import resolve_cache_dir
+from cliploc_ros.files.storage import resolve_cache_dir
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _ROOT = _PACKAGE.name

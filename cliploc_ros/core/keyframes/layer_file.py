@@ -3,8 +3,7 @@
 """The file of a layer: ``NAME.keyframes.npz`` next to ``NAME.yaml``.
 
 The arrays lie in the file uncompressed. Those of a large file are mapped into memory, not read: a
-layer costs memory only where it is used, and may be larger than the memory. A small file is read:
-a program that writes over a mapped file in place would kill this process.
+layer costs memory only where it is used, and may be larger than the memory.
 """
 
 import hashlib
@@ -18,42 +17,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import is_rigid
+from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, Schema
 
 VERSION = 1
-# Arrays of the file: shape in terms of K keyframes, n points, L landmarks and W words; type.
-_LAYOUT: dict[str, tuple[tuple[object, ...], str]] = {
-    'landmark_ids': (('L',), 'U'),
-    'landmark_centers': (('L', 3), 'float32'),
-    'map_from_camera': (('K', 4, 4), 'float64'),
-    'offsets': (('K+1',), 'int64'),
-    'pixels': (('n', 2), 'uint16'),
-    'points': (('n', 3), 'float32'),
-    'descriptors': (('n', DIMENSIONS), 'uint8'),
-    'words': (('n',), 'uint16'),
-    'vocabulary': (('W', DIMENSIONS), 'uint8'),
-}
-# Only there where images were asked for; b bytes.
-_IMAGES: dict[str, tuple[tuple[object, ...], str]] = {
-    'images': (('b',), 'uint8'),
-    'image_offsets': (('K+1',), 'int64'),
-}
+
+
+def _check_words(name: str, arrays: Arrays) -> None:
+    if (arrays[name] >= len(arrays['vocabulary'])).any():
+        raise ArrayError(f'array {name} names a word that the vocabulary lacks')
+
+
+# K keyframes, n points, L landmarks, W words, b bytes.
+_SCHEMA = Schema('file of keyframes', {
+    'header': Field('text'),
+    'landmark_ids': Field('text', ('L',)),
+    'landmark_centers': Field('float32', ('L', 3)),
+    'map_from_camera': Field('float64', ('K', 4, 4), (
+        Check('is no rigid transform', lambda poses: ~are_rigid(poses)),)),
+    'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
+    'pixels': Field('uint16', ('n', 2), stays=True),
+    'points': Field('float32', ('n', 3), stays=True),
+    'descriptors': Field('uint8', ('n', DIMENSIONS), stays=True),
+    'words': Field('uint16', ('n',), (_check_words,)),
+    'vocabulary': Field('uint8', ('W', DIMENSIONS)),
+    # only there where images were asked for, both of them
+    'images': Field('uint8', ('b',), is_optional=True, stays=True),
+    'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
+}, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
+    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True, checks_sums=False,
+    largest_read=256_000_000)
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
-_MAPPED = ('pixels', 'points', 'descriptors', 'images')
-_HEADER_BYTES = 100_000
 _HASH_DIGITS = 12
-#: Files up to this size are read into memory [bytes].
-MOST_READ = 256_000_000
 _MOST_DEVIATION = 1.0
 # A map whose landmarks of the same name have moved so far in general is another map [m]. An update
 # or an edit moves few of them.
 _MOST_MOVED_M = 0.25
-_MAKE_AGAIN = 'make the layer again with build_map --keyframe-layer, or remove the file'
 
 
 def layer_path(map_path: str | os.PathLike[str]) -> Path:
@@ -72,16 +75,14 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
               'camera': {name: getattr(layer.camera, name) for name in _CAMERA}}
-    layout = _LAYOUT if layer.images is None else _LAYOUT | _IMAGES
-    arrays: dict[str, NDArray[Any]] = {
-        name: np.asarray(getattr(layer, name)).astype(kind, copy=False)
-        for name, (_, kind) in layout.items()}
-    try:
-        with replace_file(path) as partial, partial.open('wb') as file:
-            np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-    except OSError as error:
-        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                       ) from error
+    names = [name for name in _SCHEMA.fields
+             if name != 'header' and getattr(layer, name) is not None]
+    arrays: dict[str, NDArray[Any]] = {'header': np.array(json.dumps(header))} | {
+        name: np.asarray(getattr(layer, name)) for name in names}
+    _SCHEMA.write(path, {
+        name: array if _SCHEMA.fields[name].type == 'text'
+        else array.astype(_SCHEMA.fields[name].type, copy=False)
+        for name, array in arrays.items()})
 
 
 def remove_layer(map_path: str | os.PathLike[str]) -> str:
@@ -111,11 +112,12 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
     MapError
         The file is invalid or belongs to another map; says what to do.
     """
+    arrays = _SCHEMA.read(path)
     try:
-        layer = _load(path)
+        layer = _layer_of(arrays)
         _check_map(layer, landmark_map)
-    except _LayerError as error:
-        raise MapError(f'{path}: {error}; {_MAKE_AGAIN}') from error
+    except ArrayError as error:
+        raise _SCHEMA.invalid(path, error) from error
     return layer
 
 
@@ -129,120 +131,43 @@ def layer_hash(path: Path) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()[:_HASH_DIGITS]
 
 
-class _LayerError(Exception):
-    """What is wrong with a layer; the caller adds the file's name."""
-
-
-def _load(path: Path) -> KeyframeLayer:
-    if not path.is_file():
-        raise _LayerError('no such file')
+def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
+    if ('images' in arrays) != ('image_offsets' in arrays):
+        raise ArrayError('array images or image_offsets is missing')
     try:
-        with zipfile.ZipFile(path) as archive, path.open('rb') as file:
-            header = _read_header(archive)
-            layout = _LAYOUT | _IMAGES if 'images.npy' in archive.namelist() else _LAYOUT
-            arrays = {name: _read_array(archive, file, path, name) for name in layout}
-    except _LayerError:
-        raise
-    except Exception as error:  # whatever NumPy and zipfile meet in a broken file
-        raise _LayerError(f'is no complete layer of keyframes ({error})') from error
-    _check_layout(arrays, layout)
-    _check_values(arrays)
+        header = json.loads(str(arrays.pop('header')))
+        version, kind = header.get('version'), header.get('descriptors')
+    except (AttributeError, ValueError, RecursionError) as error:
+        raise ArrayError(f'its header is no JSON object ({error})') from error
+    if version != VERSION:
+        raise ArrayError(f'is of version {version!r}, expected {VERSION}')
+    if kind != KIND:
+        raise ArrayError(f'has descriptors of the kind {kind!r}, expected {KIND!r}')
     try:
         camera = Camera(*(header['camera'][name] for name in _CAMERA))
         deviation = float(header['deviation_per_metre'])
     except (CameraError, KeyError, TypeError, ValueError) as error:
-        raise _LayerError(f'has no valid camera or deviation in its header ({error})') from error
+        raise ArrayError(f'has no valid camera or deviation in its header ({error})') from error
     if not 0.0 <= deviation <= _MOST_DEVIATION:
-        raise _LayerError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
+        raise ArrayError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), camera, **arrays,
                          deviation_per_metre=deviation)
 
 
-def _read_header(archive: zipfile.ZipFile) -> dict[str, Any]:
-    if archive.getinfo('header.npy').file_size > _HEADER_BYTES:
-        raise _LayerError(f'its header is larger than {_HEADER_BYTES} bytes')
-    with archive.open('header.npy') as member:
-        header = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
-    if not isinstance(header, dict):
-        raise _LayerError('its header is no JSON object')
-    if header.get('version') != VERSION:
-        raise _LayerError(f"is of version {header.get('version')!r}, expected {VERSION}")
-    if header.get('descriptors') != KIND:
-        raise _LayerError(f"has descriptors of the kind {header.get('descriptors')!r}, expected "
-                          f'{KIND!r}')
-    return header
-
-
-def _read_array(archive: zipfile.ZipFile, file: Any, path: Path, name: str) -> NDArray[Any]:
-    """Return an array of the archive; a large one stays in the file."""
-    info = archive.getinfo(f'{name}.npy')
-    if info.file_size > path.stat().st_size:
-        raise _LayerError(f'array {name} claims more bytes than the file has')
-    if name not in _MAPPED:
-        with archive.open(info) as member:
-            return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
-    if info.compress_type != zipfile.ZIP_STORED:
-        raise _LayerError(f'array {name} is compressed')
-    # the local header repeats name and extra fields, whose lengths may differ from the directory's
-    file.seek(info.header_offset + 26)
-    lengths = np.frombuffer(file.read(4), dtype='<u2')
-    file.seek(info.header_offset + 30 + int(lengths.sum()))
-    version = np.lib.format.read_magic(file)
-    read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
-            else np.lib.format.read_array_header_2_0)
-    shape, fortran, dtype = read(file)
-    if fortran or dtype.hasobject or not np.prod(shape):
-        raise _LayerError(f'array {name} has shape {shape} and type {dtype}')
-    mapped = np.memmap(path, dtype=dtype, mode='r', offset=file.tell(), shape=shape)
-    return mapped if path.stat().st_size > MOST_READ else np.array(mapped)
-
-
-def _check_layout(arrays: dict[str, NDArray[Any]],
-                  layout: dict[str, tuple[tuple[object, ...], str]]) -> None:
-    sizes: dict[object, int] = {
-        letter: len(np.atleast_1d(arrays[name])) for letter, name in
-        (('K', 'map_from_camera'), ('n', 'descriptors'), ('L', 'landmark_ids'),
-         ('W', 'vocabulary'))}
-    sizes['K+1'] = sizes['K'] + 1
-    sizes['b'] = arrays['images'].size if 'images' in layout else 0
-    for name, (letters, kind) in layout.items():
-        array, shape = arrays[name], tuple(sizes.get(one, one) for one in letters)
-        if array.shape != shape:
-            raise _LayerError(f'array {name} has shape {array.shape}, expected {shape}')
-        if (array.dtype.kind != 'U') if kind == 'U' else (array.dtype != kind):
-            raise _LayerError(f'array {name} has type {array.dtype}, expected {kind}')
-    if not sizes['K'] or not sizes['W']:
-        raise _LayerError('has no keyframes')
-
-
-def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
-    for name, counted, what in (('offsets', 'descriptors', 'points'),
-                                ('image_offsets', 'images', 'bytes')):
-        offsets = arrays.get(name)
-        if offsets is not None and (offsets[0] != 0 or offsets[-1] != len(arrays[counted])
-                                    or (np.diff(offsets) < 0).any()):
-            raise _LayerError(f'array {name} does not count the {what} of the keyframes')
-    for row, pose in enumerate(arrays['map_from_camera']):
-        if not is_rigid(pose, tolerance=1e-3):
-            raise _LayerError(f'array map_from_camera has no rigid transform in row {row}')
-    if (arrays['words'] >= len(arrays['vocabulary'])).any():
-        raise _LayerError('array words names a word that the vocabulary lacks')
-
-
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     """Refuse the layer of another map. Landmarks may be new, gone or moved, but not in general."""
     if layer.frame_id != landmark_map.frame_id:
-        raise _LayerError(f"is of a map in frame '{layer.frame_id}', not "
+        raise ArrayError(f"is of a map in frame '{layer.frame_id}', not "
                           f"'{landmark_map.frame_id}'")
     rows = {name: row for row, name in enumerate(layer.landmark_ids)}
     shared = [(rows[name], row) for row, name in enumerate(landmark_map.landmark_ids)
               if name in rows]
     if not shared:
-        raise _LayerError('knows no landmark of the map: it is of another map')
+        raise ArrayError('knows no landmark of the map: it is of another map')
     ours, theirs = np.array(shared).T
     moved = np.linalg.norm(layer.landmark_centers[ours] - landmark_map.centers[theirs], axis=1)
     if not float(np.median(moved)) <= _MOST_MOVED_M:
-        raise _LayerError(f'its landmarks lie {np.median(moved):.3g} m from those of the map '
+        raise ArrayError(f'its landmarks lie {np.median(moved):.3g} m from those of the map '
                           '(median): it is of another map')

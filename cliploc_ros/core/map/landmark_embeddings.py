@@ -3,7 +3,6 @@
 """What an image encoder saw of each landmark: ``NAME.embeddings.npz`` next to ``NAME.yaml``."""
 
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,23 +13,35 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
-from cliploc_ros.replace_file import replace_file
+from cliploc_ros.files.arrays import UNIQUE, ArrayError, Arrays, Check, Field, Offsets, Schema
 
 #: The most medoids of one landmark.
 MOST_MEDOIDS = 5
-# Arrays of the file: shape in terms of L landmarks, m medoids and d numbers; kinds of dtype.
-_LAYOUT = {
-    'encoder_key': ((), 'U'),
-    'landmark_ids': (('L',), 'U'),
-    'means': (('L', 'd'), 'f'),
-    'medoids': (('m', 'd'), 'f'),
-    'medoid_offsets': (('L+1',), 'iu'),
-}
-_KIND_NAMES = {'U': 'text', 'f': 'floats', 'iu': 'integers'}
-# float16 rounds each number by up to 5e-4 of it.
-_MAX_NORM_ERROR = 5e-3
 # Landmarks whose images stand for crops where spreads are measured.
 _CROPS_SAMPLED = 1024
+
+def _check_key(name: str, arrays: Arrays) -> None:
+    if not str(arrays[name]):
+        raise ArrayError(f'array {name} is empty: it names no encoder')
+
+
+def _is_no_direction(rows: NDArray[Any]) -> NDArray[np.bool_]:
+    # float16 rounds each number by up to 5e-4 of it
+    lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
+    return np.asarray(~(np.abs(lengths - 1.0) <= 5e-3))  # true for NaN
+
+
+# L landmarks, m medoids, d numbers.
+_SCHEMA = Schema('file of embeddings', {
+    'encoder_key': Field('text', (), (_check_key,)),
+    'landmark_ids': Field('text', ('L',), (UNIQUE,)),
+    'means': Field('floats', ('L', 'd'), (Check(
+        'is not of unit length', lambda rows: _is_no_direction(rows) & (rows != 0).any(axis=1)),)),
+    'medoids': Field('floats', ('m', 'd'), (Check('is not of unit length', _is_no_direction),)),
+    'medoid_offsets': Field('integers', ('L+1',), (Offsets('medoids', 'medoids'), Check(
+        f'gives a landmark more than {MOST_MEDOIDS} medoids',
+        lambda offsets: np.diff(offsets) > MOST_MEDOIDS))),
+}, MapError, 'build the map again, or remove the file')
 
 
 @dataclass(frozen=True)
@@ -137,13 +148,7 @@ def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings
     MapError
         Names the file, the array, what is wrong with it, and what to do.
     """
-    path = Path(path)
-    try:
-        arrays = _read_arrays(path)
-        _check_layout(arrays)
-        _check_values(arrays)
-    except _ArrayError as error:
-        raise MapError(f'{path}: {error}; build the map again, or remove the file') from error
+    arrays = _SCHEMA.read(Path(path))
     return LandmarkEmbeddings(
         str(arrays['encoder_key']), tuple(map(str, arrays['landmark_ids'])),
         arrays['means'].astype(np.float16), arrays['medoids'].astype(np.float16),
@@ -159,92 +164,12 @@ def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkE
     MapError
         The embeddings are malformed, or the file cannot be written.
     """
-    path = Path(path)
-    arrays = {
+    _SCHEMA.write(Path(path), {
         'encoder_key': np.array(embeddings.encoder_key, dtype=np.str_),
         'landmark_ids': np.array(embeddings.landmark_ids, dtype=np.str_),
         'means': embeddings.means.astype(np.float16),
         'medoids': embeddings.medoids.astype(np.float16),
-        'medoid_offsets': embeddings.medoid_offsets.astype(np.int64),
-    }
-    try:
-        _check_layout(arrays)
-        _check_values(arrays)
-        with replace_file(path) as partial, partial.open('wb') as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-    except _ArrayError as error:
-        raise MapError(f'{path}: cannot be written: {error}') from error
-    except OSError as error:
-        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                       ) from error
-
-
-class _ArrayError(Exception):
-    """What is wrong with an array; the caller adds the file's name."""
-
-
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    if not path.is_file():
-        raise _ArrayError('no such file')
-    try:
-        content = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _ArrayError('is no complete npz file') from error
-    if not isinstance(content, np.lib.npyio.NpzFile):
-        raise _ArrayError('is a single array, not an npz file of named arrays')
-    with content:
-        return {name: _read_array(content, name) for name in _LAYOUT}
-
-
-def _read_array(content: Any, name: str) -> NDArray[Any]:
-    if name not in content.files:
-        raise _ArrayError(f'array {name} is missing')
-    try:
-        return np.asarray(content[name])
-    except Exception as error:  # whatever numpy and zipfile meet in a broken file
-        raise _ArrayError(f'array {name} cannot be read: {error}') from error
-
-
-def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
-    for name in ('landmark_ids', 'means', 'medoids'):
-        if arrays[name].ndim == 0:
-            raise _ArrayError(f'array {name} is a single value')
-    count = len(arrays['landmark_ids'])
-    sizes: dict[object, int] = {'L': count, 'L+1': count + 1, 'm': len(arrays['medoids']),
-                                'd': arrays['means'].shape[-1]}
-    for name, (letters, kinds) in _LAYOUT.items():
-        array, shape = arrays[name], tuple(sizes[letter] for letter in letters)
-        if array.shape != shape:
-            raise _ArrayError(f'array {name} has shape {array.shape}, expected {shape}')
-        if array.dtype.kind not in kinds:
-            raise _ArrayError(f'array {name} has type {array.dtype}, expected '
-                              f'{_KIND_NAMES[kinds]}')
-
-
-def _check_values(arrays: dict[str, NDArray[Any]]) -> None:
-    if not str(arrays['encoder_key']):
-        raise _ArrayError('array encoder_key is empty: it names no encoder')
-    ids = arrays['landmark_ids']
-    _, first_places = np.unique(ids, return_index=True)
-    _refuse('landmark_ids', 'repeats an id', ~np.isin(np.arange(len(ids)), first_places))
-    for name in ('means', 'medoids'):
-        lengths = np.linalg.norm(arrays[name].astype(np.float32), axis=1)
-        allowed = np.abs(lengths - 1.0) <= _MAX_NORM_ERROR  # false for NaN
-        if name == 'means':
-            allowed |= lengths == 0.0
-        _refuse(name, 'is not of unit length', ~allowed)
-    offsets = arrays['medoid_offsets'].astype(np.int64)
-    if offsets[0] != 0 or offsets[-1] != len(arrays['medoids']):
-        raise _ArrayError(f'array medoid_offsets goes from {offsets[0]} to {offsets[-1]}, '
-                          f"expected 0 to {len(arrays['medoids'])}, the number of medoids")
-    counts = np.diff(offsets)
-    _refuse('medoid_offsets', f'gives a landmark less than 0 or more than {MOST_MEDOIDS} medoids',
-            (counts < 0) | (counts > MOST_MEDOIDS))
-
-
-def _refuse(name: str, what: str, is_wrong: NDArray[np.bool_]) -> None:
-    if is_wrong.any():
-        raise _ArrayError(f'array {name} {what} in row {int(np.argmax(is_wrong))}')
+        'medoid_offsets': embeddings.medoid_offsets.astype(np.int64)})
 
 
 def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: str

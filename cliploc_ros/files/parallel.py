@@ -340,7 +340,7 @@ def _check_package(client: 'Client', address: str) -> None:
         from importlib.util import find_spec
         if find_spec('cliploc_ros') is None:
             return None
-        from cliploc_ros import parallel
+        from cliploc_ros.files import parallel
         return getattr(parallel, 'package_state', lambda: 'of another version')()
 
     ours = package_state()
@@ -353,7 +353,7 @@ def _check_package(client: 'Client', address: str) -> None:
 
 def package_state() -> str:
     """Return the version of this package, and a digest of its sources."""
-    folder = Path(__file__).parent
+    folder = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for path in sorted(folder.rglob('*.py')):
         digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())

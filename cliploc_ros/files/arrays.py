@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The schema of an npz file: which arrays it holds, of which type and shape, with which values.
+
+A reader is a table of fields. An untrusted file ends in an error that names file, array and row:
+pickles are refused, and no array is larger than the file says.
+"""
+
+import struct
+import zipfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.files.storage import replace_file
+
+#: Arrays by name.
+Arrays = Mapping[str, NDArray[Any]]
+
+# Kinds of numpy's types; any other type of a field is the name of one.
+_KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
+_ROWS_AT_ONCE = 10_000
+# Of a member of a zip file: where the lengths of its name and of a further field stand, and where
+# the name begins.
+_ZIP_LENGTHS, _ZIP_HEAD = 26, 30
+
+
+class ArrayError(Exception):
+    """What is wrong with an array; the schema adds the file's name."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A condition that each row of an array meets.
+
+    Parameters
+    ----------
+    what : str
+        What is wrong with a row that fails, such as 'is not finite'.
+    is_wrong : callable
+        Takes the array (n, ...), returns whether each row (n,) fails.
+    """
+
+    what: str
+    is_wrong: Callable[[NDArray[Any]], NDArray[np.bool_]]
+
+    def __call__(self, name: str, arrays: Arrays) -> None:
+        """Raise ArrayError if a row fails."""
+        wrong = self.is_wrong(arrays[name])
+        if wrong.any():
+            raise ArrayError(f'array {name} {self.what} in row {int(np.argmax(wrong))}')
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """A check of offsets: where the rows of each part begin in another array, and its end."""
+
+    counted: str
+    what: str
+
+    def __call__(self, name: str, arrays: Arrays) -> None:
+        """Raise ArrayError if they do not count all rows in their order."""
+        offsets, count = arrays[name].astype(np.int64), len(arrays[self.counted])
+        if offsets[0] != 0 or offsets[-1] != count:
+            raise ArrayError(f'array {name} goes from {offsets[0]} to {offsets[-1]}, expected 0 '
+                             f'to {count}, the number of {self.what}')
+        Check('decreases', lambda all_: np.diff(offsets, prepend=0) < 0)(name, arrays)
+
+
+def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Look at some rows at once: the array may stay in its file."""
+    return np.concatenate([~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+                           for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
+
+
+def _is_repeated(values: NDArray[Any]) -> NDArray[np.bool_]:
+    repeated = np.ones(len(values), dtype=np.bool_)
+    repeated[np.unique(values, return_index=True)[1]] = False
+    return repeated
+
+
+FINITE = Check('is not finite', _is_not_finite)
+UNIQUE = Check('repeats an id', _is_repeated)
+BOX = Check('is not left, top, right, bottom',
+            lambda boxes: (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
+SHARE = Check('is outside 0 to 1', lambda shares: (shares < 0) | (shares > 1))
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of a file.
+
+    Parameters
+    ----------
+    type : str
+        'text', 'numbers', 'floats', 'integers', 'booleans', or the name of one type, as 'uint8'.
+    shape : tuple of int or str
+        Lengths, or their names, such as 'n'. The first field with a name determines its length;
+        'n+1' is one more.
+    checks : callables
+        Each takes the name and all arrays, and raises ArrayError.
+    is_optional : bool
+    stays : bool
+        Whether it stays in the file, so that memory holds only the rows in use. A compressed
+        array is read nevertheless.
+    """
+
+    type: str
+    shape: tuple[int | str, ...] = ()
+    checks: tuple[Callable[[str, Arrays], None], ...] = ()
+    is_optional: bool = False
+    stays: bool = False
+
+
+@dataclass(frozen=True)
+class Schema:
+    """The arrays of a kind of npz file.
+
+    Parameters
+    ----------
+    kind : str
+        Names the file, as in 'no such query file'.
+    fields : mapping of str to Field
+        Other arrays of a file are not read.
+    error : type of CliplocError
+        What is raised.
+    advice : str
+        What to do about an invalid file.
+    not_empty : mapping of str to str
+        Lengths that must be above 0, and what they count.
+    others : mapping of str to str
+        Arrays of other kinds of files, and what a file is that has one where a field is missing.
+    is_stored : bool
+        Whether compressed arrays are refused.
+    checks_sums : bool
+        Whether to compare the check sums of arrays that stay in the file, which reads it once.
+    largest_read : int
+        In files up to this size all arrays are read [bytes]: a program that writes over a mapped
+        file in place would kill this process.
+    """
+
+    kind: str
+    fields: Mapping[str, Field]
+    error: type[CliplocError]
+    advice: str = ''
+    not_empty: Mapping[str, str] = field(default_factory=dict)
+    others: Mapping[str, str] = field(default_factory=dict)
+    is_stored: bool = False
+    checks_sums: bool = True
+    largest_read: int = 0
+
+    def read(self, path: Path) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a file, validated; optional ones that it lacks are missing.
+
+        Raises
+        ------
+        CliplocError
+            Names the file, the array, what is wrong with it, and what to do.
+        """
+        if not path.is_file():
+            raise self.error(f'{path}: no such {self.kind}')
+        try:
+            arrays = self._arrays(path)
+            self.check(arrays)
+        except ArrayError as error:
+            raise self.invalid(path, error) from error
+        return arrays
+
+    def invalid(self, path: Path, what: object) -> CliplocError:
+        """Return the error of an invalid file."""
+        return self.error(f'{path}: {what}; {self.advice}' if self.advice else f'{path}: {what}')
+
+    def write(self, path: Path, arrays: Arrays, compress: bool = False) -> None:
+        """Write a file in one step: an existing file is replaced complete, or stays.
+
+        Raises
+        ------
+        CliplocError
+            The arrays are invalid, or the file cannot be written.
+        """
+        save: Any = np.savez_compressed if compress else np.savez
+        try:
+            self.check(arrays)
+            with replace_file(path) as partial, partial.open('wb') as file:
+                save(file, **arrays)
+        except ArrayError as error:
+            raise self.error(f'{path}: cannot be written: {error}') from error
+        except OSError as error:
+            raise self.error(f'{path}: cannot be written: {error.strerror}; nothing was changed'
+                             ) from error
+
+    def check(self, arrays: Arrays) -> None:
+        """Raise ArrayError if a type, a shape or a value is wrong."""
+        sizes: dict[str, int] = {}
+        fields = {name: one for name, one in self.fields.items() if name in arrays}
+        for name, one in fields.items():
+            array = arrays[name]
+            if array.ndim == 0 and one.shape:
+                raise ArrayError(f'array {name} is a single value')
+            if array.ndim == len(one.shape):
+                for letter, length in zip(one.shape, array.shape, strict=True):
+                    if isinstance(letter, str) and letter not in sizes and '+' not in letter:
+                        sizes |= {letter: length, f'{letter}+1': length + 1}
+        for name, one in fields.items():
+            array, shape = arrays[name], tuple(sizes.get(str(one), one) for one in one.shape)
+            if array.shape != shape:
+                expected = str(shape).replace("'", '')
+                raise ArrayError(f'array {name} has shape {array.shape}, expected {expected}')
+            if (array.dtype.kind not in _KINDS[one.type] if one.type in _KINDS
+                    else array.dtype != one.type):
+                raise ArrayError(f'array {name} has type {array.dtype}, expected {one.type}')
+        for letter, what in self.not_empty.items():
+            if sizes[letter] == 0:
+                raise ArrayError(f'holds no {what}')
+        for name, one in fields.items():
+            for check in one.checks:
+                check(name, arrays)
+
+    def _arrays(self, path: Path) -> dict[str, NDArray[Any]]:
+        try:
+            archive = zipfile.ZipFile(path)
+        except Exception as error:  # whatever zipfile meets in a broken file
+            with suppress(OSError), path.open('rb') as file:
+                if file.read(6) == b'\x93NUMPY':
+                    raise ArrayError('is a single array, not an npz file of named arrays'
+                                     ) from error
+            raise ArrayError(f'is no complete npz file ({error})') from error
+        with archive:
+            names = {name.removesuffix('.npy') for name in archive.namelist()}
+            for name, one in self.fields.items():
+                if name not in names and not one.is_optional:
+                    hints = [f' ({what})' for other, what in self.others.items() if other in names]
+                    raise ArrayError(f'array {name} is missing{"".join(hints)}')
+            arrays = {}
+            for name, one in self.fields.items():
+                if name in names:
+                    try:
+                        arrays[name] = self._array(path, archive, name, one.stays)
+                    except ArrayError:
+                        raise
+                    except Exception as error:  # whatever numpy and zipfile meet in a broken file
+                        raise ArrayError(f'array {name} cannot be read: {error}') from error
+            return arrays
+
+    def _array(self, path: Path, archive: zipfile.ZipFile, name: str, stays: bool) -> NDArray[Any]:
+        member = archive.getinfo(f'{name}.npy')
+        is_compressed = member.compress_type != zipfile.ZIP_STORED
+        if is_compressed and self.is_stored:
+            raise ArrayError(f'array {name} is compressed')
+        with archive.open(member) as stream:
+            if not stays or is_compressed:
+                array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+                return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
+            version = np.lib.format.read_magic(stream)
+            read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0)
+            shape, by_columns, dtype = read(stream)
+            start = stream.tell()
+            while self.checks_sums and stream.read(1 << 20):
+                pass  # to the end, where zipfile compares the check sum
+        with path.open('rb') as file:
+            # the local header repeats name and a further field, whose length may be another one
+            file.seek(member.header_offset + _ZIP_LENGTHS)
+            start += member.header_offset + _ZIP_HEAD + sum(struct.unpack('<HH', file.read(4)))
+        if dtype.hasobject:
+            raise ArrayError(f'array {name} cannot be read: it holds objects')
+        if 0 in shape:
+            return np.empty(shape, dtype)
+        mapped = np.memmap(path, dtype, 'r', start, shape, 'F' if by_columns else 'C')
+        return mapped if path.stat().st_size > self.largest_read else np.array(mapped)
