@@ -127,7 +127,7 @@ def test_malformed_arrays_are_named(file, changes, message):
 def test_a_truncated_file_is_named(file, share):
     content = file.read_bytes()
     file.write_bytes(content[:int(share * len(content))])
-    with pytest.raises(MapError, match='no complete npz file|cannot be read'):
+    with pytest.raises(MapError, match=r'no complete npz file|cannot be read'):
         load_layer_of_map(file, ROOM)
 
 

@@ -88,7 +88,7 @@ WRONG = {
     'infinite': ('medoids', np.full((3, 8), np.inf), 'medoids is not of unit length'),
     'short': ('medoids', unit_rows(3, 1) / 2, 'medoids is not of unit length'),
     'end': ('medoid_offsets', np.array([0, 1, 2, 2]), 'medoid_offsets goes from 0 to 2'),
-    'falling': ('medoid_offsets', np.array([0, 3, 2, 3]), 'medoid_offsets gives'),
+    'falling': ('medoid_offsets', np.array([0, 3, 2, 3]), 'medoid_offsets decreases'),
     'floats': ('medoid_offsets', np.array([0.0, 2, 2, 3]), 'expected integers'),
 }
 
