@@ -29,6 +29,13 @@ def path(tmp_path):
     return path
 
 
+@pytest.fixture
+def document(path):
+    document = Document(path)
+    yield document
+    document.close()
+
+
 def changed_lines(path, text=TEXT):
     """Return the lines that the file has lost and won, without their indentation."""
     old, new = text.splitlines(), path.read_text().splitlines()
@@ -36,8 +43,7 @@ def changed_lines(path, text=TEXT):
             [line.strip() for line in new if line not in old])
 
 
-def test_an_edit_changes_its_line_only(path):
-    document = Document(path)
+def test_an_edit_changes_its_line_only(document, path):
     document.apply(edits.move(document.landmarks, 'cup_1', [1.25, 2, 0.5]))
     document.save()
     assert changed_lines(path) == (['center: [1.0, 2.0, 0.5]   # from the plan'],
@@ -45,15 +51,13 @@ def test_an_edit_changes_its_line_only(path):
     assert LandmarkMap.from_file(path).centers[0].tolist() == [1.25, 2.0, 0.5]
 
 
-def test_saving_without_an_edit_changes_no_character(path):
-    document = Document(path)
+def test_saving_without_an_edit_changes_no_character(document, path):
     document.save()
     assert path.read_text() == TEXT
 
 
-def test_all_kinds_of_lines(path):
+def test_all_kinds_of_lines(document, path):
     """A list over several lines, a folded text, a new field, and one that goes."""
-    document = Document(path)
     document.apply(edits.relabel(document.landmarks, ['book_1', 'plant_1'], 'yes: "no" # <b>'))
     document.apply(edits.move(document.landmarks, 'book_1', [0, 0, 1e-6]))
     document.apply(edits.reclass(document.landmarks, ['book_1'], 'off'))
@@ -68,8 +72,7 @@ def test_all_kinds_of_lines(path):
     assert read_parameter_file(path)['other_node'] == {'ros__parameters': {'rate': 5.0}}
 
 
-def test_a_comment_goes_with_its_landmark(path):
-    document = Document(path)
+def test_a_comment_goes_with_its_landmark(document, path):
     document.apply(edits.delete(document.landmarks, ['book_1']))
     document.save()
     text = path.read_text()
@@ -77,8 +80,7 @@ def test_a_comment_goes_with_its_landmark(path):
     assert LandmarkMap.from_file(path).landmark_ids == ('cup_1', 'plant_1')
 
 
-def test_new_landmarks_follow_the_last_one(path):
-    document = Document(path)
+def test_new_landmarks_follow_the_last_one(document, path):
     change = edits.create(document.landmarks, 'a lamp', 'floor lamp', np.ones(3), np.eye(3))
     document.apply(change)
     document.apply(edits.split(document.landmarks, 'plant_1'))
@@ -149,8 +151,7 @@ def test_windows_line_ends(tmp_path):
     assert len(LandmarkMap.from_file(path)) == 4
 
 
-def test_every_edit_is_undone_and_done_again(path):
-    document = Document(path)
+def test_every_edit_is_undone_and_done_again(document):
     states = [document.landmarks]
     for edit in (lambda all: edits.move(all, 'cup_1', [9, 9, 9]),
                  lambda all: edits.rotate(all, 'cup_1', [0, 0, 2, 2]),
@@ -176,8 +177,7 @@ def test_every_edit_is_undone_and_done_again(path):
     assert not document.redo()
 
 
-def test_a_drag_is_one_edit(path):
-    document = Document(path)
+def test_a_drag_is_one_edit(document):
     for x in range(5):
         document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag 1')
     document.apply(edits.move(document.landmarks, 'cup_1', [7, 0, 0]), gesture='drag 2')
@@ -199,15 +199,13 @@ def test_a_drag_is_one_edit(path):
     (lambda all: edits.delete(all, ['sofa']), "no landmark 'sofa'"),
     (lambda all: edits.merge(all, ['cup_1', 'cup_1']), 'two landmarks or more'),
 ])
-def test_what_no_map_may_hold_is_refused(path, edit, message):
-    document = Document(path)
+def test_what_no_map_may_hold_is_refused(document, edit, message):
     with pytest.raises(CliplocError, match=message):
         document.apply(edit(document.landmarks))
     assert document.is_saved and document.to_undo is None
 
 
-def test_a_locked_landmark_is_not_edited(path):
-    document = Document(path)
+def test_a_locked_landmark_is_not_edited(document, path):
     document.apply(edits.lock(document.landmarks, ['cup_1']))
     for edit in (lambda all: edits.move(all, 'cup_1', [0, 0, 0]),
                  lambda all: edits.delete(all, ['cup_1']),
@@ -220,8 +218,7 @@ def test_a_locked_landmark_is_not_edited(path):
     assert Document(path).landmarks['cup_1'].is_locked, 'but the journal keeps it'
 
 
-def test_a_moved_landmark_has_no_measured_uncertainty(path):
-    document = Document(path)
+def test_a_moved_landmark_has_no_measured_uncertainty(document, path):
     document.apply(edits.move(document.landmarks, 'book_1', [0, 0, 0]))
     assert 'position_sigma' not in document.landmarks['book_1'].fields
     document.undo()
@@ -229,9 +226,8 @@ def test_a_moved_landmark_has_no_measured_uncertainty(path):
     assert path.read_text() == TEXT
 
 
-def test_merging_halves_gives_back_the_whole(path):
+def test_merging_halves_gives_back_the_whole(document):
     """The halves of a split lie in the whole; their union's moments are near its moments."""
-    document = Document(path)
     whole = document.landmarks['plant_1']
     document.apply(edits.split(document.landmarks, 'plant_1'))
     first, second = (document.landmarks[key] for key in ('plant_1', 'plant_2'))
@@ -245,8 +241,7 @@ def test_merging_halves_gives_back_the_whole(path):
     assert np.allclose(squares, [0.1**2, 0.15**2, 6 * 0.15**2], rtol=1e-4)
 
 
-def test_equal_landmarks_merge_to_themselves(path):
-    document = Document(path)
+def test_equal_landmarks_merge_to_themselves(document):
     quat = Rotation.from_euler('xyz', [0.3, 0.2, 0.1]).as_quat()
     document.apply(edits.rotate(document.landmarks, 'plant_1', quat))
     one = document.landmarks['plant_1']
@@ -259,8 +254,7 @@ def test_equal_landmarks_merge_to_themselves(path):
 
 # ---- the file on the disk
 
-def test_a_file_that_changed_on_disk_is_not_overwritten(path):
-    document = Document(path)
+def test_a_file_that_changed_on_disk_is_not_overwritten(document, path):
     document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
     theirs = TEXT.replace('a red cup', 'theirs')
     path.write_text(theirs)
@@ -274,8 +268,7 @@ def test_a_file_that_changed_on_disk_is_not_overwritten(path):
     assert LandmarkMap.from_file(path).labels[0] == 'mine'
 
 
-def test_reloading_is_an_edit(path):
-    document = Document(path)
+def test_reloading_is_an_edit(document, path):
     document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
     document.apply(edits.delete(document.landmarks, ['book_1']))
     path.write_text(TEXT.replace('a red cup', 'theirs'))
@@ -287,8 +280,7 @@ def test_reloading_is_an_edit(path):
     assert document.landmarks['cup_1'].label == 'mine' and 'book_1' not in document.landmarks
 
 
-def test_an_empty_map_is_not_saved(path):
-    document = Document(path)
+def test_an_empty_map_is_not_saved(document, path):
     document.apply(edits.delete(document.landmarks, list(document.landmarks)))
     with pytest.raises(EditError, match='without landmarks'):
         document.save()

@@ -201,3 +201,4 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
     assert (drawn_m < 0.5).sum() >= (true_m < 0.5).sum() - 2
     assert (drawn_m < 0.5)[shown >= 4].mean() > 0.7
     assert not (found['drawn'].accepted & (found['drawn'].errors_m > 1.0)).any()
+    assert (list(found.values())[2].errors_m[0] < 0.25).mean() > 0.8, 'all objects'
