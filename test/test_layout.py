@@ -30,6 +30,7 @@ LAYERS = (
     ('messages', 'command'),
     ('models', 'datasets', 'vocabulary'),
     ('recording',),
+    ('make_map',),
     ('evaluation',),
     ('ros.qos', 'ros.conversions'),
     ('ros.node',),

@@ -7,30 +7,25 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from cliploc_ros.cli.map_labels import Labeller, add_label_options, prepare_labels
-from cliploc_ros.cli.map_layer import add_layer_options, check_layer_options, write_layer
-from cliploc_ros.cli.sources import add_source_options, read_source, source_of
+from cliploc_ros.cli.map_layer import (
+    add_layer_options,
+    check_layer_options,
+    layer_input,
+    write_layer,
+)
+from cliploc_ros.cli.sources import add_source_options, clip_options, read_source, source_of
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.cli.map_labels import Labeller
-    from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.options import MappingOptions
-    from cliploc_ros.mapping.posed_detections import PosedDetections
-    from cliploc_ros.mapping.updating.updating import UpdatedMap
+    import numpy as np
+    from numpy.typing import NDArray
 
+    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 
-# Standard deviations of poses that a localizer gives [m] [deg]. Guesses; the map holds on to exact
-# ones all the same.
-_USUAL_NOISE = (0.05, 1.0)
 EPILOG = """\
 examples:
   build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \\
@@ -43,80 +38,6 @@ examples:
   build_map --rgbd kitchen --out kitchen.yaml --keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
-
-
-@dataclass(frozen=True)
-class OldMap:
-    """A map to update, and the image embeddings next to it."""
-
-    landmark_map: 'LandmarkMap'
-    embeddings: 'LandmarkEmbeddings | None'
-
-
-def read_old_map(path: Path) -> OldMap:
-    """Read a map to update.
-
-    Raises
-    ------
-    MapError
-        The map or its embeddings are invalid.
-    """
-    from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-
-    landmark_map = LandmarkMap.from_file(path)
-    return OldMap(landmark_map, load_embeddings_of_map(path, landmark_map.landmark_ids))
-
-
-def with_usual_noise(mapping: 'MappingOptions') -> 'MappingOptions':
-    """Return options with which poses are refined against the old map."""
-    from cliploc_ros.mapping.options import PoseErrors
-
-    return replace(mapping, pose_errors=PoseErrors(*_USUAL_NOISE))
-
-
-def update_old_map(old: OldMap, detections: 'PosedDetections', mapping: 'MappingOptions',
-                   labeller: 'Labeller') -> 'UpdatedMap':
-    """Return the update of a map, its new landmarks labelled.
-
-    Raises
-    ------
-    CliplocError
-        The recording does not belong to the map, or the text tower cannot be loaded.
-    """
-    from cliploc_ros.mapping.updating.options import UpdateOptions
-    from cliploc_ros.mapping.updating.updating import update_map
-
-    updated = update_map(old.landmark_map, detections, UpdateOptions(mapping=mapping),
-                         old.embeddings)
-    return _label_new(updated, detections, labeller)
-
-
-def _label_new(updated: 'UpdatedMap', detections: 'PosedDetections', labeller: 'Labeller'
-               ) -> 'UpdatedMap':
-    """Return the update with phrases as labels of its new landmarks; the others keep theirs."""
-    landmark_map, first = updated.landmark_map, updated.first_new
-    if first == len(landmark_map):
-        return updated
-    new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
-                               np.where(updated.shown >= first, updated.shown - first, -1))
-    labelled = replace(
-        landmark_map, labels=landmark_map.labels[:first] + new.labels,
-        details=landmark_map.details[:first] + new.details)
-    texts = dict(zip(new.landmark_ids, new.labels, strict=True))
-    report = replace(updated.report, new=tuple(
-        replace(one, label=texts[one.landmark_id]) for one in updated.report.new))
-    return replace(updated, landmark_map=labelled, report=report)
-
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-    from cliploc_ros.mapping.posed_detections import PosedDetections
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -144,7 +65,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
-    add_label_options(parser)
+    labels = parser.add_argument_group('labels')
+    labels.add_argument('--vocabulary', type=Path, metavar='FILE',
+                        help='phrases by class (YAML), besides the shipped ones')
     add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
@@ -172,78 +95,56 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer_file import remove_layer
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
+    from cliploc_ros.make_map import find_labeller, make_map, update_map
 
     begin = time.monotonic()
     # Refuse an output whose folder is missing, before the work is done.
-    path = options.out
+    path, update = options.out, options.update
     if not path.parent.is_dir():
         raise MappingError(f'{path}: there is no folder {path.parent}; create it')
     if path.is_dir():
         raise MappingError(f'{path} is a folder; name the map file to write')
     check_layer_options(options)
-    old = None if options.update is None else read_old_map(options.update)
+    if update is not None:
+        LandmarkMap.from_file(update)
+        if options.refine_mount:
+            raise OptionsError('--refine-mount is for new maps, not for --update')
+    mapping = _mapping_options(options)
     recorded = read_source(options)
     detections = recorded.detections
     if recorded.without_pose:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    labeller = prepare_labels(options, detections)
-    made = _build(options, detections, labeller) if old is None else _update(
-        options, old, detections, labeller)
-    write_map(options.out, made.landmark_map, made.comments, made.embeddings)
-    lines = list(made.lines)
-    is_same_map = old is not None and options.out.resolve() == options.update.resolve()
-    if not is_same_map and (note := remove_layer(options.out)):
+    labeller = find_labeller(detections, clip_options(options) if options.clip else None,
+                             options.vocabulary)
+    name = source_of(options).name
+    if update is None:
+        with _ProgressBar() as bar:
+            made = make_map(detections, labeller, mapping, *layer_input(options), bar.show)
+        lines = made.report.lines()
+        head = [f'built by build_map from {name}', *lines[:2]]
+        if made.mount is not None:
+            lines.append(_mount_option(options, made.mount.given_from_corrected))
+    else:
+        made = update_map(update, detections, labeller, mapping)
+        lines = made.report.lines()
+        head = [f'{update.name}, updated by build_map from {name}', lines[0]]
+    write_map(path, made.landmark_map, head, made.embeddings)
+    is_same_map = update is not None and path.resolve() == update.resolve()
+    if not is_same_map and (note := remove_layer(path)):
         lines.append(note)
-    lines += write_layer(options, made.landmark_map)
+    if made.layer is not None:
+        lines.append(write_layer(path, made.layer))
     if options.report is not None:
-        _write_report(options.report, made.report)
+        _write_report(options.report, made.report.as_dict())
     print('\n'.join(lines))
     if labeller.note:
         print(f'note: {labeller.note}')
-    print(f'wrote {options.out} in {time.monotonic() - begin:.1f} s')
+    print(f'wrote {path} in {time.monotonic() - begin:.1f} s')
     return 0
-
-
-class _Made(NamedTuple):
-    """A map, what belongs next to it and to its head, and the report: as text and for JSON."""
-
-    landmark_map: 'LandmarkMap'
-    embeddings: 'LandmarkEmbeddings | None'
-    comments: list[str]
-    lines: list[str]
-    report: dict[str, Any]
-
-
-def _build(options: argparse.Namespace, detections: 'PosedDetections', labeller: Labeller
-           ) -> _Made:
-    from cliploc_ros.mapping.building import build_map
-
-    with _ProgressBar() as bar:
-        built = build_map(detections, _mapping_options(options), bar.show)
-    lines = built.report.lines()
-    head = [f'built by build_map from {source_of(options).name}', *lines[:2]]
-    if built.mount is not None:
-        lines.append(_mount_option(options, built.mount.given_from_corrected))
-    return _Made(*labeller.describe(built.landmark_map, detections, built.shown), head, lines,
-                 built.report.as_dict())
-
-
-def _update(options: argparse.Namespace, old: OldMap, detections: 'PosedDetections',
-            labeller: Labeller) -> _Made:
-    if options.refine_mount:
-        raise OptionsError('--refine-mount is for new maps, not for --update')
-    mapping = _mapping_options(options)
-    if mapping.pose_errors is None and options.joint is None:
-        mapping = with_usual_noise(mapping)
-    updated = update_old_map(old, detections, mapping, labeller)
-    lines = updated.report.lines()
-    head = [f'{options.update.name}, updated by build_map from {source_of(options).name}',
-            lines[0]]
-    return _Made(updated.landmark_map, updated.embeddings, head, lines,
-                 updated.report.as_dict())
 
 
 def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':

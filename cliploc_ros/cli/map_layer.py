@@ -13,6 +13,8 @@ from cliploc_ros.errors import MapError, OptionsError
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.frames import Frames
+    from cliploc_ros.recording.keyframe_layer import LayerOptions
 
 _DEFAULT_POINTS = 600
 
@@ -56,29 +58,27 @@ def check_layer_options(options: argparse.Namespace) -> None:
                            'corrected --mount')
 
 
-def write_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> list[str]:
-    """Write the layer of a new map where it is asked for; return what was written, in lines.
+def layer_input(options: argparse.Namespace) -> 'tuple[Frames | None, LayerOptions | None]':
+    """Return the images that become keyframes, and how; None where no layer is asked for."""
+    from cliploc_ros.recording.keyframe_layer import LayerOptions
 
-    Raises
-    ------
-    MappingError
-        No image has enough points.
-    """
     if not options.keyframe_layer:
-        return []
-    from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
-    from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-
+        return None, None
     distance_m, angle_deg = options.keyframes
-    layer = build_layer(read_frames(options), landmark_map,
-                        LayerOptions(distance_m, angle_deg, options.keyframe_points,
-                                     options.keyframe_images))
-    path = layer_path(options.out)
+    return read_frames(options), LayerOptions(distance_m, angle_deg, options.keyframe_points,
+                                              options.keyframe_images)
+
+
+def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:
+    """Write a layer next to its map; return what was written, in a line."""
+    from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+
+    path = layer_path(map_file)
     save_layer(path, layer)
     megabytes = path.stat().st_size / 1e6
     images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
-    return [f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
-            f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}']
+    return (f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
+            f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}')
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:

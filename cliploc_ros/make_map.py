@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Mapping as a library: what a recording shows becomes a map with labels, images and keyframes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.datasets.frames import Frames
+from cliploc_ros.errors import ModelError
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
+from cliploc_ros.mapping.mount import MountCorrection
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.report import MappingReport
+from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.mapping.updating.report import UpdateReport
+from cliploc_ros.mapping.updating.updating import update_map as update_landmarks
+from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.phrase_embeddings import phrases_of_classes
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
+
+# Standard deviations of poses that a localizer gives [m] [deg]. Guesses; the map holds on to exact
+# ones all the same.
+_USUAL_NOISE = PoseErrors(0.05, 1.0)
+
+
+@dataclass(frozen=True)
+class MadeMap:
+    """A map and what belongs next to it.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+    report : MappingReport or UpdateReport
+        What was found and left out, and why.
+    embeddings : LandmarkEmbeddings, optional
+        What CLIP saw of each landmark.
+    layer : KeyframeLayer, optional
+    mount : MountCorrection, optional
+        Where a correction was asked for.
+    """
+
+    landmark_map: LandmarkMap
+    report: MappingReport | UpdateReport
+    embeddings: LandmarkEmbeddings | None = None
+    layer: KeyframeLayer | None = None
+    mount: MountCorrection | None = None
+
+
+@dataclass(frozen=True)
+class Labeller:
+    """Describes landmarks: by the words of a vocabulary, or by their class where CLIP is missing.
+
+    Parameters
+    ----------
+    vocabulary : Vocabulary
+    clip : ClipOptions, optional
+        The CLIP that made the embeddings of the recording, with its weights; None: labels are
+        class names.
+    weights : ClipWeights, optional
+    note : str
+        Why labels are class names; '' where they are not.
+    """
+
+    vocabulary: Vocabulary
+    clip: ClipOptions | None = None
+    weights: ClipWeights | None = None
+    note: str = ''
+
+    def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
+                 shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
+        """Return the map with labels, and its image embeddings.
+
+        Parameters
+        ----------
+        landmark_map : LandmarkMap
+        detections : PosedDetections
+        shown : ndarray (n,) of int
+            Row of the landmark that each box shows, -1 for none.
+
+        Raises
+        ------
+        CliplocError
+            The text tower cannot be loaded.
+        """
+        if not _has_embeddings(detections):
+            return landmark_map, None
+        embeddings = embed_landmarks(landmark_map.landmark_ids, detections, shown)
+        if self.clip is None or self.weights is None:
+            return landmark_map, embeddings
+        names = sorted({name for row in range(len(landmark_map))
+                        for name in classes_of(landmark_map, row)})
+        # in two parts: the user's phrases change more often than the shipped ones
+        phrases = phrases_of_classes(self.weights, self.clip, [
+            {name: shipped_phrases(name) for name in names},
+            {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
+        return label_landmarks(landmark_map, embeddings, phrases), embeddings
+
+
+def find_labeller(detections: PosedDetections, clip: ClipOptions | None,
+                  vocabulary: Path | None = None) -> Labeller:
+    """Return what labels the landmarks of a recording.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+    clip : ClipOptions, optional
+        The CLIP of the recording; None: labels are class names.
+    vocabulary : Path, optional
+        Phrases by class (YAML), besides the shipped ones.
+
+    Raises
+    ------
+    OptionsError, ModelError
+        The vocabulary is invalid, or given where nothing can be labelled.
+    """
+    words = load_vocabulary(vocabulary)
+    try:
+        if clip is None:
+            raise ModelError('--no-clip was given')
+        return Labeller(words, clip, _weights_of(detections, clip))
+    except ModelError as error:
+        if vocabulary is not None:
+            raise
+        return Labeller(words, note=f'labels are class names: {error}')
+
+
+def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
+    """Return the weights that made the embeddings; ModelError where they are not at hand."""
+    if not _has_embeddings(detections):
+        raise ModelError('the observations have no CLIP embeddings that name their encoder; '
+                         'record them again with CLIP')
+    hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
+    theirs = detections.encoder_key.split(':')[0]
+    ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
+    # compared first, since the weights of another model would be downloaded in vain
+    if ours != theirs:
+        raise ModelError(f"the embeddings are of CLIP model '{theirs}', not '{ours}'; {hint}")
+    weights = resolve_clip_weights(clip)
+    if weights.key != detections.encoder_key:
+        raise ModelError(f'the embeddings are of the weights {detections.encoder_key}, not '
+                         f'{weights.key}; {hint}')
+    assert detections.embeddings is not None
+    if detections.embeddings.shape[1] != weights.embed_dim:
+        raise ModelError(f'the embeddings have {detections.embeddings.shape[1]} numbers, but '
+                         f'{weights.key} gives {weights.embed_dim}; record them again')
+    return weights
+
+
+def _has_embeddings(detections: PosedDetections) -> bool:
+    embeddings = detections.embeddings
+    return embeddings is not None and embeddings.size > 0 and bool(detections.encoder_key)
+
+
+def make_map(detections: PosedDetections, labeller: Labeller,
+             options: MappingOptions | None = None, frames: Frames | None = None,
+             layer: LayerOptions | None = None,
+             progress: Callable[[str, float], None] | None = None) -> MadeMap:
+    """Make a map of a recording.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+        Boxes and poses of the recording: ``load_observations``, or ``record_once`` for images.
+    labeller : Labeller
+        See find_labeller.
+    options : MappingOptions, optional
+    frames : Frames, optional
+        The images, for the layer of keyframes.
+    layer : LayerOptions, optional
+        None: without keyframes.
+    progress : callable, optional
+        Called with the name of a stage and the share of it that is done, 0 to 1.
+
+    Raises
+    ------
+    CliplocError
+        No map can be made of this input; the message says what to correct.
+    """
+    built = build_map(detections, options, progress)
+    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+    return MadeMap(landmark_map, built.report, embeddings,
+                   None if frames is None or layer is None
+                   else build_layer(frames, landmark_map, layer), built.mount)
+
+
+def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
+               options: MappingOptions) -> MadeMap:
+    """Bring a map file up to date with a recording; its file is not written.
+
+    Poses are refined against the map. Without ``pose_errors`` that tell how far they may be off,
+    those of a localizer are assumed, unless the poses are to be taken as they are.
+
+    Raises
+    ------
+    CliplocError
+        The map is invalid, the recording does not belong to it, or the text tower cannot be
+        loaded.
+    """
+    old = LandmarkMap.from_file(path)
+    old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
+    if options.pose_errors is None and options.estimate_pose_errors:
+        options = replace(options, pose_errors=_USUAL_NOISE)
+    updated = update_landmarks(old, detections, UpdateOptions(mapping=options), old_embeddings)
+    landmark_map, first = updated.landmark_map, updated.first_new
+    if first == len(landmark_map):
+        return MadeMap(landmark_map, updated.report, updated.embeddings)
+    # only the new landmarks get labels; the others keep theirs
+    new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
+                               np.where(updated.shown >= first, updated.shown - first, -1))
+    texts = dict(zip(new.landmark_ids, new.labels, strict=True))
+    return MadeMap(
+        replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
+                details=landmark_map.details[:first] + new.details),
+        replace(updated.report, new=tuple(
+            replace(one, label=texts[one.landmark_id]) for one in updated.report.new)),
+        updated.embeddings)
