@@ -11,6 +11,10 @@ from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
 
 if TYPE_CHECKING:
+    from cliploc_ros.datasets.bag_frames import ReadPoses
+    from cliploc_ros.datasets.frames import DepthFormat, Frames
+    from cliploc_ros.datasets.observations import Recorded
+    from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.yolo_weights import YoloOptions
 
@@ -49,13 +53,6 @@ def clip_options(options: argparse.Namespace) -> 'ClipOptions':
     return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
                                     device=options.device, inference=options.inference),
                         options.profile)
-
-
-if TYPE_CHECKING:
-    from cliploc_ros.datasets.bag_frames import ReadPoses
-    from cliploc_ros.datasets.frames import DepthFormat, Frames
-    from cliploc_ros.datasets.observations import Recorded
-    from cliploc_ros.datasets.poses import Poses
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:

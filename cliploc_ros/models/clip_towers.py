@@ -17,6 +17,7 @@ from cliploc_ros.models.files import check_weights_file, damaged, first_line
 
 if TYPE_CHECKING:
     import torch
+    from PIL.Image import Image
 
 # Apple's MobileCLIP and Google's big_vision: open_clip converts these into the model it fills.
 _FOREIGN_PREFIX = 'image_encoder.'
@@ -93,11 +94,6 @@ def _first_cause(error: pickle.UnpicklingError) -> str:
     """Return the line of torch's long message that names the refused class."""
     lines = str(error).splitlines() or ['']
     return next((line.strip() for line in lines if 'Unsupported' in line), lines[0])
-
-
-if TYPE_CHECKING:
-    import torch
-    from PIL.Image import Image
 
 
 def load_image_tower(
