@@ -114,7 +114,7 @@ def test_a_missing_or_bad_layer_is_refused_only_where_it_is_asked_for(
     layer_path(path).write_bytes(b'no layer')
     code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
     assert code == 1
-    assert 'is no complete layer' in err
+    assert 'is no complete npz file' in err
     # without being asked for, the layer is left out, and the next problem is named
     code, out, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--out', tmp_path / 'out'))
     assert code == 1
