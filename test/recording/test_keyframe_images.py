@@ -111,7 +111,7 @@ def test_offsets_that_do_not_count_the_bytes_are_named(frame, demo_map, tmp_path
     layer = build_layer(wall(frame), demo_map, WITH_IMAGES)
     path = tmp_path / 'map.keyframes.npz'
     wrong = replace(layer, image_offsets=layer.image_offsets + 1)
-    with pytest.raises(MapError, match='array image_offsets goes from 1 to .* the number of bytes'):
+    with pytest.raises(MapError, match=r'image_offsets goes from 1 to .* the number of bytes'):
         save_layer(path, wrong)
     assert not path.exists()
     noise = replace(layer, images=np.zeros_like(layer.images))
