@@ -15,7 +15,7 @@ from rclpy.node import Node
 
 from cliploc_ros.cache_folder import resolve_cache_dir
 from cliploc_ros.core.index.similarities import Similarities, split_similarities
-from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
+from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.maps.joined_map import parts_of
 from cliploc_ros.core.maps.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
