@@ -71,7 +71,6 @@ class Observation:
 
     Parameters
     ----------
-    camera : Camera
     detections : Detections
         n of them.
     similarities : ndarray (n, L), CropSimilarities or None

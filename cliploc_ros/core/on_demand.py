@@ -57,7 +57,6 @@ def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     observation : Observation
         Its similarities are ignored.
     compare : callable
@@ -102,7 +101,6 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
 
     Parameters
     ----------
-    relocalizer : Relocalizer
     earlier : sequence of SearchedFrame
         Frames before it, linked by odometry.
     observations : iterable of Observation

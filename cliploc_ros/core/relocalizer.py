@@ -37,11 +37,6 @@ _NO_LOOKS = Looks()
 class Relocalizer:
     """Finds camera poses in one map.
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-
     Raises
     ------
     OptionsError
@@ -117,7 +112,6 @@ class Relocalizer:
 
         Parameters
         ----------
-        frames : sequence of SearchedFrame
         budget : TimeBudget, optional
             Time left for the refinement; a new one by default.
         looks : Looks, optional

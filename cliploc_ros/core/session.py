@@ -38,12 +38,7 @@ class KeptFrame(NamedTuple):
 
 
 class Session:
-    """Localizes with each frame and those before it.
-
-    Parameters
-    ----------
-    relocalizer : Relocalizer
-    """
+    """Localizes with each frame and those before it."""
 
     def __init__(self, relocalizer: Relocalizer) -> None:
         self._relocalizer = relocalizer

@@ -31,9 +31,6 @@ class JoinedFrames(NamedTuple):
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-    frames : sequence of F SearchedFrame
     rig : Rig
         The same frames.
     cameras : ndarray (F, 4, 4)
@@ -115,8 +112,6 @@ def candidates_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: 
 
     Parameters
     ----------
-    joined : JoinedFrames
-    finalists : sequence of m Finalist
     upright : sequence of m bool
         See Candidate.is_upright.
     """

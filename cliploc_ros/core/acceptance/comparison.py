@@ -110,7 +110,6 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
 
     Parameters
     ----------
-    joined : JoinedFrames
     finalists : sequence of m Finalist
         Of the search of objects.
     is_upright : ndarray (m,) of bool
@@ -200,8 +199,6 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
 
     Parameters
     ----------
-    joined : JoinedFrames
-    compared : Comparison
     covariance : ndarray (6, 6)
         Of the leading pose.
     looks : Looks

@@ -64,7 +64,6 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
     Parameters
     ----------
-    place : RecognizedPlace
     support : Support
         By objects.
     boxes : ndarray (b, 4)
@@ -93,7 +92,6 @@ def chance_genuine(signs: Signs, motion: Motion | None = None,
 
     Parameters
     ----------
-    signs : Signs
     motion : Motion, optional
         Since an earlier look.
     """

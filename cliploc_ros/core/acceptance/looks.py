@@ -35,7 +35,6 @@ class Look(NamedTuple):
 
     Parameters
     ----------
-    observation : Observation
     map_from_camera : ndarray (4, 4)
     confidence : float
         From the frames of this look alone.

@@ -96,8 +96,6 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    frames : sequence of F ComparedFrame
     map_from_cameras : ndarray (F, 4, 4)
         Pose of the camera in each frame.
     matches : sequence of F sequence of Match

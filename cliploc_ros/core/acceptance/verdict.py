@@ -56,7 +56,6 @@ class Evidence:
         cliploc_ros.core.acceptance.confidence.
     by_points : float
         The same without what objects say for it; 0 where keyframes do not propose it.
-    rival : Rival or None
     distinct : float
         Probability that its place is not mistaken for one that looks alike.
     place, twin : tuple of float, optional

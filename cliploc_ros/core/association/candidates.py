@@ -65,7 +65,6 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64]) -> Candidate
 
     Parameters
     ----------
-    index : ClassIndex
     classes : ndarray (n,) of int
         Class of each detection, as the index numbers them; below 0 for none.
     """
@@ -144,7 +143,6 @@ def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candid
 
     Parameters
     ----------
-    first, second : Candidates
     landmark_count : int
         Number of landmarks of the map.
     """

@@ -132,7 +132,6 @@ def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
 
     Parameters
     ----------
-    radius_m : float
     covariance : ndarray (6, 6)
         As of pose_covariance.
     """

@@ -110,7 +110,6 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
 
     Parameters
     ----------
-    frames : sequence of SearchedFrame
     rig : Rig
         The same frames.
     refine : bool
@@ -195,8 +194,6 @@ def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
 
     Parameters
     ----------
-    frames : sequence of SearchedFrame
-    pose : Finalist
     matches : sequence of sequence of Match
         Inliers of the pose in each frame.
     """
@@ -223,10 +220,8 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
 
     Parameters
     ----------
-    frames : sequence of SearchedFrame
     rig : Rig
         The same frames.
-    pose : Finalist
     matches : sequence of sequence of Match
         Inliers of the pose in each frame.
     shared : ndarray (L, 2), optional

@@ -133,17 +133,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of what the covariance gains if each of n objects in turn is left out.
-
-    Parameters
-    ----------
-    information, noise : ndarray (n, 6, 6)
-        Without each object.
-    gradients : ndarray (n, 6)
-        Of each object: the others had the opposite one.
-    matched : ndarray (6, 6)
-        The covariance with all.
-    """
+    """Return the sum of what the covariance gains if each of n objects in turn is left out."""
     limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
@@ -230,31 +220,14 @@ def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.fl
 
 def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
                   ) -> NDArray[np.float64]:
-    """Return what the errors that n objects have in common add to M (6, 6).
-
-    Parameters
-    ----------
-    of_objects : ndarray (n, 6, 6)
-        What each object tells.
-    shared : ndarray (n, 2)
-        See refined_covariance.
-    """
+    """Return what the errors that n objects have in common add to M (6, 6)."""
     pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
     return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
                     stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return what the errors of odometry add to M (6, 6).
-
-    Parameters
-    ----------
-    cameras : ndarray (F, 4, 4)
-        map_from_camera; the last one is the reference.
-    information : ndarray (F, 6, 6)
-        Of each frame, in steps of the reference.
-    stamps_ns : ndarray (F,)
-    """
+    """Return what the errors of odometry add to M (6, 6)."""
     noise = np.zeros((6, 6))
     order = np.argsort(stamps_ns, kind='stable')
     last = int(np.argmax(order == len(order) - 1))

@@ -52,7 +52,6 @@ class Rig(NamedTuple):
     scene : Scene
         All arrays but the map's are concatenated. Numbers in them count within their frame, and
         starts have an end of their own for each frame. It has no pairs.
-    starts : FrameStarts
     cameras : ndarray (F, 3, 4)
         Rotation and translation of each camera_from_reference.
     verticals : ndarray (F, 7)

@@ -126,7 +126,6 @@ def choose_distinct(scores: NDArray[np.float64], rotations: NDArray[np.float64],
     scores : ndarray (m,)
     rotations, translations : ndarray (m, 3, 3), (m, 3)
         Of camera_from_map.
-    count : int
     """
     return _choose_distinct(np.argsort(-scores, kind='stable'), rotations, translations, count)
 

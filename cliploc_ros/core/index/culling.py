@@ -114,7 +114,6 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
 
     Parameters
     ----------
-    sorted_landmarks : SortedLandmarks
     classes : ndarray (n,) of int
         Class of each detection, as the sorted landmarks have them; below 0 for none.
     boxes : ndarray (n, 4)
@@ -148,15 +147,7 @@ def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np
 
 def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
                depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return levels and spheres of the tree over some landmarks, see Groups.
-
-    Parameters
-    ----------
-    centers, radii : ndarray (w, 3), (w,)
-        Of landmarks along a Morton curve.
-    depths : ndarray (w,)
-        The depth beyond which each appears too small.
-    """
+    """Return levels and spheres of the tree over some landmarks, see Groups."""
     spheres = [np.c_[centers, radii, depths]]
     low = high = centers
     while len(low) > 1:
@@ -203,13 +194,6 @@ def _reach(least_axes: float, angle: float) -> float:
 
     A sphere of radius r at a depth z and a distance d has an outline on the plane z = 1 whose
     semi-axes have the product ``r^2 sqrt(d^2 - r^2) / (z^2 - r^2)^(3/2)``.
-
-    Parameters
-    ----------
-    least_axes : float
-        Outlines with a smaller product of semi-axes are too small.
-    angle : float
-        Greatest angle between the optical axis and a landmark [rad].
     """
     widest = angle + _NEAR_ANGLE
     nearness = (np.sin(_NEAR_ANGLE) / np.cos(widest))**2 if widest < np.pi / 2 else 1.0
@@ -227,8 +211,6 @@ def visible_members(groups, poses, which, seen):
 
     Parameters
     ----------
-    groups : Groups
-    poses : Poses
     which : int
         Row of the pose.
     seen : ndarray (2, w) of int
@@ -281,7 +263,6 @@ def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out
         See visible_members.
     outlines, owners : ndarray (o, 6), (o,)
         Outlines that are visible and the group of each, written from row out on.
-    out : int
     """
     members = groups.members
     for place in range(visible_members(groups, poses, which, seen)):

@@ -102,7 +102,6 @@ class CropSimilarities:
     ----------
     crops : ndarray (n, d) float32
         Unit rows.
-    labels : LabelEmbeddings
     """
 
     crops: NDArray[np.float32]

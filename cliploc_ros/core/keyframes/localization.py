@@ -100,12 +100,7 @@ class _Place(NamedTuple):
 
 
 class KeyframeLocalizer:
-    """Localizes images in a layer of keyframes.
-
-    Parameters
-    ----------
-    layer : KeyframeLayer
-    """
+    """Localizes images in a layer of keyframes."""
 
     def __init__(self, layer: KeyframeLayer) -> None:
         self.layer = layer

@@ -25,10 +25,8 @@ class ImageRecognizer:
 
     Parameters
     ----------
-    keyframes : KeyframeLocalizer
     features : Features or callable
         Of the image; a callable is called when they are needed first.
-    camera : Camera
     deadline : float
         See KeyframeLocalizer.localize.
     begin_stage : callable

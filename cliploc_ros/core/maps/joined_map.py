@@ -49,7 +49,6 @@ class Place(NamedTuple):
 
     Parameters
     ----------
-    part : MapPart
     map_from_camera : ndarray (4, 4)
         In the coordinate frame of that map.
     name : str

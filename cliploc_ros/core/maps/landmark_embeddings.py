@@ -90,7 +90,6 @@ def concatenated(several: Sequence[LandmarkEmbeddings], landmark_ids: Sequence[s
 
     Parameters
     ----------
-    several : sequence of LandmarkEmbeddings
     landmark_ids : sequence of str
         New names of all landmarks, each once.
     """

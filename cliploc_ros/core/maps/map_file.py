@@ -34,7 +34,6 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     ----------
     path : str or path
         A YAML file.
-    landmark_map : LandmarkMap
     comments : iterable of str
         Lines for the head of the file.
     embeddings : LandmarkEmbeddings, optional

@@ -43,7 +43,6 @@ class SearchedFrame(NamedTuple):
 
     Parameters
     ----------
-    observation : Observation
     scene : Scene
         Of the observation.
     vertical : ndarray (7,)
@@ -52,7 +51,6 @@ class SearchedFrame(NamedTuple):
         The best hypotheses, as poses of this frame's camera.
     tilted : Leaders
         The best hypotheses that ignore the vertical, where it is known; else none.
-    progress : Progress
     samples : ndarray (t, 3) or None
         The samples tried; None for all samples of the first candidates, see progress.reach.
     firsts : tuple of int
@@ -95,9 +93,6 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    observation : Observation
-    options : RelocalizerOptions
     deadline : float
         When to stop, of time.perf_counter [s].
 

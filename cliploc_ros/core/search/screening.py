@@ -117,11 +117,8 @@ class Bench(NamedTuple):
         landmark of each correspondence candidate.
     prior : ndarray (9,)
         See Prior.as_array.
-    targets : Targets
-    sample : Sample
     poses : Poses
         Those that the sample allows.
-    overlaps : Overlaps
     """
 
     candidates: NDArray[np.float64]
@@ -137,7 +134,6 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
 
     Parameters
     ----------
-    scene : Scene
     prior : Prior, optional
         Poses that contradict it are not verified.
     """
@@ -294,12 +290,8 @@ def verify_beyond(targets, poses, which, overlaps, floor):
 
     Parameters
     ----------
-    targets : Targets
-    poses : Poses
     which : int
         Row of the pose.
-    overlaps : Overlaps
-    floor : float
     """
     groups, outlines = targets.groups, overlaps.outlines
     overlaps.best_bounds[:] = targets.iou_threshold

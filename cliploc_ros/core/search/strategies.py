@@ -60,7 +60,6 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
 
     Parameters
     ----------
-    scene : Scene
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
     leaders : Leaders
@@ -92,7 +91,6 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
 
     Parameters
     ----------
-    scene : Scene
     leaders : Leaders
         Takes the best hypotheses.
     prior : Prior, optional
@@ -129,7 +127,6 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
 
     Parameters
     ----------
-    scene : Scene
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.compatibility.
     leaders : Leaders
