@@ -34,19 +34,12 @@ _LEAST_SHARE = 1e-4
 
 
 class Known(NamedTuple):
-    """What a filter knows that fused all answers of one run of odometry.
+    """What a filter knows that fused all answers of one run of odometry."""
 
-    Parameters
-    ----------
-    odom_from_camera, map_from_camera : ndarray (4, 4)
-        At the last answer.
-    covariance : ndarray (6, 6)
-        As of Relocalization.
-    """
-
+    #: (4, 4): at the last answer
     odom_from_camera: NDArray[np.float64]
     map_from_camera: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    covariance: NDArray[np.float64]  #: (6, 6): as of Relocalization
 
 
 def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],

@@ -58,23 +58,13 @@ _MOST_GUESSES = 3
 
 
 class Comparison(NamedTuple):
-    """The candidates, and what decides between them.
+    """The candidates, and what decides between them."""
 
-    Parameters
-    ----------
-    candidates : list of m Candidate
-        The leading one first; of those of one source, one of each place.
-    poses : ndarray (m, 4, 4)
-    likely : ndarray (m,)
-        Probability of each, shared by those that agree.
-    recognition : Recognition or None
-        What keyframes say.
-    """
-
+    #: The leading one first; of those of one source, one of each place
     candidates: list[Candidate]
-    poses: NDArray[np.float64]
-    likely: NDArray[np.float64]
-    recognition: Recognition | None
+    poses: NDArray[np.float64]  #: (m, 4, 4)
+    likely: NDArray[np.float64]  #: (m,): probability of each, shared by those that agree
+    recognition: Recognition | None  #: What keyframes say
 
     @property
     def leading(self) -> NDArray[np.bool_]:

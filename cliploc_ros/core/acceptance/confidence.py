@@ -32,17 +32,10 @@ _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 
 
 class Setting(NamedTuple):
-    """What the chance of a wrong pose depends on, besides the supports.
+    """What the chance of a wrong pose depends on, besides the supports."""
 
-    Parameters
-    ----------
-    landmarks : int
-        Number of landmarks in the map.
-    vertical_deg : float
-        Standard deviation of the known vertical [deg]; infinite where none is known.
-    """
-
-    landmarks: int
+    landmarks: int  #: Number of landmarks in the map
+    #: Standard deviation of the known vertical [deg]; infinite where none is known
     vertical_deg: float = math.inf
 
     @property

@@ -46,23 +46,14 @@ _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
 
 
 class Alike(NamedTuple):
-    """Places that look like one place, the most alike first.
+    """Places that look like one place, the most alike first."""
 
-    Parameters
-    ----------
-    moves : ndarray (m, 4, 4)
-        Each takes the place onto another one: a turn about the vertical and a shift.
-    landmarks : ndarray (r,) of int
-        Landmarks of the place.
-    others : ndarray (m, r) of int
-        The landmark of its class at the same spot of the other place, where found.
-    found : ndarray (m, r) of bool
-    """
-
+    #: (m, 4, 4): each takes the place onto another one: a turn about the vertical and a shift
     moves: NDArray[np.float64]
-    landmarks: NDArray[np.int64]
+    landmarks: NDArray[np.int64]  #: (r,): landmarks of the place
+    #: (m, r): the landmark of its class at the same spot of the other place, where found
     others: NDArray[np.int64]
-    found: NDArray[np.bool_]
+    found: NDArray[np.bool_]  #: (m, r)
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:

@@ -29,60 +29,33 @@ _EDGE_DEVIATION = (0.2, 0.003)
 
 @dataclass(frozen=True)
 class Support:
-    """The support of a pose; each object counts once.
+    """The support of a pose; each object counts once."""
 
-    Parameters
-    ----------
-    inliers : int
-        Number of objects that are where the map has them.
-    score : float
-        Sum of their IoUs.
-    misfit : float
-        How far the edges of their boxes are from the outlines: Cauchy's robust sum.
-    likeness : float
-        How much more similar their crops are to the labels of their landmarks than to the map's
-        labels on average, in standard deviations, summed.
-    rarity : float
-        Summed over the objects that have a class of their landmark: the logarithm of the map's
-        number of landmarks for each landmark of this class. A chance match of a rare class is
-        rarer than one of a common class. A class that the detector takes the landmark for at
-        times counts by its share, see ClassIndex.shares.
-    unlabelled : float
-        Number of the objects that were matched by class alone.
-    unexplained : float
-        Number of other detected objects of the map's classes, which no landmark explains.
-    """
-
-    inliers: int = 0
-    score: float = 0.0
+    inliers: int = 0  #: Number of objects that are where the map has them
+    score: float = 0.0  #: Sum of their IoUs
+    #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
     misfit: float = 0.0
+    #: How much more similar their crops are to the labels of their landmarks than to the map's
+    #: labels on average, in standard deviations, summed
     likeness: float = 0.0
+    #: Summed over the objects that have a class of their landmark: the logarithm of the map's
+    #: number of landmarks for each landmark of this class. A chance match of a rare class is rarer
+    #: than one of a common class. A class that the detector takes the landmark for at times counts
+    #: by its share, see ClassIndex.shares.
     rarity: float = 0.0
-    unlabelled: float = 0.0
+    unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
+    #: Number of other detected objects of the map's classes, which no landmark explains
     unexplained: float = 0.0
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in.
+    """A frame to measure supports in."""
 
-    Parameters
-    ----------
-    bboxes_xyxy : ndarray (n, 4)
-        [px]
-    class_ids : tuple of str
-        Class of each detection, n of them.
-    similarities : Similarities or None
-        None where classes alone are matched.
-    scene : Scene
-        Of the same detections.
-    similarity_rows : ndarray (n,) of int
-        Row of similarities of each detection; -1 where its class alone is matched.
-    """
-
-    bboxes_xyxy: NDArray[np.float64]
-    class_ids: tuple[str, ...]
-    similarities: Similarities | None
-    scene: Scene
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4) [px]
+    class_ids: tuple[str, ...]  #: Class of each detection, n of them
+    similarities: Similarities | None  #: None where classes alone are matched
+    scene: Scene  #: Of the same detections
+    #: (n,): row of similarities of each detection; -1 where its class alone is matched
     similarity_rows: NDArray[np.int64]
 
 

@@ -20,21 +20,14 @@ from cliploc_ros.errors import OptionsError
 
 @dataclass(frozen=True)
 class Candidates:
-    """Correspondence candidates, in the order in which a sampler prefers them.
+    """Correspondence candidates, in the order in which a sampler prefers them."""
 
-    Parameters
-    ----------
-    detections, landmarks : ndarray (c,) of int
-        Indices of the pair.
-    ranks : ndarray (c,) of int
-        0 for a detection's most similar landmark, 1 for the next, and so on.
-    similarities : ndarray (c,)
-        Cosine similarity of crop and label; 0 where only the class is known.
-    """
-
+    #: (c,): indices of the pair
     detections: NDArray[np.int64]
     landmarks: NDArray[np.int64]
+    #: (c,): 0 for a detection's most similar landmark, 1 for the next, and so on
     ranks: NDArray[np.int64]
+    #: (c,): cosine similarity of crop and label; 0 where only the class is known
     similarities: NDArray[np.float64]
 
     def __len__(self) -> int:

@@ -11,52 +11,30 @@ from cliploc_ros.core.index.culling import Groups, SortedLandmarks, make_groups,
 
 
 class Potential(NamedTuple):
-    """Landmarks that single detections may show: u landmarks, p pairs.
+    """Landmarks that single detections may show: u landmarks, p pairs."""
 
-    Parameters
-    ----------
-    landmarks : ndarray (u,)
-        Rows in the map, each once.
-    starts : ndarray (u + 1,)
-        Where the detections of each landmark begin in detections.
-    detections : ndarray (p,)
-        The detections that may show each landmark.
-    """
-
-    landmarks: NDArray[np.int64]
+    landmarks: NDArray[np.int64]  #: (u,): rows in the map, each once
+    #: (u + 1,): where the detections of each landmark begin in detections
     starts: NDArray[np.int64]
-    detections: NDArray[np.int64]
+    detections: NDArray[np.int64]  #: (p,): the detections that may show each landmark
 
 
 class Scene(NamedTuple):
-    """One frame and the map: n detections, L landmarks, c candidates.
+    """One frame and the map: n detections, L landmarks, c candidates."""
 
-    Parameters
-    ----------
-    box_ellipses : ndarray (n, 4)
-        Centre x, y and semi-axes x, y of the ellipse inscribed in each box, on the plane z = 1.
-    bearings : ndarray (n, 3)
-        Unit vectors through the box centres.
-    centers, shapes : ndarray (L, 3), (L, 6)
-        Of the landmarks, see cliploc_ros.core.geometry.ellipsoid.
-    potential : Potential
-        Landmarks that single detections may show.
-    pairs : ndarray (c, 2)
-        Detection and landmark of each correspondence candidate, in order of preference.
-    iou_threshold : float
-        A detection and a landmark match only if their IoU is above this.
-    sorted_landmarks, groups : SortedLandmarks, Groups
-        Of a large map, the landmarks that detections may show because of their class. In a small
-        map both are empty, and these pairs are in potential.
-    """
-
+    #: (n, 4): centre x, y and semi-axes x, y of the ellipse inscribed in each box, on the plane z
+    #: = 1
     box_ellipses: NDArray[np.float64]
-    bearings: NDArray[np.float64]
+    bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
+    #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]
     shapes: NDArray[np.float64]
-    potential: Potential
+    potential: Potential  #: Landmarks that single detections may show
+    #: (c, 2): detection and landmark of each correspondence candidate, in order of preference
     pairs: NDArray[np.int64]
-    iou_threshold: float
+    iou_threshold: float  #: A detection and a landmark match only if their IoU is above this
+    #: Of a large map, the landmarks that detections may show because of their class. In a small
+    #: map both are empty, and these pairs are in potential.
     sorted_landmarks: SortedLandmarks
     groups: Groups
 

@@ -50,30 +50,17 @@ class Match:
 
 
 class Finalist(NamedTuple):
-    """One of the best hypotheses; refined ones may be different minima at one place.
+    """One of the best hypotheses; refined ones may be different minima at one place."""
 
-    Parameters
-    ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        camera_from_map of the reference frame.
-    score : float
-        Sum of the IoUs of its inliers in all frames.
-    iteration : int
-        Iteration that found it, from 1.
-    frame : int
-        Frame whose search found it.
-    sample : ndarray (s,) of int
-        Its minimal sample: three candidates, or two where the vertical is known.
-    information : ndarray (6, 6) or None
-        See refine_rig; None without refinement.
-    """
-
+    #: (3, 3), (3,): camera_from_map of the reference frame
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    score: float
-    iteration: int
-    frame: int
+    score: float  #: Sum of the IoUs of its inliers in all frames
+    iteration: int  #: Iteration that found it, from 1
+    frame: int  #: Frame whose search found it
+    #: (s,): its minimal sample: three candidates, or two where the vertical is known
     sample: NDArray[np.int64]
+    #: (6, 6): see refine_rig; None without refinement
     information: NDArray[np.float64] | None = None
 
     @property

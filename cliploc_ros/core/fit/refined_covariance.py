@@ -53,36 +53,22 @@ POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 class _Fit(NamedTuple):
-    """A fit, linearized in steps of the reference: F frames, m matches of n objects.
+    """A fit, linearized in steps of the reference: F frames, m matches of n objects."""
 
-    Parameters
-    ----------
-    jacobian : ndarray (m, 4, 6)
-    residuals, weights : ndarray (m, 4), (m, 4)
-    own : ndarray (m,)
-        Share of each match's deviation that its edges have, apart from the landmark's position.
-    objects, frames : ndarray (m,) of int
-        Of each match.
-    sigmas : ndarray (n,)
-        Of the objects' positions [m].
-    numbers : ndarray (n,) of int
-        The objects' landmarks.
-    verticals : ndarray (F, 6, 6)
-        Information of each frame's vertical.
-    cameras : ndarray (F, 4, 4)
-        map_from_camera.
-    """
-
-    jacobian: NDArray[np.float64]
+    jacobian: NDArray[np.float64]  #: (m, 4, 6)
+    #: (m, 4), (m, 4)
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
+    #: (m,): share of each match's deviation that its edges have, apart from the landmark's
+    #: position
     own: NDArray[np.float64]
+    #: (m,): of each match
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
-    sigmas: NDArray[np.float64]
-    numbers: NDArray[np.int64]
-    verticals: NDArray[np.float64]
-    cameras: NDArray[np.float64]
+    sigmas: NDArray[np.float64]  #: (n,): of the objects' positions [m]
+    numbers: NDArray[np.int64]  #: (n,): the objects' landmarks
+    verticals: NDArray[np.float64]  #: (F, 6, 6): information of each frame's vertical
+    cameras: NDArray[np.float64]  #: (F, 4, 4): map_from_camera
 
     @property
     def information(self) -> NDArray[np.float64]:

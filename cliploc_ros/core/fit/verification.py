@@ -23,21 +23,11 @@ from cliploc_ros.core.search.leaders import same_place
 
 
 class Verified(NamedTuple):
-    """What a pose explains: n detections, those of several frames one behind the other.
+    """What a pose explains: n detections, those of several frames one behind the other."""
 
-    Parameters
-    ----------
-    score : float
-        Sum of the IoUs.
-    ious : ndarray (n,)
-        IoU of each detection with its landmark; 0 if it has none.
-    landmarks : ndarray (n,) of int
-        Landmark of each detection; -1 if it has none.
-    """
-
-    score: float
-    ious: NDArray[np.float64]
-    landmarks: NDArray[np.int64]
+    score: float  #: Sum of the IoUs
+    ious: NDArray[np.float64]  #: (n,): IoU of each detection with its landmark; 0 if it has none
+    landmarks: NDArray[np.int64]  #: (n,): landmark of each detection; -1 if it has none
 
 
 @compiled

@@ -25,31 +25,23 @@ _MAX_ROUND_TRIP_PX = 0.1
 class Camera:
     """A pinhole camera with distortion, as in sensor_msgs/CameraInfo.
 
-    Parameters
-    ----------
-    width, height : int
-        Image size [px].
-    fx, fy, cx, cy : float
-        Focal lengths and principal point [px].
-    distortion_model : str
-        'plumb_bob', 'rational_polynomial' or 'equidistant'; '' with no coefficients.
-    distortion : tuple of float
-        The model's coefficients, in OpenCV's order.
-
     Raises
     ------
     CameraError
         For values that no camera can have.
     """
 
+    #: Image size [px]
     width: int
     height: int
+    #: Focal lengths and principal point [px]
     fx: float
     fy: float
     cx: float
     cy: float
+    #: 'plumb_bob', 'rational_polynomial' or 'equidistant'; '' with no coefficients
     distortion_model: str = ''
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  #: The model's coefficients, in OpenCV's order
 
     def __post_init__(self) -> None:
         """Refuse values that no camera can have."""

@@ -13,13 +13,9 @@ from cliploc_ros.core.kernels.compiled import compiled
 
 
 class Poses(NamedTuple):
-    """Poses camera_from_map, as a minimal solver writes them.
+    """Poses camera_from_map, as a minimal solver writes them."""
 
-    Parameters
-    ----------
-    rotations, translations : ndarray (p, 3, 3), (p, 3)
-    """
-
+    #: (p, 3, 3), (p, 3)
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
 

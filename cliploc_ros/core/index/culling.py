@@ -31,53 +31,33 @@ class SortedLandmarks(NamedTuple):
     """All landmarks of a map along a Morton curve, so that neighbours have near rows: m rows.
 
     A landmark has a row for each of its classes.
-
-    Parameters
-    ----------
-    landmarks : ndarray (m, 9)
-        Centre and shape of each.
-    radii : ndarray (m,)
-        Greatest semi-axis of each [m].
-    numbers : ndarray (m,)
-        Row of each in the map.
-    classes : ndarray (m,) of int32
-        Class number of each.
     """
 
-    landmarks: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    numbers: NDArray[np.int64]
-    classes: NDArray[np.int32]
+    landmarks: NDArray[np.float64]  #: (m, 9): centre and shape of each
+    radii: NDArray[np.float64]  #: (m,): greatest semi-axis of each [m]
+    numbers: NDArray[np.int64]  #: (m,): row of each in the map
+    classes: NDArray[np.int32]  #: (m,): class number of each
 
 
 class Groups(NamedTuple):
     """The landmarks of the classes that a frame shows: g classes, w landmarks, m spheres.
 
     A group is a class: its detections may show any of its landmarks, the members.
-
-    Parameters
-    ----------
-    starts : ndarray (g + 1,)
-        Where the detections of each group begin in detections.
-    detections : ndarray (v,)
-    frusta : ndarray (g + 1, 4, 2)
-        Unit normals, inwards, of the sides of the frustum through the boxes of each group: x and z
-        of left and right, y and z of top and bottom. The last row is the frustum through all.
-    members : ndarray (w, 2) of int32
-        Row among the sorted landmarks, in their order, and group.
-    levels : ndarray (d + 1,)
-        Where each level of the tree begins in spheres. The first level has a sphere for each
-        member, the next one for each eight of them, up to the root.
-    spheres : ndarray (m, 5)
-        Centre and radius of a sphere around all members below, and the depth of the centre beyond
-        which all of them appear too small [m].
     """
 
-    starts: NDArray[np.int64]
-    detections: NDArray[np.int64]
+    starts: NDArray[np.int64]  #: (g + 1,): where the detections of each group begin in detections
+    detections: NDArray[np.int64]  #: (v,)
+    #: (g + 1, 4, 2): unit normals, inwards, of the sides of the frustum through the boxes of each
+    #: group: x and z of left and right, y and z of top and bottom. The last row is the frustum
+    #: through all.
     frusta: NDArray[np.float64]
+    #: (w, 2): row among the sorted landmarks, in their order, and group
     members: NDArray[np.int32]
+    #: (d + 1,): where each level of the tree begins in spheres. The first level has a sphere for
+    #: each member, the next one for each eight of them, up to the root.
     levels: NDArray[np.int64]
+    #: (m, 5): centre and radius of a sphere around all members below, and the depth of the centre
+    #: beyond which all of them appear too small [m]
     spheres: NDArray[np.float64]
 
 

@@ -27,20 +27,13 @@ _BLOCK = 2048
 
 @dataclass(frozen=True)
 class LabelEmbeddings:
-    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d).
+    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d)."""
 
-    Parameters
-    ----------
-    unique : ndarray (U, d) float32
-        One row for each different label: of unit length, or a weighted mean of such rows.
-    of_landmarks : ndarray (L,) of int
-        The row of each landmark's label. Every row belongs to a landmark.
-    parts : tuple of LabelEmbeddings
-        Those of each of several maps, see in_parts; empty for a single map.
-    """
-
+    #: (U, d): one row for each different label: of unit length, or a weighted mean of such rows
     unique: NDArray[np.float32]
+    #: (L,): the row of each landmark's label. Every row belongs to a landmark.
     of_landmarks: NDArray[np.int64]
+    #: Those of each of several maps, see in_parts; empty for a single map
     parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
@@ -97,14 +90,9 @@ class CropSimilarities:
     """Cosine similarities of crops and landmarks, computed when needed.
 
     NumPy sees an array (n, L).
-
-    Parameters
-    ----------
-    crops : ndarray (n, d) float32
-        Unit rows.
     """
 
-    crops: NDArray[np.float32]
+    crops: NDArray[np.float32]  #: (n, d): unit rows
     labels: LabelEmbeddings
 
     @property

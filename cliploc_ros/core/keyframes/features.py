@@ -27,20 +27,11 @@ _RATIO = 0.85
 
 @dataclass(frozen=True)
 class Features:
-    """The n features of an image.
+    """The n features of an image."""
 
-    Parameters
-    ----------
-    pixels : ndarray (n, 2)
-        [px] in the image as it is, distorted.
-    descriptors : ndarray (n, 128) uint8
-    strengths : ndarray (n,) float32
-        Response of the detector; the strongest is first.
-    """
-
-    pixels: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
-    strengths: NDArray[np.float32]
+    pixels: NDArray[np.float64]  #: (n, 2) [px] in the image as it is, distorted
+    descriptors: NDArray[np.uint8]  #: (n, 128)
+    strengths: NDArray[np.float32]  #: (n,): response of the detector; the strongest is first
 
     def __len__(self) -> int:
         """Return the number of features."""

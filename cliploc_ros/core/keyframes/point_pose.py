@@ -31,19 +31,11 @@ _FROM_MEDIAN = 1.4826
 
 
 class PointPose(NamedTuple):
-    """A pose that many points agree with.
+    """A pose that many points agree with."""
 
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    inliers : ndarray (k,) of int
-        Rows of the points that agree.
-    covariance : ndarray (6, 6)
-        From the features' deviations alone; in the order of core.fit.covariance.
-    """
-
-    map_from_camera: NDArray[np.float64]
-    inliers: NDArray[np.int64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    inliers: NDArray[np.int64]  #: (k,): rows of the points that agree
+    #: (6, 6): from the features' deviations alone; in the order of core.fit.covariance
     covariance: NDArray[np.float64]
 
 

@@ -27,37 +27,19 @@ _APART = 100_000.0
 
 
 class MapPart(NamedTuple):
-    """One of several maps.
+    """One of several maps."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        In its own coordinate frame.
-    first : int
-        Row of its first landmark among those of all maps.
-    shift : ndarray (3,)
-        From its own coordinates to those of all maps, level [m].
-    """
-
-    landmark_map: LandmarkMap
-    first: int
-    shift: NDArray[np.float64]
+    landmark_map: LandmarkMap  #: In its own coordinate frame
+    first: int  #: Row of its first landmark among those of all maps
+    shift: NDArray[np.float64]  #: (3,): from its own coordinates to those of all maps, level [m]
 
 
 class Place(NamedTuple):
-    """A pose in the map that it belongs to.
-
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-        In the coordinate frame of that map.
-    name : str
-        Of the map; empty where there is only one.
-    """
+    """A pose in the map that it belongs to."""
 
     part: MapPart
-    map_from_camera: NDArray[np.float64]
-    name: str
+    map_from_camera: NDArray[np.float64]  #: (4, 4): in the coordinate frame of that map
+    name: str  #: Of the map; empty where there is only one
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -68,15 +50,9 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class JoinedMap(LandmarkMap):
-    """The landmarks of several maps in one coordinate frame, that of the first map.
+    """The landmarks of several maps in one coordinate frame, that of the first map."""
 
-    Parameters
-    ----------
-    parts : tuple of MapPart
-        Along the x axis.
-    """
-
-    parts: tuple[MapPart, ...] = ()
+    parts: tuple[MapPart, ...] = ()  #: Along the x axis
 
     def prepare(self) -> None:
         """Compute the indices now, those of the single maps, too."""

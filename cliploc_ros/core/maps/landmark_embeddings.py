@@ -32,27 +32,17 @@ _MAX_NORM_ERROR = 5e-3
 
 @dataclass(frozen=True)
 class LandmarkEmbeddings:
-    """Image embeddings of L landmarks: d numbers each.
+    """Image embeddings of L landmarks: d numbers each."""
 
-    Parameters
-    ----------
-    encoder_key : str
-        Identifies the encoder: crops of another one must not be compared with these.
-    landmark_ids : tuple of str
-        The landmarks, each once.
-    means : ndarray (L, d) float16
-        The mean direction of each landmark's crops, unit rows; a zero row is unknown.
-    medoids : ndarray (m, d) float16
-        Crops that stand for all crops of their landmark, unit rows.
-    medoid_offsets : ndarray (L + 1,) of int
-        Landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at most
-        five.
-    """
-
+    #: Identifies the encoder: crops of another one must not be compared with these
     encoder_key: str
-    landmark_ids: tuple[str, ...]
+    landmark_ids: tuple[str, ...]  #: The landmarks, each once
+    #: (L, d): the mean direction of each landmark's crops, unit rows; a zero row is unknown
     means: NDArray[np.float16]
+    #: (m, d): crops that stand for all crops of their landmark, unit rows
     medoids: NDArray[np.float16]
+    #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
+    #: most five
     medoid_offsets: NDArray[np.int64]
 
     def __len__(self) -> int:

@@ -47,31 +47,18 @@ _COMPARED, _NEAR_M = 3, 0.5
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """Landmarks of one map frame. L is their number, at least 1.
+    """Landmarks of one map frame. L is their number, at least 1."""
 
-    Parameters
-    ----------
-    frame_id : str
-        The coordinate frame of centres and orientations.
-    landmark_ids, labels, class_ids : tuple of str
-        Name, description in natural language and detector class of each landmark.
-    centers : ndarray (L, 3)
-        [m].
-    semi_axes : ndarray (L, 3)
-        Half lengths along each landmark's own axes [m].
-    quats_xyzw : ndarray (L, 4)
-        Unit quaternions that rotate landmark axes into map axes.
-    details : tuple of LandmarkDetails
-        Optional fields of each landmark; empty where the map has none.
-    """
-
-    frame_id: str
+    frame_id: str  #: The coordinate frame of centres and orientations
+    #: Name, description in natural language and detector class of each landmark
     landmark_ids: tuple[str, ...]
     labels: tuple[str, ...]
     class_ids: tuple[str, ...]
-    centers: NDArray[np.float64]
-    semi_axes: NDArray[np.float64]
+    centers: NDArray[np.float64]  #: (L, 3) [m]
+    semi_axes: NDArray[np.float64]  #: (L, 3): half lengths along each landmark's own axes [m]
+    #: (L, 4): unit quaternions that rotate landmark axes into map axes
     quats_xyzw: NDArray[np.float64]
+    #: Optional fields of each landmark; empty where the map has none
     details: tuple[LandmarkDetails, ...] = ()
 
     def __len__(self) -> int:

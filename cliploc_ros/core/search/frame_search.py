@@ -39,32 +39,17 @@ _UNIT_TOLERANCE = 1e-3
 
 
 class SearchedFrame(NamedTuple):
-    """A frame and the result of the search among its samples.
-
-    Parameters
-    ----------
-    scene : Scene
-        Of the observation.
-    vertical : ndarray (7,)
-        See VERTICAL_UNKNOWN.
-    leaders : Leaders
-        The best hypotheses, as poses of this frame's camera.
-    tilted : Leaders
-        The best hypotheses that ignore the vertical, where it is known; else none.
-    samples : ndarray (t, 3) or None
-        The samples tried; None for all samples of the first candidates, see progress.reach.
-    firsts : tuple of int
-        Row of the first landmark of each of several maps.
-    """
+    """A frame and the result of the search among its samples."""
 
     observation: Observation
-    scene: Scene
-    vertical: NDArray[np.float64]
-    leaders: Leaders
-    tilted: Leaders
+    scene: Scene  #: Of the observation
+    vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
+    leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
+    tilted: Leaders  #: The best hypotheses that ignore the vertical, where it is known; else none
     progress: Progress
+    #: (t, 3): the samples tried; None for all samples of the first candidates, see progress.reach
     samples: NDArray[np.int64] | None = None
-    firsts: tuple[int, ...] = (0,)
+    firsts: tuple[int, ...] = (0,)  #: Row of the first landmark of each of several maps
 
     @property
     def sample_size(self) -> int:

@@ -14,26 +14,18 @@ VERTICAL_UNKNOWN = np.zeros(7)
 
 
 class Prior(NamedTuple):
-    """What is known of the camera; by default nothing.
+    """What is known of the camera; by default nothing."""
 
-    Parameters
-    ----------
-    up_in_camera, up_in_map : tuple of float
-        The vertical, unit vectors in the camera's optical frame and in the map frame.
-    min_height, max_height : float
-        Of the camera's centre, along up_in_map from the map's origin [m].
-    max_tilt : float
-        Greatest angle between both verticals at a pose from three points [rad]. Poses from two
-        points hold them equal.
-    vertical_deviation : float
-        Standard deviation of the angle between both verticals [rad]; inf: only max_tilt counts.
-    """
-
+    #: The vertical, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
     up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    #: Of the camera's centre, along up_in_map from the map's origin [m]
     min_height: float = -inf
     max_height: float = inf
+    #: Greatest angle between both verticals at a pose from three points [rad]. Poses from two
+    #: points hold them equal.
     max_tilt: float = pi
+    #: Standard deviation of the angle between both verticals [rad]; inf: only max_tilt counts
     vertical_deviation: float = inf
 
     def as_array(self) -> NDArray[np.float64]:

@@ -56,26 +56,14 @@ class Targets(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Memory of one minimal sample: three candidates, or two.
+    """Memory of one minimal sample: three candidates, or two."""
 
-    Parameters
-    ----------
-    bearings : ndarray (3, 3)
-        Through the box centres.
-    boxes : ndarray (3, 4)
-        Box ellipses.
-    landmarks : ndarray (3, 9)
-        Centres and shapes.
-    outlines : ndarray (12, 6)
-        Outlines of the landmarks at each of up to four poses, see project.
-    uppers : ndarray (4,)
-        Upper bound of the summed IoUs at each pose; -1 where the pose is impossible.
-    """
-
-    bearings: NDArray[np.float64]
-    boxes: NDArray[np.float64]
-    landmarks: NDArray[np.float64]
+    bearings: NDArray[np.float64]  #: (3, 3): through the box centres
+    boxes: NDArray[np.float64]  #: (3, 4): box ellipses
+    landmarks: NDArray[np.float64]  #: (3, 9): centres and shapes
+    #: (12, 6): outlines of the landmarks at each of up to four poses, see project
     outlines: NDArray[np.float64]
+    #: (4,): upper bound of the summed IoUs at each pose; -1 where the pose is impossible
     uppers: NDArray[np.float64]
 
 
@@ -84,48 +72,30 @@ class Overlaps(NamedTuple):
 
     There is room for every landmark and every pair. The system provides only the pages that are
     written.
-
-    Parameters
-    ----------
-    visible : ndarray (2, w)
-        Members of the groups that the pose may see, see visible_members.
-    outlines : ndarray (o, 6)
-        Outlines of all landmarks that it may see, see project.
-    owners : ndarray (o,)
-        Row in the starts of each outline's detections.
-    pairs, bounds : ndarray (x, 2), (x,)
-        Pairs of detection and outline that may overlap enough, and upper bounds of their IoUs.
-    best_bounds : ndarray (n,)
-        The greatest bound of each detection.
     """
 
+    #: (2, w): members of the groups that the pose may see, see visible_members
     visible: NDArray[np.int64]
+    #: (o, 6): outlines of all landmarks that it may see, see project
     outlines: NDArray[np.float64]
-    owners: NDArray[np.int64]
+    owners: NDArray[np.int64]  #: (o,): row in the starts of each outline's detections
+    #: (x, 2), (x,): pairs of detection and outline that may overlap enough, and upper bounds of
+    #: their IoUs
     pairs: NDArray[np.int64]
     bounds: NDArray[np.float64]
-    best_bounds: NDArray[np.float64]
+    best_bounds: NDArray[np.float64]  #: (n,): the greatest bound of each detection
 
 
 class Bench(NamedTuple):
-    """A scene laid out for one search, and the memory that its hypotheses reuse.
+    """A scene laid out for one search, and the memory that its hypotheses reuse."""
 
-    Parameters
-    ----------
-    candidates : ndarray (c, 16)
-        Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
-        landmark of each correspondence candidate.
-    prior : ndarray (9,)
-        See Prior.as_array.
-    poses : Poses
-        Those that the sample allows.
-    """
-
+    #: (c, 16): bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of
+    #: the landmark of each correspondence candidate
     candidates: NDArray[np.float64]
-    prior: NDArray[np.float64]
+    prior: NDArray[np.float64]  #: (9,): see Prior.as_array
     targets: Targets
     sample: Sample
-    poses: Poses
+    poses: Poses  #: Those that the sample allows
     overlaps: Overlaps
 
 

@@ -37,21 +37,11 @@ _FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 class Progress(NamedTuple):
-    """How far a search is.
+    """How far a search is."""
 
-    Parameters
-    ----------
-    tried : int
-        Hypotheses tried so far.
-    coverage : float
-        The share of its samples that were tried, 0 to 1.
-    reach : int
-        A progressive search has tried all samples among so many first candidates.
-    """
-
-    tried: int
-    coverage: float
-    reach: int = 0
+    tried: int  #: Hypotheses tried so far
+    coverage: float  #: The share of its samples that were tried, 0 to 1
+    reach: int = 0  #: A progressive search has tried all samples among so many first candidates
 
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
