@@ -101,14 +101,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
 
     Parameters
     ----------
-    earlier : sequence of SearchedFrame
-        Frames before it, linked by odometry.
     observations : iterable of Observation
         The frame with more and more of its crops, one at least, see crops_on_demand.
-    looks : Looks, optional
-        Results of earlier frames, which have to agree.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes.
 
     Returns
     -------
@@ -116,11 +110,6 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         With the crops that it took.
     found : Relocalization
         Its time is that of all searches.
-
-    Raises
-    ------
-    OptionsError
-        See Relocalizer.relocalize.
     """
     search_ms = 0.0
     for observation in observations:

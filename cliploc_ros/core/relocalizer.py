@@ -96,13 +96,7 @@ class Relocalizer:
         return TimeBudget.begin(self._options.time_budget_s, frames)
 
     def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
-        """Search one frame, until a deadline of time.perf_counter [s].
-
-        Raises
-        ------
-        OptionsError
-            See relocalize.
-        """
+        """Search one frame, until a deadline of time.perf_counter [s]."""
         return search_frame(self._map, observation, self._options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
@@ -114,15 +108,8 @@ class Relocalizer:
         ----------
         budget : TimeBudget, optional
             Time left for the refinement; a new one by default.
-        looks : Looks, optional
-            Results of earlier frames, which have to agree.
         recognizer : ImageRecognizer, optional
             Of the keyframes, for the image of the last frame.
-
-        Raises
-        ------
-        OptionsError
-            See relocalize.
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self._map, self._options, frames)

@@ -52,8 +52,6 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
 
     Parameters
     ----------
-    known : Known or None
-        After the answers before; None for the first one.
     odom_from_camera, map_from_camera : ndarray (4, 4)
         Of the answer.
     covariance : ndarray (6, 6)

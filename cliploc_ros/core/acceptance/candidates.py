@@ -80,13 +80,7 @@ class Candidate(NamedTuple):
 
 def candidates_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
                 ) -> list[Candidate]:
-    """Return poses as candidates, with their odds by objects.
-
-    Parameters
-    ----------
-    upright : sequence of m bool
-        See Candidate.is_upright.
-    """
+    """Return poses as candidates, with their odds by objects."""
     poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
     matches = [matches_of(joined.rig, one) for one in finalists]
     supports = supports_of(joined, poses, matches)

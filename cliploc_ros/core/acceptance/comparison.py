@@ -100,8 +100,6 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
 
     Parameters
     ----------
-    finalists : sequence of m Finalist
-        Of the search of objects.
     is_upright : ndarray (m,) of bool
         Which of them use the known vertical.
     recognizer : ImageRecognizer, optional
@@ -191,10 +189,6 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     ----------
     covariance : ndarray (6, 6)
         Of the leading pose.
-    looks : Looks
-        Results of earlier frames.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes, where there are some.
     """
     best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
     coverage, last = coverage_of(joined.frames), joined.frames[-1].observation

@@ -52,14 +52,8 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
     Parameters
     ----------
-    support : Support
-        By objects.
     boxes : ndarray (b, 4)
         That the pose explains: left, top, right, bottom [px].
-    camera : Camera
-        Of the image.
-    rival : int
-        Number of features that agree with another place.
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
@@ -76,13 +70,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
                    calibration: Calibration = CALIBRATION) -> float:
-    """Return the probability that a place is there, and as it was mapped.
-
-    Parameters
-    ----------
-    motion : Motion, optional
-        Since an earlier look.
-    """
+    """Return the probability that a place is there, and as it was mapped."""
     terms = calibration.genuine
     odds = terms.none + sum(getattr(terms, name) * sign for name, sign in signs._asdict().items())
     if motion is not None:

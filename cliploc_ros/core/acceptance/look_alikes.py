@@ -109,8 +109,6 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-        L landmarks, z up.
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
         Landmarks that the pose explains detections with; all around it count where there are none.
@@ -135,8 +133,6 @@ def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.fl
 
     Parameters
     ----------
-    its : Support
-        Of the pose.
     twins : sequence of Support
         Of the m poses at places that look like its own, one at least.
     leads : ndarray (m,)

@@ -43,8 +43,6 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
 
     Parameters
     ----------
-    deviation_per_metre : float
-        Of the layer that both were recognized in.
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """

@@ -71,8 +71,6 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     ----------
     map_from_cameras : ndarray (F, 4, 4)
         Pose of the camera in each frame.
-    matches : sequence of F sequence of Match
-        Inliers in each frame.
     """
     rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
     for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):

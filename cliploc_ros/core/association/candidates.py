@@ -94,8 +94,6 @@ def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     ----------
     similarities : ndarray (n, L) or CropSimilarities
         Cosine similarity of each crop and label.
-    k : int
-        1 to L.
 
     Raises
     ------
@@ -132,13 +130,7 @@ def concatenated(some: Sequence[Candidates]) -> Candidates:
 
 
 def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
-    """Return the first candidates, followed by those of the second that are new.
-
-    Parameters
-    ----------
-    landmark_count : int
-        Number of landmarks of the map.
-    """
+    """Return the first candidates, followed by those of the second that are new."""
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return concatenated([first, second.select(new)])

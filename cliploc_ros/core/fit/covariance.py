@@ -74,8 +74,6 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
         The sampled landmarks' centres in the map [m].
     box_sizes : ndarray (m, 2)
         Width and height of the sampled boxes on the plane z = 1.
-    scatter : float
-        See box_scatter.
     vertical : ndarray (7,), optional
         See make_rig.
 

@@ -97,12 +97,6 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
 
     Parameters
     ----------
-    rig : Rig
-        The same frames.
-    refine : bool
-        Whether to refine the poses.
-    count : int
-        The most poses to refine.
     deadline : float, optional
         Time of time.perf_counter [s] at which refinement stops; the remaining, worst poses stay
         as found.
@@ -177,13 +171,7 @@ def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
 
 def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
                 matches: Sequence[Sequence[Match]]) -> int:
-    """Return how many of the samples tried hold only inliers of a pose.
-
-    Parameters
-    ----------
-    matches : sequence of sequence of Match
-        Inliers of the pose in each frame.
-    """
+    """Return how many of the samples tried hold only inliers of a pose."""
     return sum(_meetings_in(frame, len(pose.sample), found)
                for frame, found in zip(frames, matches, strict=True))
 
@@ -207,10 +195,6 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
 
     Parameters
     ----------
-    rig : Rig
-        The same frames.
-    matches : sequence of sequence of Match
-        Inliers of the pose in each frame.
     shared : ndarray (L, 2), optional
         See refined_covariance.
     """

@@ -84,8 +84,6 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 
     Parameters
     ----------
-    rig : Rig
-        F frames.
     rotation, translation : ndarray (3, 3), (3,)
         Of camera_from_map, with information, see refine_rig.
     stamps_ns : ndarray (F,)

@@ -78,8 +78,6 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
 
     Parameters
     ----------
-    scenes : sequence of Scene
-        F of them, of one map.
     camera_from_reference : ndarray (F, 4, 4)
     verticals : ndarray (F, 7)
         See VERTICAL_UNKNOWN.

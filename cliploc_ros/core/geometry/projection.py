@@ -36,8 +36,6 @@ def project(landmarks, first, last, poses, which, outlines, out):
     ----------
     landmarks : ndarray (u, 9)
         Centre and shape of each.
-    which : int
-        Row of the pose.
     outlines : ndarray (o, 6)
         Centre x and y, half extents x and y, exy, and the product of the semi-axes. The half
         extents are minus infinity where an ellipsoid is not wholly in front of the camera.

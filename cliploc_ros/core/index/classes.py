@@ -33,8 +33,6 @@ class ClassIndex:
 
         Parameters
         ----------
-        landmark_classes : sequence of str
-            Own class of each landmark.
         others : sequence of (int, str)
             A landmark and another class of it, each pair once.
         weights : mapping, optional

@@ -191,8 +191,6 @@ def visible_members(groups, poses, which, seen):
 
     Parameters
     ----------
-    which : int
-        Row of the pose.
     seen : ndarray (2, w) of int
         The second row holds their parents in the tree.
     """
@@ -239,8 +237,6 @@ def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out
     ----------
     landmarks : ndarray (L, 9)
         See SortedLandmarks.
-    groups, poses, which, seen
-        See visible_members.
     outlines, owners : ndarray (o, 6), (o,)
         Outlines that are visible and the group of each, written from row out on.
     """

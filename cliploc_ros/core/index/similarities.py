@@ -47,11 +47,6 @@ class LabelEmbeddings:
         """Return the same embeddings, those of each of several maps in rows of their own.
 
         A label of two maps is stored twice.
-
-        Parameters
-        ----------
-        sizes : sequence of M int
-            Number of landmarks of each map, in order.
         """
         pieces = [np.unique(some, return_inverse=True)
                   for some in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
@@ -140,8 +135,6 @@ def nearest_landmarks(similarities: Similarities, k: int
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
-    k : int
-        1 to L.
 
     Raises
     ------

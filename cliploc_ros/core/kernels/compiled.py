@@ -244,13 +244,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def warm_up(run: Callable[[], object]) -> None:
-    """Run the kernels once. Where they must be compiled, say so and how long it takes.
-
-    Parameters
-    ----------
-    run : callable
-        Calls every kernel that requests use.
-    """
+    """Run the kernels once. Where they must be compiled, say so and how long it takes."""
     start, missing = time.monotonic(), KERNEL_FOLDERS.missing
     run()
     compiled_now = KERNEL_FOLDERS.missing - missing

@@ -114,8 +114,6 @@ class KeyframeLocalizer:
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
-        camera : Camera
-            Of the image.
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float

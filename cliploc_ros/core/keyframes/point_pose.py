@@ -52,8 +52,6 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
         In the map [m].
     bearings : ndarray (n, 2)
         Where the image shows them, on the plane z = 1.
-    iterations : int
-        Most samples of three points.
     """
     if len(points) < LEAST_INLIERS:
         return None

@@ -27,8 +27,6 @@ class ImageRecognizer:
     ----------
     features : Features or callable
         Of the image; a callable is called when they are needed first.
-    deadline : float
-        See KeyframeLocalizer.localize.
     begin_stage : callable
         Takes the name of a stage that begins: 'keyframes', and 'search' after them.
     """

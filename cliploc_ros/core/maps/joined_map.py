@@ -79,8 +79,6 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
     ----------
     maps : sequence of LandmarkMap
         At least one, each in a coordinate frame of its own.
-    sources : sequence of str
-        Where each comes from, for messages.
 
     Raises
     ------

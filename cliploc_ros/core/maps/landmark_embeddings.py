@@ -55,13 +55,7 @@ class LandmarkEmbeddings:
         return np.asarray(self.means.any(axis=1))
 
     def in_order(self, landmark_ids: Sequence[str]) -> 'LandmarkEmbeddings':
-        """Return the embeddings of some landmarks, in the order given; missing ones are unknown.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of str
-            Of a map, each once.
-        """
+        """Return the embeddings of some landmarks in the order given; missing ones are unknown."""
         rows_of = {landmark_id: row for row, landmark_id in enumerate(self.landmark_ids)}
         rows = np.array([rows_of.get(landmark_id, -1) for landmark_id in landmark_ids],
                         dtype=np.int64)
@@ -76,13 +70,7 @@ class LandmarkEmbeddings:
 
 def concatenated(several: Sequence[LandmarkEmbeddings], landmark_ids: Sequence[str]
                  ) -> LandmarkEmbeddings:
-    """Return the embeddings of several maps, of one encoder and in their order, as one.
-
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        New names of all landmarks, each once.
-    """
+    """Return the embeddings of several maps, of one encoder and in their order, as one."""
     counts = np.concatenate([np.diff(one.medoid_offsets) for one in several])
     return LandmarkEmbeddings(
         several[0].encoder_key, tuple(landmark_ids),

@@ -205,13 +205,6 @@ class LandmarkMap:
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
         """Build a map from a tree with the keys frame_id and landmarks.
 
-        Parameters
-        ----------
-        tree : mapping
-            As in the map file, below the key 'map'.
-        source : str
-            Where the tree came from, for messages.
-
         Raises
         ------
         MapError

@@ -32,10 +32,6 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
 
     Parameters
     ----------
-    path : str or path
-        A YAML file.
-    comments : iterable of str
-        Lines for the head of the file.
     embeddings : LandmarkEmbeddings, optional
         Image embeddings of these landmarks, written next to the map.
 

@@ -100,13 +100,7 @@ class Bench(NamedTuple):
 
 
 def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
-    """Return the bench of a scene.
-
-    Parameters
-    ----------
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-    """
+    """Return the bench of a scene."""
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     candidates = np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                                  scene.centers[landmarks], scene.shapes[landmarks]], axis=1)
@@ -144,8 +138,6 @@ def make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou
         Of the bench. A bench as a whole is slow to pass: its arrays are counted at each call.
     samples : ndarray (t, 3) of int
         Three candidates, or two and -1.
-    number : int
-        Row of the sample.
     least_iou : float
         A pose whose sampled pairs have a smaller sum of IoUs is not verified.
     """
@@ -256,13 +248,7 @@ def _outline_iou(boxes, box, outlines, out):
 
 @compiled
 def verify_beyond(targets, poses, which, overlaps, floor):
-    """Return the score of a pose if it is above a floor; if not, the floor.
-
-    Parameters
-    ----------
-    which : int
-        Row of the pose.
-    """
+    """Return the score of a pose if it is above a floor; if not, the floor."""
     groups, outlines = targets.groups, overlaps.outlines
     overlaps.best_bounds[:] = targets.iou_threshold
     single = targets.landmarks.shape[0]

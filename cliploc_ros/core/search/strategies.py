@@ -52,10 +52,6 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     ----------
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
 
     Yields
     ------
@@ -78,13 +74,6 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
 def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
                         ) -> Iterator[Progress]:
     """Try every valid sample, a block at a time, without storing them.
-
-    Parameters
-    ----------
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
 
     Yields
     ------
@@ -119,12 +108,6 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     ----------
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.compatibility.
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-    limit : float, optional
-        The most samples to try.
     size : int, optional
         Candidates in a sample: three, or two where the prior's vertical is known (see
         cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
@@ -151,13 +134,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
 
 
 class _Pace:
-    """Blocks of samples of about equal time. Results do not depend on their sizes.
-
-    Parameters
-    ----------
-    limit : float
-        How many samples to try in all.
-    """
+    """Blocks of samples of about equal time. Results do not depend on their sizes."""
 
     def __init__(self, limit: float = inf) -> None:
         self._memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
