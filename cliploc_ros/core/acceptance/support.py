@@ -83,20 +83,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
         return Support()
     total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
     views_of_each = sum(map(len, rows.values())) / len(rows)
-    unexplained = sum(_unexplained(landmark_map, frame, found)
-                      for frame, found in zip(frames, matches, strict=True)) / views_of_each
-    return Support(len(rows), *map(float, [*total, unexplained]))
-
-
-def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Sequence[Match]) -> int:
-    """Return how many detections of the map's classes match no landmark.
-
-    A class that a landmark is only taken for does not count: a real person is not expected in a
-    map because a teddy bear sometimes looks like one.
-    """
-    index = landmark_map.classes
-    known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
-    return len(known - {match.detection for match in matches})
+    # A class that a landmark is only taken for does not count: a real person is not expected in a
+    # map because a teddy bear sometimes looks like one.
+    index, unexplained = landmark_map.classes, 0
+    for frame, found in zip(frames, matches, strict=True):
+        known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
+        unexplained += len(known - {match.detection for match in found})
+    return Support(len(rows), *map(float, [*total, unexplained / views_of_each]))
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
@@ -105,25 +98,22 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     """Return what each match (m, 5) adds to a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
-    classes = landmark_map.classes.classes_of(frame.class_ids)
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
     compared = rows >= 0
     if frame.similarities is not None and compared.any():
-        likenesses[compared] = _likenesses(frame.similarities, rows[compared],
-                                           landmarks[compared])
+        means, deviations = sampled_spread(frame.similarities, rows[compared])
+        likenesses[compared] = (
+            pair_similarities(frame.similarities, rows[compared], landmarks[compared])
+            - means) / np.maximum(deviations, 1e-6)
+    index = landmark_map.classes
+    classes = index.classes_of(frame.class_ids)[detections]
+    # 0 if the class of a detection is none of its landmark
+    rarities = index.shares(landmarks, classes) * -np.log(
+        np.maximum(index.sizes_of(classes), 1) / len(landmark_map))
     return np.column_stack([
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
-                 landmark_map.position_sigmas[landmarks]), likenesses,
-        _rarities(landmark_map, landmarks, classes[detections]), ~compared])
-
-
-def _rarities(landmark_map: LandmarkMap, landmarks: NDArray[np.int64],
-              classes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how rare the class of each detection (m,) is; 0 if it is none of its landmark."""
-    index = landmark_map.classes
-    shares = np.maximum(index.sizes_of(classes), 1) / len(landmark_map)
-    return -np.log(shares) * index.shares(landmarks, classes)
+                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared])
 
 
 def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
@@ -165,10 +155,3 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
-
-
-def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
-                landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    means, deviations = sampled_spread(similarities, rows)
-    return np.asarray((pair_similarities(similarities, rows, landmarks) - means)
-                      / np.maximum(deviations, 1e-6))

@@ -172,20 +172,19 @@ def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
 def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
                 matches: Sequence[Sequence[Match]]) -> int:
     """Return how many of the samples tried hold only inliers of a pose."""
-    return sum(_meetings_in(frame, len(pose.sample), found)
-               for frame, found in zip(frames, matches, strict=True))
-
-
-def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> int:
-    scene, progress = frame.scene, frame.progress
-    landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
-    for match in matches:
-        landmark_of[match.detection] = match.landmark
-    is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
-    if frame.samples is None:
-        return comb(int(is_inlier[:progress.reach].sum()), size)
-    tried = frame.samples[:round(progress.coverage * len(frame.samples))]
-    return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
+    meetings = 0
+    for frame, found in zip(frames, matches, strict=True):
+        scene, progress = frame.scene, frame.progress
+        landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
+        for match in found:
+            landmark_of[match.detection] = match.landmark
+        is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
+        if frame.samples is None:
+            meetings += comb(int(is_inlier[:progress.reach].sum()), len(pose.sample))
+        else:
+            tried = frame.samples[:round(progress.coverage * len(frame.samples))]
+            meetings += int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
+    return meetings
 
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,

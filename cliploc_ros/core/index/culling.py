@@ -104,8 +104,10 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
     shown = np.unique(classes[classes >= 0])
     rows = [np.nonzero(classes == one)[0] for one in shown]
     frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
+    # of the greatest angle between the optical axis and a corner of each box
+    tangents = np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1)
     reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
-                               _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
+                               float(np.arctan(tangents[some].max()))) for some in rows], dtype=np.float64)
     members = _members(sorted_landmarks.classes, shown)
     radii = sorted_landmarks.radii[members[:, 0]]
     return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
@@ -162,11 +164,6 @@ def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     high = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
     sides = np.array([[1.0, -low[0]], [-1.0, high[0]], [1.0, -low[1]], [-1.0, high[1]]])
     return sides / np.linalg.norm(sides, axis=1, keepdims=True)
-
-
-def _widest_angle(boxes: NDArray[np.float64]) -> float:
-    """Return the greatest angle between the optical axis and a corner of some boxes [rad]."""
-    return float(np.arctan(np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1).max()))
 
 
 def _reach(least_axes: float, angle: float) -> float:

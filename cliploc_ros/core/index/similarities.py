@@ -142,26 +142,17 @@ def nearest_landmarks(similarities: Similarities, k: int
         A similarity is not finite.
     """
     if not isinstance(similarities, CropSimilarities):
-        return _nearest_columns(_column_blocks(similarities), len(similarities), k)
-    labels = similarities.labels
-    found, values = _nearest_columns(_label_blocks(similarities), len(similarities.crops),
-                                     min(k, len(labels.unique)))
-    if len(labels.unique) == len(labels.of_landmarks):
-        landmarks = labels.landmarks[found]
-        return _best(landmarks, values, k)
-    return _expanded(labels, found, values, k)
-
-
-def _column_blocks(similarities: NDArray[np.float32]
-                   ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    for start in range(0, similarities.shape[1], _BLOCK):
-        yield start, similarities[:, start:start + _BLOCK]
-
-
-def _label_blocks(similarities: CropSimilarities) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    unique = similarities.labels.unique
-    for start in range(0, len(unique), _BLOCK):
-        yield start, similarities.crops @ unique[start:start + _BLOCK].T
+        return _nearest_columns(((start, similarities[:, start:start + _BLOCK]) for start in
+                                 range(0, similarities.shape[1], _BLOCK)), len(similarities), k)
+    labels, crops = similarities.labels, similarities.crops
+    found, values = _nearest_columns(((start, crops @ labels.unique[start:start + _BLOCK].T)
+                                      for start in range(0, len(labels.unique), _BLOCK)),
+                                     len(crops), min(k, len(labels.unique)))
+    if len(labels.unique) < len(labels.of_landmarks):
+        return _expanded(labels, found, values, k)
+    landmarks = labels.landmarks[found]
+    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # of equals, the first landmark first
+    return np.take_along_axis(landmarks, order, axis=1), np.take_along_axis(values, order, axis=1)
 
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
@@ -210,13 +201,6 @@ def keep_greatest(block, start, columns, values):
             values[row, place], columns[row, place] = value, start + column
             least = values[row, last]
     return True
-
-
-def _best(columns: NDArray[np.int64], values: NDArray[np.float32], k: int
-          ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k best of each row, best first; of equals, the lower column first."""
-    order = np.lexsort((columns, -values), axis=1)[:, :k]
-    return np.take_along_axis(columns, order, axis=1), np.take_along_axis(values, order, axis=1)
 
 
 def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray[np.float32],
