@@ -84,7 +84,11 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     moves : ndarray (k, 4, 4), optional
         Moves to try besides those that the map suggests.
     """
-    rows = _place(landmark_map, position, matched)
+    # those matched, then those around, the nearest first
+    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
+    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
+    rows = rows[np.isfinite(distances)]
+    rows = np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
     if len(rows) < _LEAST_LANDMARKS:
         return Alike(_NOWHERE, rows, np.empty((0, len(rows)), np.int64),
                      np.empty((0, len(rows)), np.bool_))
@@ -122,8 +126,12 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     are_rooms : ndarray (m,) of bool
         See Alike.are_rooms.
     """
-    alike = find_alike(landmark_map, map_from_camera[:3, 3], matched,
-                       _moves_of_poses(map_from_camera, others[:_OTHERS]))
+    position = map_from_camera[:3, 3]
+    moves = others[:_OTHERS] @ invert_transform(map_from_camera)
+    moves = moves[moves[:, 2, 2] > _MOST_TILT]
+    upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
+                             moves[:, :3, :3] @ position + moves[:, :3, 3])
+    alike = find_alike(landmark_map, position, matched, upright)
     return alike.moves @ map_from_camera, alike.are_rooms
 
 
@@ -151,15 +159,6 @@ def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.fl
             int(np.argmin(leads)))
 
 
-def _place(landmark_map: LandmarkMap, position: NDArray[np.float64], matched: NDArray[np.int64]
-           ) -> NDArray[np.int64]:
-    """Return the landmarks of a place: those matched, then those around, the nearest first."""
-    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
-    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
-    rows = rows[np.isfinite(distances)]
-    return np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
-
-
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the moves (m, 4, 4) of a place onto others for which most pairs vote."""
     repeats = find_repeats(landmark_map.pairs, rows[:_LOOKED_UP])
@@ -176,16 +175,6 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
     return moves[_distinct(moves, middle, _MOVES)]
-
-
-def _moves_of_poses(map_from_camera: NDArray[np.float64], others: NDArray[np.float64]
-                    ) -> NDArray[np.float64]:
-    """Return the upright moves (m, 4, 4) that take a pose to others (k, 4, 4)."""
-    moves = others @ invert_transform(map_from_camera)
-    moves = moves[moves[:, 2, 2] > _MOST_TILT]
-    position = map_from_camera[:3, 3]
-    return _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
-                          moves[:, :3, :3] @ position + moves[:, :3, 3])
 
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],

@@ -68,15 +68,12 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
     boxes = np.ascontiguousarray(np.concatenate([middle, half], axis=1))
     single = np.argwhere(potential) if potential.dtype == np.bool_ else potential.astype(np.int64)
+    single = single[np.lexsort(single.T)]
+    shown, starts = np.unique(single[:, 1], return_index=True)
     if sorted_landmarks is None or classes is None:
         sorted_landmarks, classes = no_landmarks(), np.full(len(boxes), -1, dtype=np.int64)
+    by_landmark = Potential(shown, np.append(starts, len(single)),
+                            np.ascontiguousarray(single[:, 0]))
     return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
-                 _by_landmark(single), np.ascontiguousarray(pairs), float(iou_threshold),
+                 by_landmark, np.ascontiguousarray(pairs), float(iou_threshold),
                  sorted_landmarks, make_groups(sorted_landmarks, classes, boxes, iou_threshold))
-
-
-def _by_landmark(pairs: NDArray[np.int64]) -> Potential:
-    """Return pairs of detection and landmark (p, 2), sorted by landmark."""
-    pairs = pairs[np.lexsort(pairs.T)]
-    landmarks, starts = np.unique(pairs[:, 1], return_index=True)
-    return Potential(landmarks, np.append(starts, len(pairs)), np.ascontiguousarray(pairs[:, 0]))

@@ -54,10 +54,8 @@ class Camera:
                 'be positive and all values finite (is the camera calibrated?)')
         if not np.all(np.isfinite(self.distortion)):
             raise CameraError(f'distortion {self.distortion} has values that are not finite')
-        if any(self.distortion):
-            self._check_distortion_model()
-
-    def _check_distortion_model(self) -> None:
+        if not any(self.distortion):
+            return
         counts = _COEFFICIENT_COUNTS.get(self.distortion_model)
         if counts is None:
             raise CameraError(f"distortion model '{self.distortion_model}' is none of "

@@ -107,7 +107,8 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
     # of the greatest angle between the optical axis and a corner of each box
     tangents = np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1)
     reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
-                               float(np.arctan(tangents[some].max()))) for some in rows], dtype=np.float64)
+                               float(np.arctan(tangents[some].max()))) for some in rows],
+                       dtype=np.float64)
     members = _members(sorted_landmarks.classes, shown)
     radii = sorted_landmarks.radii[members[:, 0]]
     return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),

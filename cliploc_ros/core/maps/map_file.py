@@ -48,11 +48,7 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
-    _replace_embeddings(embeddings_path(path), embeddings)
-
-
-def _replace_embeddings(path: Path, embeddings: LandmarkEmbeddings | None) -> None:
-    """Write embeddings, or remove those of the map that was there before."""
+    path = embeddings_path(path)
     if embeddings is not None:
         save_landmark_embeddings(path, embeddings)
         return

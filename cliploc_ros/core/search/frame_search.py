@@ -92,7 +92,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
-        samples, prior = _draw(scene, options), prior_of(observation, options)
+        prior = prior_of(observation, options)
         if options.algorithm == 'auto':
             try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
                               limit=options.iterations)
@@ -102,12 +102,17 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                 # boxes alone suggest must be among the rivals.
                 free = _run(try_all(tilted), deadline)
                 progress = progress._replace(tried=progress.tried + free.tried)
-        elif samples is None:
+        elif options.algorithm == 'bf':
             progress = _run(search_exhaustively(scene, leaders, prior), deadline)
         else:
+            draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+            seed = options.random_seed if options.random_seed >= 0 else None
+            samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
-        progress = progress._replace(
-            coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
+        if left_out:  # the share of all samples that consist of the candidates kept
+            kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
+                comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
+            progress = progress._replace(coverage=progress.coverage * kept)
     return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
                          tuple(part.first for part in parts_of(landmark_map)))
 
@@ -135,13 +140,6 @@ def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 
-def _kept_share(kept: int, left_out: int) -> float:
-    """Return the share of all samples that consist of the candidates kept."""
-    if not left_out:
-        return 1.0
-    return comb(kept, SAMPLE_SIZE) / max(comb(kept + left_out, SAMPLE_SIZE), 1)
-
-
 def _is_known(vertical: NDArray[np.float64]) -> bool:
     return bool(vertical[6] > 0.0)
 
@@ -153,15 +151,6 @@ def _sample_size(vertical: NDArray[np.float64]) -> int:
 def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
     distinct = min(len(np.unique(scene.pairs[:, 0])), len(np.unique(scene.pairs[:, 1])))
     return distinct >= _sample_size(vertical)
-
-
-def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None:
-    """Return the samples (t, 3) of an algorithm that draws them; None for the others."""
-    if options.algorithm in ('auto', 'bf'):
-        return None
-    draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
-    seed = options.random_seed if options.random_seed >= 0 else None
-    return draw(scene.pairs, options.iterations, np.random.default_rng(seed))
 
 
 def _run(search: Iterator[Progress], deadline: float) -> Progress:

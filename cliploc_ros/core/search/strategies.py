@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which minimal samples a search tries: given ones, all of them, or the likeliest first."""
+"""Which minimal samples a search tries: given ones, all of them, or the likeliest first.
+
+Leaders take the best hypotheses; poses that contradict the prior are not verified. Each search
+yields its progress after each block of samples, and the caller may stop there.
+"""
 
 import time
 from collections.abc import Iterator
@@ -52,11 +56,6 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     ----------
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
     """
     bench = set_up(scene, prior)
     tried = 0
@@ -73,13 +72,7 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
 
 def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
                         ) -> Iterator[Progress]:
-    """Try every valid sample, a block at a time, without storing them.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
-    """
+    """Try every valid sample, a block at a time, without storing them."""
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
@@ -112,11 +105,6 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         Candidates in a sample: three, or two where the prior's vertical is known (see
         cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
         is -1.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
     """
     bench = set_up(scene, prior)
     count = len(scene.pairs)
