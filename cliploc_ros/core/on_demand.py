@@ -99,17 +99,9 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
-    Parameters
-    ----------
-    observations : iterable of Observation
-        The frame with more and more of its crops, one at least, see crops_on_demand.
-
-    Returns
-    -------
-    frame : SearchedFrame
-        With the crops that it took.
-    found : Relocalization
-        Its time is that of all searches.
+    The observations, one at least, are the frame with more and more of its crops, see
+    crops_on_demand. Returns the frame with the crops that it took; the result's time is that of
+    all searches. Raises OptionsError, see Relocalizer.relocalize.
     """
     search_ms = 0.0
     for observation in observations:

@@ -97,15 +97,9 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
                ) -> tuple[Relocalization, MapPart]:
     """Return a result in the coordinate frame of the map of its best pose, and this map.
 
-    Poses on other maps are left out: they have no place in this coordinate frame. The reason of a
-    refusal names the map. A result from a single map stays as it is.
-
-    Parameters
-    ----------
-    found : Relocalization
-        Found in landmark_map.
-    landmark_map : LandmarkMap
-        A JoinedMap, or a single map.
+    It was found in landmark_map, which may be a JoinedMap. Poses on other maps are left out: they
+    have no place in this coordinate frame. The reason of a refusal names the map. A result from a
+    single map stays as it is.
     """
     parts = parts_of(landmark_map)
     if found.map_from_camera is None or len(parts) == 1:

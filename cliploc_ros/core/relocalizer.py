@@ -63,21 +63,10 @@ class Relocalizer:
                    recognizer: ImageRecognizer | None = None) -> Relocalization:
         """Find where the camera was when it saw the last of some frames.
 
-        Several frames are localized as one: each of them gives hypotheses, which are scored and
-        refined on all of them. Each frame's search gets an equal share of the time budget.
-
-        Parameters
-        ----------
-        observations : sequence of Observation
-            One frame, or up to MAX_FRAMES of one moving camera, linked by odom_from_camera. The
-            result is the pose of the last one.
-        recognizer : ImageRecognizer, optional
-            Of the keyframes, for the image of the last frame.
-
-        Returns
-        -------
-        Relocalization
-            Accepted, or refused with the reason.
+        Several frames, up to MAX_FRAMES of one moving camera, are localized as one: each of them
+        gives hypotheses, which are scored and refined on all of them. Each frame's search gets an
+        equal share of the time budget. The recognizer is of the keyframes, for the image of the
+        last frame.
 
         Raises
         ------
@@ -104,12 +93,9 @@ class Relocalizer:
                ) -> Relocalization:
         """Find where the camera was when it saw the last of some searched frames.
 
-        Parameters
-        ----------
-        budget : TimeBudget, optional
-            Time left for the refinement; a new one by default.
-        recognizer : ImageRecognizer, optional
-            Of the keyframes, for the image of the last frame.
+        The budget is the time left for the refinement, by default a new one. Earlier looks have to
+        agree. The recognizer is of the keyframes, for the image of the last frame. Raises
+        OptionsError, see relocalize.
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self._map, self._options, frames)

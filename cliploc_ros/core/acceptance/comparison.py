@@ -95,15 +95,9 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
             recognizer: ImageRecognizer | None = None) -> Comparison:
     """Return the candidates compared; none where neither source has any.
 
-    Poses that ignore the known vertical come last. Without refinement the greatest score is
-    first, as in the paper.
-
-    Parameters
-    ----------
-    is_upright : ndarray (m,) of bool
-        Which of them use the known vertical.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes, for the image of the last frame.
+    Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement the
+    greatest score is first, as in the paper. The recognizer is of the keyframes, for the last
+    image.
     """
     candidates = candidates_of(joined, finalists, is_upright.tolist())
     if joined.options.refine:

@@ -52,21 +52,10 @@ class Setting(NamedTuple):
 
 def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: float,
                 calibration: Calibration = CALIBRATION) -> NDArray[np.float64]:
-    """Return the probability that each pose is within 1 m of the truth.
+    """Return the probability (m,) that each pose (m, 4, 4) is within 1 m of the truth.
 
-    Parameters
-    ----------
-    odds : ndarray (m,)
-        Utility of each pose.
-    poses : ndarray (m, 4, 4)
-        map_from_camera.
-    none : float
-        Utility of the case that none of them is right.
-
-    Returns
-    -------
-    ndarray (m,)
-        0 to 1. The rest to 1 is the probability that another pose is right, or none.
+    The rest to 1 is the probability that another pose is right, or none. Odds (m,) are the
+    utilities of the poses, none is that of the case that none of them is right.
     """
     if len(odds) == 0:
         return np.empty(0)

@@ -139,18 +139,8 @@ def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.fl
                     ) -> tuple[float, int]:
     """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
-    Parameters
-    ----------
-    twins : sequence of Support
-        Of the m poses at places that look like its own, one at least.
-    leads : ndarray (m,)
-        Log odds by which keyframes prefer the pose to each.
-
-    Returns
-    -------
-    chance : float
-    likeliest : int
-        The twin that is likeliest.
+    The second value is the row of the likeliest of the m poses at such places, one at least, whose
+    supports the twins are. Leads (m,) are the log odds by which keyframes prefer the pose to each.
     """
     terms = CALIBRATION.places
     leads = leads + [terms.likeness * (its.likeness - one.likeness)

@@ -29,6 +29,7 @@ from cliploc_ros.core.association.matching import match_frame
 from cliploc_ros.core.fit.finalists import matches_of
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.observation import Observation
 
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])
@@ -59,18 +60,22 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
     """Return frames whose images are mirrored left to right, searched for nothing."""
     frames = []
     for one in joined.frames:
-        # mirrored on the plane z = 1, where a lens distorts nothing
-        camera, odom = one.observation.camera, one.observation.odom_from_camera
-        detections = one.observation.detections
-        boxes = camera.normalize_bboxes(detections.bboxes_xyxy)[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)
-        observation = replace(
-            one.observation, camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
-            detections=replace(detections, bboxes_xyxy=boxes),
-            odom_from_camera=None if odom is None else _FLIP @ odom @ _FLIP)
+        observation = _mirrored_observation(one.observation)
         frames.append(one._replace(
             observation=observation, vertical=one.vertical * (-1, 1, 1, 1, 1, 1, 1),
             scene=match_frame(joined.landmark_map, observation, joined.options)[0]))
     return join_frames(joined.landmark_map, joined.options, frames)
+
+
+def _mirrored_observation(observation: Observation) -> Observation:
+    """Return an observation mirrored on the plane z = 1, where a lens distorts nothing."""
+    camera, detections = observation.camera, observation.detections
+    boxes = camera.normalize_bboxes(detections.bboxes_xyxy)
+    odom = observation.odom_from_camera
+    return replace(observation, odom_from_camera=None if odom is None else _FLIP @ odom @ _FLIP,
+                   camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
+                   detections=replace(detections,
+                                      bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
 
 
 def _planes(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -61,16 +61,11 @@ class ComparedFrame(NamedTuple):
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
-    """Return the support of a pose in one frame or several.
+    """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
 
     Several boxes on one landmark, or several landmarks behind one box, count as the best of them.
-    Frames that show the same object share the error of its shape in the map, so their agreement
-    is no more evidence than one of them: the object counts with their mean.
-
-    Parameters
-    ----------
-    map_from_cameras : ndarray (F, 4, 4)
-        Pose of the camera in each frame.
+    Frames that show the same object share the error of its shape in the map, so their agreement is
+    no more evidence than one of them: the object counts with their mean.
     """
     rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
     for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):

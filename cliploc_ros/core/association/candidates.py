@@ -90,11 +90,6 @@ def check_k(k: int, landmark_count: int) -> None:
 def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    Parameters
-    ----------
-    similarities : ndarray (n, L) or CropSimilarities
-        Cosine similarity of each crop and label.
-
     Raises
     ------
     OptionsError

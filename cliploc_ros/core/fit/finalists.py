@@ -93,13 +93,8 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
     """Return the best poses among all frames' leaders, by their scores, best first.
 
     Without refinement no two of them lie at the same place. A place may have several refined
-    poses, of different matches: which of them is best, their support tells.
-
-    Parameters
-    ----------
-    deadline : float, optional
-        Time of time.perf_counter [s] at which refinement stops; the remaining, worst poses stay
-        as found.
+    poses, of different matches: which of them is best, their support tells. At most `count` poses
+    are refined, until a deadline of time.perf_counter [s]; the others, worse ones, stay as found.
     """
     found = [one for frame in range(len(frames))
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]

@@ -74,15 +74,9 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
              verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
-    """Return the rig of some frames.
+    """Return the rig of F scenes of one map, see Rig.
 
-    Parameters
-    ----------
-    camera_from_reference : ndarray (F, 4, 4)
-    verticals : ndarray (F, 7)
-        See VERTICAL_UNKNOWN.
-    sigmas : ndarray (L,)
-        See Rig.
+    Cameras are camera_from_reference (F, 4, 4), verticals (F, 7), sigmas (L,).
     """
     first = scenes[0]
     joined = first._replace(

@@ -111,11 +111,7 @@ def choose_distinct(scores: NDArray[np.float64], rotations: NDArray[np.float64],
                     translations: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Return the rows (<= count,) of the best of m poses at distinct places, best first.
 
-    Parameters
-    ----------
-    scores : ndarray (m,)
-    rotations, translations : ndarray (m, 3, 3), (m, 3)
-        Of camera_from_map.
+    Poses are rotations (m, 3, 3) and translations (m, 3) of camera_from_map with scores (m,).
     """
     return _choose_distinct(np.argsort(-scores, kind='stable'), rotations, translations, count)
 

@@ -74,12 +74,7 @@ class SearchedFrame(NamedTuple):
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
                  options: RelocalizerOptions, deadline: float) -> SearchedFrame:
-    """Search one frame.
-
-    Parameters
-    ----------
-    deadline : float
-        When to stop, of time.perf_counter [s].
+    """Search one frame, until a deadline of time.perf_counter [s].
 
     Raises
     ------

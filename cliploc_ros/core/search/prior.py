@@ -43,16 +43,10 @@ class Prior(NamedTuple):
 
     def tilt_error(self, map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
                    ) -> float:
-        """Return the angle between both verticals at a pose, in its standard deviations.
+        """Return the angle between both verticals at a pose (4, 4), in its standard deviations.
 
-        Those of the vertical and of the pose count. Of right poses, one of 1,000 exceeds 3.7, if
-        the vertical is right. 0 where the vertical is unknown.
-
-        Parameters
-        ----------
-        map_from_camera : ndarray (4, 4)
-        covariance : ndarray (6, 6)
-            Of the pose, in the order of core.fit.covariance.
+        Those of the vertical and of the pose, with covariance (6, 6), count. Of right poses, one
+        of 1,000 exceeds 3.7, if the vertical is right. 0 where the vertical is unknown.
         """
         up = map_from_camera[:3, :3] @ self.up_in_camera
         axis = np.cross(up, self.up_in_map)

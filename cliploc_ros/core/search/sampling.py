@@ -193,14 +193,8 @@ def _compatible_before(compatible, newest, earlier):
 def enumerate_compatible_pairs(compatible, cursor, samples):
     """Write the next pairs of compatible candidates, by their newer; return their number.
 
-    Parameters
-    ----------
-    compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.search.compatibility.
-    cursor : ndarray (2,)
-        Newer and older candidate, at first 1, 0; updated. The newer is c at the end.
-    samples : ndarray (t, 3)
-        Its first two columns are filled from the first row on: older, newer.
+    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) is at
+    first 1, 0, and its first value is c at the end.
     """
     count = compatible.shape[0]
     newest, first = cursor[0], cursor[1]
