@@ -76,14 +76,9 @@ def unit_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the pairs (k, 2) of rows of two images' descriptors that show the same point.
+    """Return the pairs (k, 2) of rows of two images' unit descriptors that show the same point.
 
     Each is the other's most similar one, and clearly more similar than the second of theirs.
-
-    Parameters
-    ----------
-    ours, theirs : ndarray (n, d), (m, d)
-        Unit vectors, see unit_rows.
     """
     if len(ours) == 0 or len(theirs) < 2:
         return np.empty((0, 2), dtype=np.int64)

@@ -44,14 +44,8 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
     """Return the pose that most points agree with; None where there is none.
 
     MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
-    optimization, MAGSAC++ and PoseLib took longer at equal success.
-
-    Parameters
-    ----------
-    points : ndarray (n, 3)
-        In the map [m].
-    bearings : ndarray (n, 2)
-        Where the image shows them, on the plane z = 1.
+    optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map
+    [m], bearings (n, 2) where the image shows them, on the plane z = 1.
     """
     if len(points) < LEAST_INLIERS:
         return None

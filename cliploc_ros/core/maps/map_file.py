@@ -28,12 +28,8 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
               ) -> None:
     """Write a map file in one step: an existing file is replaced complete, or stays.
 
-    The image embeddings of a map that is replaced are removed: they are not of the new one.
-
-    Parameters
-    ----------
-    embeddings : LandmarkEmbeddings, optional
-        Image embeddings of these landmarks, written next to the map.
+    Comments are lines for the head of the file. Image embeddings are written next to the map;
+    those of a map that is replaced are removed: they are not of the new one.
 
     Raises
     ------
