@@ -15,9 +15,8 @@ from cliploc_ros.core.fit.rig import make_rig
 from cliploc_ros.core.fit.verification import Verified, verify_rig
 from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.p3p import p3p
+from cliploc_ros.core.geometry.p3p import solve_p3p
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.geometry.two_point import two_point
 from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
 
 # A pose: rotation (3, 3) and translation (3,) of camera_from_map.
@@ -37,27 +36,6 @@ def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np
     mask = np.zeros(shape, dtype=bool)
     mask[candidates.detections, candidates.landmarks] = True
     return mask
-
-
-def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations (s, 3, 3) and translations (s, 3) that the kernel finds, s = 0 to 4."""
-    rotations, translations = np.empty((4, 3, 3)), np.empty((4, 3))
-    count = p3p(np.ascontiguousarray(bearings, dtype=np.float64),
-                np.ascontiguousarray(points, dtype=np.float64), rotations, translations)
-    return rotations[:count], translations[:count]
-
-
-def solve_two_point(bearings: NDArray[np.float64], points: NDArray[np.float64],
-                    up_in_camera: NDArray[np.float64], up_in_map: NDArray[np.float64]
-                    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations (s, 3, 3) and translations (s, 3) that the kernel finds, s = 0 to 2."""
-    rotations, translations = np.empty((2, 3, 3)), np.empty((2, 3))
-    count = two_point(np.ascontiguousarray(bearings, dtype=np.float64),
-                      np.ascontiguousarray(points, dtype=np.float64),
-                      np.concatenate([up_in_camera, up_in_map]).astype(np.float64), rotations,
-                      translations)
-    return rotations[:count], translations[:count]
 
 
 def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:

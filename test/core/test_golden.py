@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from reference import candidate_mask, same_class, sample_pose, solve_p3p, verify
+from reference import candidate_mask, same_class, sample_pose, verify
 
 from cliploc_ros.core.association.candidates import (
     balanced_order,
@@ -12,6 +12,7 @@ from cliploc_ros.core.association.candidates import (
     prosac_order,
 )
 from cliploc_ros.core.association.scene import make_scene
+from cliploc_ros.core.geometry.p3p import solve_p3p
 from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.strategies import search_exhaustively
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference import solve_p3p
 from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.p3p import solve_p3p
 
 coordinates = st.floats(-5.0, 5.0)
 

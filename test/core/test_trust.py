@@ -332,9 +332,8 @@ def test_a_search_cut_short_is_refused(office_map, queries, observe):
 
 def test_covariance_is_that_of_simulated_boxes(rng):
     """The linearized covariance against the scatter of poses solved from noisy boxes."""
-    from reference import solve_p3p
-
     from cliploc_ros.core.fit.covariance import _VARIANCE_INFLATION
+    from cliploc_ros.core.geometry.p3p import solve_p3p
     centers = np.array([[-1.0, 0.2, 4.0], [1.2, -0.3, 5.0], [0.1, 0.9, 3.0]])
     seen = centers[:, :2] / centers[:, 2:]
     sizes, scatter = np.full((3, 2), 0.1), 0.01

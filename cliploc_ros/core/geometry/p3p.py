@@ -12,6 +12,9 @@ polished by Newton's method on the three equations themselves.
 
 from math import sqrt
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cliploc_ros.core.geometry.cubic import largest_cubic_root
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
@@ -21,17 +24,34 @@ _NEWTON_STEPS = 3
 _MIN_SINE = 1e-9
 
 
-@compiled
-def p3p(bearings, points, rotations, translations):
-    """Write the poses from which three points are seen along three bearings; return their number.
+def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the poses from which three points are seen along three bearings.
 
     Parameters
     ----------
-    bearings, points : ndarray (3, 3)
-        Unit vectors in the camera's optical frame, and points in the map frame [m], one a row.
-    rotations, translations : ndarray (4, 3, 3), (4, 3)
-        Of camera_from_map [m]. All points lie in front of the camera along their bearings.
+    bearings : ndarray (3, 3)
+        Unit vectors in the camera's optical frame, one a row.
+    points : ndarray (3, 3)
+        The points in the map frame [m], one a row.
+
+    Returns
+    -------
+    rotations : ndarray (s, 3, 3)
+        Rotation of ``camera_from_map`` of each of the s = 0 to 4 solutions.
+    translations : ndarray (s, 3)
+        Its translation [m]. All points lie in front of the camera along their bearings.
     """
+    rotations = np.empty((MAX_SOLUTIONS, 3, 3))
+    translations = np.empty((MAX_SOLUTIONS, 3))
+    count = p3p(np.ascontiguousarray(bearings, dtype=np.float64),
+                np.ascontiguousarray(points, dtype=np.float64), rotations, translations)
+    return rotations[:count], translations[:count]
+
+
+@compiled
+def p3p(bearings, points, rotations, translations):
+    """Write up to four poses into the two arrays; return their number (see solve_p3p)."""
     m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
     a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
                      _squared_distance(points, 1, 2))
