@@ -13,21 +13,12 @@ from cliploc_ros.core.map.similarities import Similarities
 
 @dataclass(frozen=True)
 class Detections:
-    """The objects a detector found in one image.
+    """The objects a detector found in one image."""
 
-    Parameters
-    ----------
-    bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px] in the distorted image.
-    class_ids : tuple of str
-        Class name of each detection, n of them.
-    scores : ndarray (n,)
-        Detector confidence, 0 to 1.
-    """
-
+    #: (n, 4): Left, top, right, bottom [px] in the distorted image
     bboxes_xyxy: NDArray[np.float64]
-    class_ids: tuple[str, ...]
-    scores: NDArray[np.float64]
+    class_ids: tuple[str, ...]  #: Class name of each detection, n of them
+    scores: NDArray[np.float64]  #: (n,): detector confidence, 0 to 1
 
     def __len__(self) -> int:
         """Return the number of detections."""
@@ -67,37 +58,23 @@ class Detections:
 
 @dataclass(frozen=True)
 class Observation:
-    """A frame's detections with its camera and time.
-
-    Parameters
-    ----------
-    camera : Camera
-    detections : Detections
-        n of them.
-    similarities : ndarray (n, L), CropSimilarities or None
-        Cosine similarity of each compared detection's crop with the label of each of the map's L
-        landmarks, in the map's order. None where only classes are known.
-    stamp_ns : int
-        Time of the image [ns].
-    up_in_camera : ndarray (3,) or None
-        The vertical, a unit vector in the camera's optical coordinate frame; None if unknown.
-    odom_from_camera : ndarray (4, 4) or None
-        The camera in the coordinate frame of odometry, which links this frame to others; None if
-        unknown.
-    odom_way_m : float
-        Way driven since the run of odometry began [m]; 0 where it is unknown.
-    compared : ndarray (m,) of int or None
-        The detections that the rows of similarities (m, L) belong to; None for all, in their
-        order. The other detections are matched by class alone.
-    """
+    """A frame's detections with its camera and time."""
 
     camera: Camera
-    detections: Detections
+    detections: Detections  #: n of them
+    #: (n, L): cosine similarity of each compared detection's crop with the label
+    #: of each of the map's L landmarks, in the map's order. None where only classes are known.
     similarities: Similarities | None = None
-    stamp_ns: int = 0
+    stamp_ns: int = 0  #: Time of the image [ns]
+    #: (3,): the vertical, a unit vector in the camera's optical coordinate frame; None if unknown
     up_in_camera: NDArray[np.float64] | None = None
+    #: (4, 4): the camera in the coordinate frame of odometry, which links this frame to others;
+    #: None if unknown
     odom_from_camera: NDArray[np.float64] | None = None
+    #: Way driven since the run of odometry began [m]; 0 where it is unknown
     odom_way_m: float = 0.0
+    #: (m,): the detections that the rows of similarities (m, L) belong to; None for all, in their
+    #: order. The other detections are matched by class alone.
     compared: NDArray[np.int64] | None = None
 
     @property

@@ -57,7 +57,6 @@ def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     observation : Observation
         Its similarities are ignored.
     compare : callable
@@ -100,29 +99,9 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
-    Parameters
-    ----------
-    relocalizer : Relocalizer
-    earlier : sequence of SearchedFrame
-        Frames before it, linked by odometry.
-    observations : iterable of Observation
-        The frame with more and more of its crops, one at least, see crops_on_demand.
-    looks : Looks, optional
-        Results of earlier frames, which have to agree.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes.
-
-    Returns
-    -------
-    frame : SearchedFrame
-        With the crops that it took.
-    found : Relocalization
-        Its time is that of all searches.
-
-    Raises
-    ------
-    OptionsError
-        See Relocalizer.relocalize.
+    The observations, one at least, are the frame with more and more of its crops, see
+    crops_on_demand. Returns the frame with the crops that it took; the result's time is that of
+    all searches. Raises OptionsError, see Relocalizer.relocalize.
     """
     search_ms = 0.0
     for observation in observations:

@@ -100,7 +100,10 @@ class RelocalizerOptions:
         _check_range('iterations', self.iterations, 1, 1_000_000)
         _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)
         _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
-        _check_height_range(self.height_range_m)
+        heights = self.height_range_m
+        if len(heights) != 2 or not heights[0] < heights[1]:
+            raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater '
+                               'height')
         _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
         _check_range('tilt_deviation_deg', self.tilt_deviation_deg, 0.0, 60.0)
         _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
@@ -121,8 +124,3 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')
-
-
-def _check_height_range(heights: tuple[float, float]) -> None:
-    if len(heights) != 2 or not heights[0] < heights[1]:
-        raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater height')

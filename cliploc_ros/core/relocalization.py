@@ -42,53 +42,28 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """The hypotheses of a relocalization, and whether the best one is accepted.
+    """The hypotheses of a relocalization, and whether the best one is accepted."""
 
-    Parameters
-    ----------
-    accepted : bool
-        Whether to act on the pose.
-    reason : str
-        Reason of a refusal, in one line; empty when accepted.
-    hypotheses : tuple of Hypothesis
-        The best distinct hypotheses, best first; empty when nothing was found.
-    matches : tuple of Match
-        Inliers of the best hypothesis in the newest frame.
-    evidence : Evidence or None
-        Evidence for the best hypothesis, which decided; None when nothing was found.
-    covariance : ndarray (6, 6) or None
-        Of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was found.
-    tried : int
-        Number of hypotheses tried.
-    best_iteration : int
-        Iteration that found the best hypothesis, from 1; 0 when nothing was found.
-    coverage : float
-        Share of its samples that the search tried, 0 to 1.
-    search_ms : float
-        Time of association, search and verification [ms].
-    stamp_ns : int
-        Stamp of the newest observation [ns].
-    source : str
-        What proposes the best pose: 'objects', 'keyframes' or 'both'.
-    refusal_kind : RefusalKind or None
-        Kind of the refusal, which programs compare; None when accepted.
-    recognition : Recognition or None
-        What keyframes say, whatever the best pose comes from; None without keyframes.
-    """
-
-    accepted: bool
-    reason: str
+    accepted: bool  #: Whether to act on the pose
+    reason: str  #: Reason of a refusal, in one line; empty when accepted
+    #: The best distinct hypotheses, best first; empty when nothing was found
     hypotheses: tuple[Hypothesis, ...] = ()
-    matches: tuple[Match, ...] = ()
+    matches: tuple[Match, ...] = ()  #: Inliers of the best hypothesis in the newest frame
+    #: Evidence for the best hypothesis, which decided; None when nothing was found
     evidence: Evidence | None = None
+    #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was
+    #: found
     covariance: NDArray[np.float64] | None = None
-    tried: int = 0
+    tried: int = 0  #: Number of hypotheses tried
+    #: Iteration that found the best hypothesis, from 1; 0 when nothing was found
     best_iteration: int = 0
-    coverage: float = 1.0
-    search_ms: float = 0.0
-    stamp_ns: int = 0
-    source: str = 'objects'
+    coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
+    search_ms: float = 0.0  #: Time of association, search and verification [ms]
+    stamp_ns: int = 0  #: Stamp of the newest observation [ns]
+    source: str = 'objects'  #: What proposes the best pose: 'objects', 'keyframes' or 'both'
+    #: Kind of the refusal, which programs compare; None when accepted
     refusal_kind: RefusalKind | None = None
+    #: What keyframes say, whatever the best pose comes from; None without keyframes
     recognition: Recognition | None = None
 
     @property
@@ -121,15 +96,9 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
                ) -> tuple[Relocalization, MapPart]:
     """Return a result in the coordinate frame of the map of its best pose, and this map.
 
-    Poses on other maps are left out: they have no place in this coordinate frame. The reason of a
-    refusal names the map. A result from a single map stays as it is.
-
-    Parameters
-    ----------
-    found : Relocalization
-        Found in landmark_map.
-    landmark_map : LandmarkMap
-        A JoinedMap, or a single map.
+    It was found in landmark_map, which may be a JoinedMap. Poses on other maps are left out: they
+    have no place in this coordinate frame. The reason of a refusal names the map. A result from a
+    single map stays as it is.
     """
     parts = parts_of(landmark_map)
     if found.map_from_camera is None or len(parts) == 1:

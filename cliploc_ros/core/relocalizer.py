@@ -85,11 +85,6 @@ class TimeBudget:
 class Relocalizer:
     """Finds camera poses in one map.
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-
     Raises
     ------
     OptionsError
@@ -116,21 +111,10 @@ class Relocalizer:
                    recognizer: ImageRecognizer | None = None) -> Relocalization:
         """Find where the camera was when it saw the last of some frames.
 
-        Several frames are localized as one: each of them gives hypotheses, which are scored and
-        refined on all of them. Each frame's search gets an equal share of the time budget.
-
-        Parameters
-        ----------
-        observations : sequence of Observation
-            One frame, or up to MAX_FRAMES of one moving camera, linked by odom_from_camera. The
-            result is the pose of the last one.
-        recognizer : ImageRecognizer, optional
-            Of the keyframes, for the image of the last frame.
-
-        Returns
-        -------
-        Relocalization
-            Accepted, or refused with the reason.
+        Several frames, up to MAX_FRAMES of one moving camera, are localized as one: each of them
+        gives hypotheses, which are scored and refined on all of them. Each frame's search gets an
+        equal share of the time budget. The recognizer is of the keyframes, for the image of the
+        last frame.
 
         Raises
         ------
@@ -149,13 +133,7 @@ class Relocalizer:
         return TimeBudget.begin(self._options.time_budget_s, frames)
 
     def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
-        """Search one frame, until a deadline of time.perf_counter [s].
-
-        Raises
-        ------
-        OptionsError
-            See relocalize.
-        """
+        """Search one frame, until a deadline of time.perf_counter [s]."""
         return search_frame(self._map, observation, self._options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
@@ -163,20 +141,9 @@ class Relocalizer:
                ) -> Relocalization:
         """Find where the camera was when it saw the last of some searched frames.
 
-        Parameters
-        ----------
-        frames : sequence of SearchedFrame
-        budget : TimeBudget, optional
-            Time left for the refinement; a new one by default.
-        looks : Looks, optional
-            Results of earlier frames, which have to agree.
-        recognizer : ImageRecognizer, optional
-            Of the keyframes, for the image of the last frame.
-
-        Raises
-        ------
-        OptionsError
-            See relocalize.
+        The budget is the time left for the refinement, by default a new one. Earlier looks have to
+        agree. The recognizer is of the keyframes, for the image of the last frame. Raises
+        OptionsError, see relocalize.
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self._map, self._options, frames)

@@ -38,12 +38,7 @@ class KeptFrame(NamedTuple):
 
 
 class Session:
-    """Localizes with each frame and those before it.
-
-    Parameters
-    ----------
-    relocalizer : Relocalizer
-    """
+    """Localizes with each frame and those before it."""
 
     def __init__(self, relocalizer: Relocalizer) -> None:
         self._relocalizer = relocalizer
@@ -136,7 +131,12 @@ def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit:
     if earlier and max(_steps(earlier[-1].anchor, anchor)) <= 1.0:
         anchor = earlier.pop().anchor
     while len(earlier) >= limit:
-        del earlier[_least_useful([*(one.anchor for one in earlier), anchor])]
+        # the frame nearest to those before and after it goes, neither end if possible
+        anchors = [*(one.anchor for one in earlier), anchor]
+        ways = [sum(_steps(anchors[row - 1], anchors[row])
+                    + _steps(anchors[row], anchors[row + 1]))
+                for row in range(1, len(anchors) - 1)]
+        del earlier[1 + int(np.argmin(ways)) if ways else 0]
     return earlier, anchor
 
 
@@ -144,10 +144,3 @@ def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[flo
     """Return how far a camera drove and turned, in the steps that make a frame a new one."""
     distance_m, angle_deg = pose_error(before, after)
     return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg
-
-
-def _least_useful(anchors: Sequence[NDArray[np.float64]]) -> int:
-    """Return the frame that is nearest to those before and after it; neither end if possible."""
-    ways = [sum(_steps(anchors[row - 1], anchors[row]) + _steps(anchors[row], anchors[row + 1]))
-            for row in range(1, len(anchors) - 1)]
-    return 1 + int(np.argmin(ways)) if ways else 0

@@ -34,19 +34,12 @@ _LEAST_SHARE = 1e-4
 
 
 class Known(NamedTuple):
-    """What a filter knows that fused all answers of one run of odometry.
+    """What a filter knows that fused all answers of one run of odometry."""
 
-    Parameters
-    ----------
-    odom_from_camera, map_from_camera : ndarray (4, 4)
-        At the last answer.
-    covariance : ndarray (6, 6)
-        As of Relocalization.
-    """
-
+    #: (4, 4): at the last answer
     odom_from_camera: NDArray[np.float64]
     map_from_camera: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    covariance: NDArray[np.float64]  #: (6, 6): as of Relocalization
 
 
 def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
@@ -55,16 +48,8 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
     """Return the covariance of an answer to a filter, and what the filter knows after it.
 
     An answer that contradicts its predecessors makes both less certain: one of them is wrong. So
-    an outlier hardly moves the filter, and a filter that it misled recovers.
-
-    Parameters
-    ----------
-    known : Known or None
-        After the answers before; None for the first one.
-    odom_from_camera, map_from_camera : ndarray (4, 4)
-        Of the answer.
-    covariance : ndarray (6, 6)
-        Of the answer alone.
+    an outlier hardly moves the filter, and a filter that it misled recovers. Poses (4, 4) and
+    covariance (6, 6) are of the answer alone; known is None for the first one.
     """
     if known is None:
         return covariance, Known(odom_from_camera, map_from_camera, covariance)

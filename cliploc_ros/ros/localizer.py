@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
+from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, split_similarities

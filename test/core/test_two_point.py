@@ -6,10 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.two_point import solve_two_point
+from cliploc_ros.core.geometry.two_point import two_point
 
 coordinates = st.floats(-5.0, 5.0)
 UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def solve_two_point(bearings, points, up_in_camera, up_in_map):
+    """Rotations (s, 3, 3) and translations (s, 3) that the kernel finds, s = 0 to 2."""
+    rotations, translations = np.empty((2, 3, 3)), np.empty((2, 3))
+    count = two_point(np.ascontiguousarray(bearings), np.ascontiguousarray(points),
+                      np.concatenate([up_in_camera, up_in_map]), rotations, translations)
+    return rotations[:count], translations[:count]
 
 
 def random_problem(rng):

@@ -17,7 +17,7 @@ import sys
 sys.path[:0] = sys.argv[1:3]
 from dataclasses import replace
 import numpy as np
-from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS
+from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session

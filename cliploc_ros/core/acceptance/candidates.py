@@ -26,24 +26,13 @@ _NONE = np.empty(0, dtype=np.int64)
 
 
 class JoinedFrames(NamedTuple):
-    """What poses are compared on: searched frames of one camera, in a map.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    options : RelocalizerOptions
-    frames : sequence of F SearchedFrame
-    rig : Rig
-        The same frames.
-    cameras : ndarray (F, 4, 4)
-        Each camera from the last.
-    """
+    """What poses are compared on: searched frames of one camera, in a map."""
 
     landmark_map: LandmarkMap
     options: RelocalizerOptions
     frames: Sequence[SearchedFrame]
-    rig: Rig
-    cameras: NDArray[np.float64]
+    rig: Rig  #: The same frames
+    cameras: NDArray[np.float64]  #: (F, 4, 4): each camera from the last
 
     @property
     def knows_vertical(self) -> bool:
@@ -73,52 +62,24 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
 
 
 class Candidate(NamedTuple):
-    """A pose that may be right, and what supports it.
+    """A pose that may be right, and what supports it."""
 
-    Parameters
-    ----------
-    finalist : Finalist
-        Of the search of objects, or the pose of keyframes as one.
-    pose : ndarray (4, 4)
-        map_from_camera.
-    matches : list of F tuple of Match
-        Inliers in each frame.
-    support : Support
-        By objects.
-    is_upright : bool
-        Whether it uses the known vertical, or agrees with it.
-    handicap : float
-        Log odds that its attitude takes from it.
-    odds : float
-        Logarithm of its odds, up to a constant that all candidates share.
-    recognized : RecognizedPlace or None
-        What keyframes show there, where they propose the pose.
-    by_points : float
-        The odds of a pose that keyframes propose, without what objects say for it.
-    """
-
-    finalist: Finalist
-    pose: NDArray[np.float64]
-    matches: list[tuple[Match, ...]]
-    support: Support
-    is_upright: bool
-    handicap: float
-    odds: float
+    finalist: Finalist  #: Of the search of objects, or the pose of keyframes as one
+    pose: NDArray[np.float64]  #: (4, 4): map_from_camera
+    matches: list[tuple[Match, ...]]  #: Inliers in each of F frames
+    support: Support  #: By objects
+    is_upright: bool  #: Whether it uses the known vertical, or agrees with it
+    handicap: float  #: Log odds that its attitude takes from it
+    odds: float  #: Logarithm of its odds, up to a constant that all candidates share
+    #: What keyframes show there, where they propose the pose
     recognized: RecognizedPlace | None = None
+    #: The odds of a pose that keyframes propose, without what objects say for it
     by_points: float = -math.inf
 
 
 def candidates_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
                 ) -> list[Candidate]:
-    """Return poses as candidates, with their odds by objects.
-
-    Parameters
-    ----------
-    joined : JoinedFrames
-    finalists : sequence of m Finalist
-    upright : sequence of m bool
-        See Candidate.is_upright.
-    """
+    """Return poses as candidates, with their odds by objects."""
     poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
     matches = [matches_of(joined.rig, one) for one in finalists]
     supports = supports_of(joined, poses, matches)

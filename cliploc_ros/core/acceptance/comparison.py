@@ -85,23 +85,13 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
 
 
 class Comparison(NamedTuple):
-    """The candidates, and what decides between them.
+    """The candidates, and what decides between them."""
 
-    Parameters
-    ----------
-    candidates : list of m Candidate
-        The leading one first; of those of one source, one of each place.
-    poses : ndarray (m, 4, 4)
-    likely : ndarray (m,)
-        Probability of each, shared by those that agree.
-    recognition : Recognition or None
-        What keyframes say.
-    """
-
+    #: The leading one first; of those of one source, one of each place
     candidates: list[Candidate]
-    poses: NDArray[np.float64]
-    likely: NDArray[np.float64]
-    recognition: Recognition | None
+    poses: NDArray[np.float64]  #: (m, 4, 4)
+    likely: NDArray[np.float64]  #: (m,): probability of each, shared by those that agree
+    recognition: Recognition | None  #: What keyframes say
 
     @property
     def leading(self) -> NDArray[np.bool_]:
@@ -132,18 +122,9 @@ def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDA
             recognizer: ImageRecognizer | None = None) -> Comparison:
     """Return the candidates compared; none where neither source has any.
 
-    Poses that ignore the known vertical come last. Without refinement the greatest score is
-    first, as in the paper.
-
-    Parameters
-    ----------
-    joined : JoinedFrames
-    finalists : sequence of m Finalist
-        Of the search of objects.
-    is_upright : ndarray (m,) of bool
-        Which of them use the known vertical.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes, for the image of the last frame.
+    Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement the
+    greatest score is first, as in the paper. The recognizer is of the keyframes, for the last
+    image.
     """
     candidates = candidates_of(joined, finalists, is_upright.tolist())
     if joined.options.refine:
@@ -227,14 +208,8 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
 
     Parameters
     ----------
-    joined : JoinedFrames
-    compared : Comparison
     covariance : ndarray (6, 6)
         Of the leading pose.
-    looks : Looks
-        Results of earlier frames.
-    recognizer : ImageRecognizer, optional
-        Of the keyframes, where there are some.
     """
     best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
     coverage, last = coverage_of(joined.frames), joined.frames[-1].observation

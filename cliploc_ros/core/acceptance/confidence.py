@@ -32,17 +32,10 @@ _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 
 
 class Setting(NamedTuple):
-    """What the chance of a wrong pose depends on, besides the supports.
+    """What the chance of a wrong pose depends on, besides the supports."""
 
-    Parameters
-    ----------
-    landmarks : int
-        Number of landmarks in the map.
-    vertical_deg : float
-        Standard deviation of the known vertical [deg]; infinite where none is known.
-    """
-
-    landmarks: int
+    landmarks: int  #: Number of landmarks in the map
+    #: Standard deviation of the known vertical [deg]; infinite where none is known
     vertical_deg: float = math.inf
 
     @property
@@ -59,21 +52,10 @@ class Setting(NamedTuple):
 
 def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: float,
                 calibration: Calibration = CALIBRATION) -> NDArray[np.float64]:
-    """Return the probability that each pose is within 1 m of the truth.
+    """Return the probability (m,) that each pose (m, 4, 4) is within 1 m of the truth.
 
-    Parameters
-    ----------
-    odds : ndarray (m,)
-        Utility of each pose.
-    poses : ndarray (m, 4, 4)
-        map_from_camera.
-    none : float
-        Utility of the case that none of them is right.
-
-    Returns
-    -------
-    ndarray (m,)
-        0 to 1. The rest to 1 is the probability that another pose is right, or none.
+    The rest to 1 is the probability that another pose is right, or none. Odds (m,) are the
+    utilities of the poses, none is that of the case that none of them is right.
     """
     if len(odds) == 0:
         return np.empty(0)

@@ -29,32 +29,20 @@ _MANY = 40
 
 
 class Signs(NamedTuple):
-    """Signs that a place is there, and as it was mapped.
+    """Signs that a place is there, and as it was mapped."""
 
-    Parameters
-    ----------
-    points : float
-        Logarithm of the number of features that agree, of 40 at most.
-    confirmed : float
-        See RecognizedPlace.
-    focal, aspect : float
-        How far the focal length and the aspect that the points suggest are from the camera's, as
-        logarithms of ratios: 0 to 0.25.
-    reach : float
-        Share of the image's width or height, the greater one, over which the points and the boxes
-        lie that agree: a picture ends within the image.
-    unexplained : float
-        Share of the detected objects of the map's classes that the pose does not explain.
-    rival : float
-        Number of features that agree with another place, as a share of those that agree here.
-    """
-
-    points: float
-    confirmed: float
+    points: float  #: Logarithm of the number of features that agree, of 40 at most
+    confirmed: float  #: See RecognizedPlace
+    #: How far the focal length and the aspect that the points suggest are from the camera's, as
+    #: logarithms of ratios: 0 to 0.25
     focal: float
     aspect: float
+    #: Share of the image's width or height, the greater one, over which the points and the boxes
+    #: lie that agree: a picture ends within the image
     reach: float
+    #: Share of the detected objects of the map's classes that the pose does not explain
     unexplained: float
+    #: Number of features that agree with another place, as a share of those that agree here
     rival: float
 
 
@@ -64,15 +52,8 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
     Parameters
     ----------
-    place : RecognizedPlace
-    support : Support
-        By objects.
     boxes : ndarray (b, 4)
         That the pose explains: left, top, right, bottom [px].
-    camera : Camera
-        Of the image.
-    rival : int
-        Number of features that agree with another place.
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
@@ -89,14 +70,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
                    calibration: Calibration = CALIBRATION) -> float:
-    """Return the probability that a place is there, and as it was mapped.
-
-    Parameters
-    ----------
-    signs : Signs
-    motion : Motion, optional
-        Since an earlier look.
-    """
+    """Return the probability that a place is there, and as it was mapped."""
     terms = calibration.genuine
     odds = terms.none + sum(getattr(terms, name) * sign for name, sign in signs._asdict().items())
     if motion is not None:

@@ -46,23 +46,14 @@ _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
 
 
 class Alike(NamedTuple):
-    """Places that look like one place, the most alike first.
+    """Places that look like one place, the most alike first."""
 
-    Parameters
-    ----------
-    moves : ndarray (m, 4, 4)
-        Each takes the place onto another one: a turn about the vertical and a shift.
-    landmarks : ndarray (r,) of int
-        Landmarks of the place.
-    others : ndarray (m, r) of int
-        The landmark of its class at the same spot of the other place, where found.
-    found : ndarray (m, r) of bool
-    """
-
+    #: (m, 4, 4): each takes the place onto another one: a turn about the vertical and a shift
     moves: NDArray[np.float64]
-    landmarks: NDArray[np.int64]
+    landmarks: NDArray[np.int64]  #: (r,): landmarks of the place
+    #: (m, r): the landmark of its class at the same spot of the other place, where found
     others: NDArray[np.int64]
-    found: NDArray[np.bool_]
+    found: NDArray[np.bool_]  #: (m, r)
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
@@ -93,7 +84,11 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     moves : ndarray (k, 4, 4), optional
         Moves to try besides those that the map suggests.
     """
-    rows = _place(landmark_map, position, matched)
+    # those matched, then those around, the nearest first
+    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
+    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
+    rows = rows[np.isfinite(distances)]
+    rows = np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
     if len(rows) < _LEAST_LANDMARKS:
         return Alike(_NOWHERE, rows, np.empty((0, len(rows)), np.int64),
                      np.empty((0, len(rows)), np.bool_))
@@ -118,8 +113,6 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-        L landmarks, z up.
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
         Landmarks that the pose explains detections with; all around it count where there are none.
@@ -133,8 +126,12 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     are_rooms : ndarray (m,) of bool
         See Alike.are_rooms.
     """
-    alike = find_alike(landmark_map, map_from_camera[:3, 3], matched,
-                       _moves_of_poses(map_from_camera, others[:_OTHERS]))
+    position = map_from_camera[:3, 3]
+    moves = others[:_OTHERS] @ invert_transform(map_from_camera)
+    moves = moves[moves[:, 2, 2] > _MOST_TILT]
+    upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
+                             moves[:, :3, :3] @ position + moves[:, :3, 3])
+    alike = find_alike(landmark_map, position, matched, upright)
     return alike.moves @ map_from_camera, alike.are_rooms
 
 
@@ -142,35 +139,14 @@ def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.fl
                     ) -> tuple[float, int]:
     """Return the probability that a pose is not mistaken for one at a place that looks alike.
 
-    Parameters
-    ----------
-    its : Support
-        Of the pose.
-    twins : sequence of Support
-        Of the m poses at places that look like its own, one at least.
-    leads : ndarray (m,)
-        Log odds by which keyframes prefer the pose to each.
-
-    Returns
-    -------
-    chance : float
-    likeliest : int
-        The twin that is likeliest.
+    The second value is the row of the likeliest of the m poses at such places, one at least, whose
+    supports the twins are. Leads (m,) are the log odds by which keyframes prefer the pose to each.
     """
     terms = CALIBRATION.places
     leads = leads + [terms.likeness * (its.likeness - one.likeness)
                      + terms.unlabelled * (its.unlabelled - one.unlabelled) for one in twins]
     return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
             int(np.argmin(leads)))
-
-
-def _place(landmark_map: LandmarkMap, position: NDArray[np.float64], matched: NDArray[np.int64]
-           ) -> NDArray[np.int64]:
-    """Return the landmarks of a place: those matched, then those around, the nearest first."""
-    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
-    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
-    rows = rows[np.isfinite(distances)]
-    return np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -189,16 +165,6 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
     return moves[_distinct(moves, middle, _MOVES)]
-
-
-def _moves_of_poses(map_from_camera: NDArray[np.float64], others: NDArray[np.float64]
-                    ) -> NDArray[np.float64]:
-    """Return the upright moves (m, 4, 4) that take a pose to others (k, 4, 4)."""
-    moves = others @ invert_transform(map_from_camera)
-    moves = moves[moves[:, 2, 2] > _MOST_TILT]
-    position = map_from_camera[:3, 3]
-    return _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
-                          moves[:, :3, :3] @ position + moves[:, :3, 3])
 
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],

@@ -31,38 +31,20 @@ _MOST_RECOGNIZED = 3
 
 
 class Look(NamedTuple):
-    """The best pose of one frame.
-
-    Parameters
-    ----------
-    observation : Observation
-    map_from_camera : ndarray (4, 4)
-    confidence : float
-        From the frames of this look alone.
-    recognized : RecognizedPlace or None
-        What keyframes recognize.
-    """
+    """The best pose of one frame."""
 
     observation: Observation
-    map_from_camera: NDArray[np.float64]
-    confidence: float
-    recognized: RecognizedPlace | None = None
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    confidence: float  #: From the frames of this look alone
+    recognized: RecognizedPlace | None = None  #: What keyframes recognize
 
 
 @dataclass(frozen=True)
 class Looks:
-    """The last looks of one run of odometry, oldest first.
+    """The last looks of one run of odometry, oldest first."""
 
-    Parameters
-    ----------
-    past : tuple of Look
-        Those that led to no accepted pose.
-    recognized : tuple of Look
-        The last ones by keyframes, accepted or not.
-    """
-
-    past: tuple[Look, ...] = ()
-    recognized: tuple[Look, ...] = ()
+    past: tuple[Look, ...] = ()  #: Those that led to no accepted pose
+    recognized: tuple[Look, ...] = ()  #: The last ones by keyframes, accepted or not
 
     def __len__(self) -> int:
         """Return the number of looks."""

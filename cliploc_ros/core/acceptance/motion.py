@@ -28,19 +28,12 @@ _AHEAD_M = 0.1
 
 
 class Motion(NamedTuple):
-    """How well two looks agree with odometry: squared Mahalanobis distances, dof 6.
+    """How well two looks agree with odometry: squared Mahalanobis distances, dof 6."""
 
-    Parameters
-    ----------
-    square : float
-        Of the motion between the two poses from that by odometry.
-    picture : float
-        The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
-        motion does not tell a picture from the place: a camera that only turns sees both move
-        alike.
-    """
-
-    square: float
+    square: float  #: Of the motion between the two poses from that by odometry
+    #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
+    #: motion does not tell a picture from the place: a camera that only turns sees both move
+    #: alike.
     picture: float
 
 
@@ -50,9 +43,6 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
 
     Parameters
     ----------
-    deviation_per_metre : float
-        Of the layer that both were recognized in.
-    first, second : RecognizedPlace
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """

@@ -29,79 +29,43 @@ _EDGE_DEVIATION = (0.2, 0.003)
 
 @dataclass(frozen=True)
 class Support:
-    """The support of a pose; each object counts once.
+    """The support of a pose; each object counts once."""
 
-    Parameters
-    ----------
-    inliers : int
-        Number of objects that are where the map has them.
-    score : float
-        Sum of their IoUs.
-    misfit : float
-        How far the edges of their boxes are from the outlines: Cauchy's robust sum.
-    likeness : float
-        How much more similar their crops are to the labels of their landmarks than to the map's
-        labels on average, in standard deviations, summed.
-    rarity : float
-        Summed over the objects that have a class of their landmark: the logarithm of the map's
-        number of landmarks for each landmark of this class. A chance match of a rare class is
-        rarer than one of a common class. A class that the detector takes the landmark for at
-        times counts by its share, see ClassIndex.shares.
-    unlabelled : float
-        Number of the objects that were matched by class alone.
-    unexplained : float
-        Number of other detected objects of the map's classes, which no landmark explains.
-    """
-
-    inliers: int = 0
-    score: float = 0.0
+    inliers: int = 0  #: Number of objects that are where the map has them
+    score: float = 0.0  #: Sum of their IoUs
+    #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
     misfit: float = 0.0
+    #: How much more similar their crops are to the labels of their landmarks than to the map's
+    #: labels on average, in standard deviations, summed
     likeness: float = 0.0
+    #: Summed over the objects that have a class of their landmark: the logarithm of the map's
+    #: number of landmarks for each landmark of this class. A chance match of a rare class is rarer
+    #: than one of a common class. A class that the detector takes the landmark for at times counts
+    #: by its share, see ClassIndex.shares.
     rarity: float = 0.0
-    unlabelled: float = 0.0
+    unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
+    #: Number of other detected objects of the map's classes, which no landmark explains
     unexplained: float = 0.0
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in.
+    """A frame to measure supports in."""
 
-    Parameters
-    ----------
-    bboxes_xyxy : ndarray (n, 4)
-        [px]
-    class_ids : tuple of str
-        Class of each detection, n of them.
-    similarities : Similarities or None
-        None where classes alone are matched.
-    scene : Scene
-        Of the same detections.
-    similarity_rows : ndarray (n,) of int
-        Row of similarities of each detection; -1 where its class alone is matched.
-    """
-
-    bboxes_xyxy: NDArray[np.float64]
-    class_ids: tuple[str, ...]
-    similarities: Similarities | None
-    scene: Scene
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4) [px]
+    class_ids: tuple[str, ...]  #: Class of each detection, n of them
+    similarities: Similarities | None  #: None where classes alone are matched
+    scene: Scene  #: Of the same detections
+    #: (n,): row of similarities of each detection; -1 where its class alone is matched
     similarity_rows: NDArray[np.int64]
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
-    """Return the support of a pose in one frame or several.
+    """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
 
     Several boxes on one landmark, or several landmarks behind one box, count as the best of them.
-    Frames that show the same object share the error of its shape in the map, so their agreement
-    is no more evidence than one of them: the object counts with their mean.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    frames : sequence of F ComparedFrame
-    map_from_cameras : ndarray (F, 4, 4)
-        Pose of the camera in each frame.
-    matches : sequence of F sequence of Match
-        Inliers in each frame.
+    Frames that show the same object share the error of its shape in the map, so their agreement is
+    no more evidence than one of them: the object counts with their mean.
     """
     rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
     for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):
@@ -114,20 +78,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
         return Support()
     total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
     views_of_each = sum(map(len, rows.values())) / len(rows)
-    unexplained = sum(_unexplained(landmark_map, frame, found)
-                      for frame, found in zip(frames, matches, strict=True)) / views_of_each
-    return Support(len(rows), *map(float, [*total, unexplained]))
-
-
-def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matches: Sequence[Match]) -> int:
-    """Return how many detections of the map's classes match no landmark.
-
-    A class that a landmark is only taken for does not count: a real person is not expected in a
-    map because a teddy bear sometimes looks like one.
-    """
-    index = landmark_map.classes
-    known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
-    return len(known - {match.detection for match in matches})
+    # A class that a landmark is only taken for does not count: a real person is not expected in a
+    # map because a teddy bear sometimes looks like one.
+    index, unexplained = landmark_map.classes, 0
+    for frame, found in zip(frames, matches, strict=True):
+        known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
+        unexplained += len(known - {match.detection for match in found})
+    return Support(len(rows), *map(float, [*total, unexplained / views_of_each]))
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
@@ -136,25 +93,22 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     """Return what each match (m, 5) adds to a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
-    classes = landmark_map.classes.classes_of(frame.class_ids)
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
     compared = rows >= 0
     if frame.similarities is not None and compared.any():
-        likenesses[compared] = _likenesses(frame.similarities, rows[compared],
-                                           landmarks[compared])
+        means, deviations = sampled_spread(frame.similarities, rows[compared])
+        likenesses[compared] = (
+            pair_similarities(frame.similarities, rows[compared], landmarks[compared])
+            - means) / np.maximum(deviations, 1e-6)
+    index = landmark_map.classes
+    classes = index.classes_of(frame.class_ids)[detections]
+    # 0 if the class of a detection is none of its landmark
+    rarities = index.shares(landmarks, classes) * -np.log(
+        np.maximum(index.sizes_of(classes), 1) / len(landmark_map))
     return np.column_stack([
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
-                 landmark_map.position_sigmas[landmarks]), likenesses,
-        _rarities(landmark_map, landmarks, classes[detections]), ~compared])
-
-
-def _rarities(landmark_map: LandmarkMap, landmarks: NDArray[np.int64],
-              classes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how rare the class of each detection (m,) is; 0 if it is none of its landmark."""
-    index = landmark_map.classes
-    shares = np.maximum(index.sizes_of(classes), 1) / len(landmark_map)
-    return -np.log(shares) * index.shares(landmarks, classes)
+                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared])
 
 
 def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
@@ -196,10 +150,3 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
-
-
-def _likenesses(similarities: Similarities, rows: NDArray[np.int64],
-                landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    means, deviations = sampled_spread(similarities, rows)
-    return np.asarray((pair_similarities(similarities, rows, landmarks) - means)
-                      / np.maximum(deviations, 1e-6))

@@ -57,96 +57,50 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Rival:
-    """The likeliest pose that does not agree with the leading one.
+    """The likeliest pose that does not agree with the leading one."""
 
-    Parameters
-    ----------
-    likely : float
-        Its probability.
-    place : tuple of float
-        Where its camera is [m].
-    map : str
-        Name of its map, where there are several.
-    is_other_source : bool
-        Whether keyframes propose one of the two poses and objects the other.
-    """
-
-    likely: float
-    place: Point
-    map: str = ''
+    likely: float  #: Its probability
+    place: Point  #: Where its camera is [m]
+    map: str = ''  #: Name of its map, where there are several
+    #: Whether keyframes propose one of the two poses and objects the other
     is_other_source: bool = False
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for and against the leading pose.
+    """Evidence for and against the leading pose."""
 
-    Parameters
-    ----------
-    inliers : int
-        Number of objects that it explains.
-    likely : float
-        Probability that it is right, given all poses found, see
-        cliploc_ros.core.acceptance.confidence.
-    by_points : float
-        The same without what objects say for it; 0 where keyframes do not propose it.
-    rival : Rival or None
-    distinct : float
-        Probability that its place is not mistaken for one that looks alike.
-    place, twin : tuple of float, optional
-        Where the camera is, and where it would be at the likeliest place that looks alike [m].
-    twin_map : str
-        Name of the twin's map, where there are several.
-    near : float
-        Probability that it is within 1 m if it is right, given its covariance.
-    deviation_m : float
-        Standard deviation of its position [m].
-    coverage : float
-        Share of its samples that the search tried, 0 to 1.
-    tried : int
-        Number of samples that the search tried.
-    meetings : float
-        Number of these samples that hold only inliers of the best pose of objects; infinite for a
-        search that tried all samples.
-    unexplained : float
-        Number of other detected objects of the map's classes.
-    signs : Signs or None
-        That the place is there and no picture of it; None where keyframes do not propose it.
-    motion : Motion or None
-        Since an earlier look by keyframes.
-    not_mirrored : float
-        Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror.
-    uncontradicted : float
-        Probability that keyframes are wrong which recognize another place only.
-    recognized : RecognizedPlace or None
-        What keyframes show at the pose.
-    earlier : tuple of float
-        Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks.
-    crops_left : int
-        Number of crops that were not compared with labels yet.
-    """
-
-    inliers: int
+    inliers: int  #: Number of objects that it explains
+    #: Probability that it is right, given all poses found, see
+    #: cliploc_ros.core.acceptance.confidence
     likely: float
+    #: The same without what objects say for it; 0 where keyframes do not propose it
     by_points: float = 0.0
     rival: Rival | None = None
-    distinct: float = 1.0
+    distinct: float = 1.0  #: Probability that its place is not mistaken for one that looks alike
+    #: Where the camera is, and where it would be at the likeliest place that looks alike [m]
     place: Point = (0.0, 0.0, 0.0)
     twin: Point | None = None
-    twin_map: str = ''
-    near: float = 1.0
-    deviation_m: float = 0.0
-    coverage: float = 1.0
-    tried: int = 0
+    twin_map: str = ''  #: Name of the twin's map, where there are several
+    near: float = 1.0  #: Probability that it is within 1 m if it is right, given its covariance
+    deviation_m: float = 0.0  #: Standard deviation of its position [m]
+    coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
+    tried: int = 0  #: Number of samples that the search tried
+    #: Number of these samples that hold only inliers of the best pose of objects; infinite for a
+    #: search that tried all samples
     meetings: float = math.inf
-    unexplained: float = 0.0
+    unexplained: float = 0.0  #: Number of other detected objects of the map's classes
+    #: That the place is there and no picture of it; None where keyframes do not propose it
     signs: Signs | None = None
-    motion: Motion | None = None
+    motion: Motion | None = None  #: Since an earlier look by keyframes
+    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror
     not_mirrored: float = 1.0
+    #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
-    recognized: RecognizedPlace | None = None
+    recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
+    #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
-    crops_left: int = 0
+    crops_left: int = 0  #: Number of crops that were not compared with labels yet
 
     @property
     def found(self) -> float:

@@ -106,14 +106,10 @@ def robust_cost(residuals):
 
 @compiled
 def linearize(pairs, vertical, rotation, translation, residuals):
-    """Return the normal equations at a pose of known residuals: information and gradient.
+    """Return the normal equations at a pose of known residuals: information (6, 6), gradient (6,).
 
-    Parameters are those of residuals_of.
-
-    Returns
-    -------
-    information, gradient : ndarray (6, 6), (6,)
-        For steps of the camera's position [m] and rotations about the map's axes [rad].
+    They are for steps of the camera's position [m] and rotations about the map's axes [rad]. See
+    residuals_of for the parameters.
     """
     return _normal_equations(jacobian_of(pairs, vertical, rotation, translation), residuals)
 

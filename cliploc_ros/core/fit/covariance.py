@@ -76,8 +76,6 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
         The sampled landmarks' centres in the map [m].
     box_sizes : ndarray (m, 2)
         Width and height of the sampled boxes on the plane z = 1.
-    scatter : float
-        See box_scatter.
     vertical : ndarray (7,), optional
         See make_rig.
 
@@ -107,15 +105,8 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
 def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the deviations (6,) of odometry between two frames: 0 if the camera did not move.
 
-    Parameters
-    ----------
-    first_from_second : ndarray (4, 4)
-        Motion of the camera by odometry.
-
-    Returns
-    -------
-    ndarray (6,)
-        On each axis, of position [m] and rotation [rad].
+    On each axis, of position [m] and rotation [rad]; first_from_second (4, 4) is the camera's
+    motion.
     """
     way_m = float(np.linalg.norm(first_from_second[:3, 3]))
     angle = float(Rotation.from_matrix(first_from_second[:3, :3]).magnitude())
@@ -130,13 +121,8 @@ def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
 
     The squared distance is a sum of squares with different variances. A scaled chi-squared
     distribution of the same mean and variance stands for it (Box, "Some Theorems on Quadratic
-    Forms Applied in the Study of Analysis of Variance Problems", 1954).
-
-    Parameters
-    ----------
-    radius_m : float
-    covariance : ndarray (6, 6)
-        As of pose_covariance.
+    Forms Applied in the Study of Analysis of Variance Problems", 1954). The covariance (6, 6) is
+    as of pose_covariance.
     """
     mean = np.trace(covariance[:3, :3])
     squares = np.sum(covariance[:3, :3] ** 2)
@@ -145,16 +131,10 @@ def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
 
 def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
                       truth: NDArray[np.float64]) -> float:
-    """Return the normalized estimation error squared (NEES) of a pose.
+    """Return the normalized estimation error squared (NEES) of a pose (4, 4).
 
-    Where covariances are right, it follows the chi-squared distribution with six degrees of
-    freedom (Bar-Shalom, Li and Kirubarajan 2001).
-
-    Parameters
-    ----------
-    map_from_camera, truth : ndarray (4, 4)
-    covariance : ndarray (6, 6)
-        As of pose_covariance.
+    Where covariances (6, 6), as of pose_covariance, are right, it follows the chi-squared
+    distribution with six degrees of freedom (Bar-Shalom, Li and Kirubarajan 2001).
     """
     error = pose_difference(map_from_camera, truth)
     return float(error @ np.linalg.solve(covariance, error))

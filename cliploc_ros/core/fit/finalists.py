@@ -50,30 +50,17 @@ class Match:
 
 
 class Finalist(NamedTuple):
-    """One of the best hypotheses; refined ones may be different minima at one place.
+    """One of the best hypotheses; refined ones may be different minima at one place."""
 
-    Parameters
-    ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        camera_from_map of the reference frame.
-    score : float
-        Sum of the IoUs of its inliers in all frames.
-    iteration : int
-        Iteration that found it, from 1.
-    frame : int
-        Frame whose search found it.
-    sample : ndarray (s,) of int
-        Its minimal sample: three candidates, or two where the vertical is known.
-    information : ndarray (6, 6) or None
-        See refine_rig; None without refinement.
-    """
-
+    #: (3, 3), (3,): camera_from_map of the reference frame
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    score: float
-    iteration: int
-    frame: int
+    score: float  #: Sum of the IoUs of its inliers in all frames
+    iteration: int  #: Iteration that found it, from 1
+    frame: int  #: Frame whose search found it
+    #: (s,): its minimal sample: three candidates, or two where the vertical is known
     sample: NDArray[np.int64]
+    #: (6, 6): see refine_rig; None without refinement
     information: NDArray[np.float64] | None = None
 
     @property
@@ -106,20 +93,8 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
     """Return the best poses among all frames' leaders, by their scores, best first.
 
     Without refinement no two of them lie at the same place. A place may have several refined
-    poses, of different matches: which of them is best, their support tells.
-
-    Parameters
-    ----------
-    frames : sequence of SearchedFrame
-    rig : Rig
-        The same frames.
-    refine : bool
-        Whether to refine the poses.
-    count : int
-        The most poses to refine.
-    deadline : float, optional
-        Time of time.perf_counter [s] at which refinement stops; the remaining, worst poses stay
-        as found.
+    poses, of different matches: which of them is best, their support tells. At most `count` poses
+    are refined, until a deadline of time.perf_counter [s]; the others, worse ones, stay as found.
     """
     found = [one for frame in range(len(frames))
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
@@ -187,29 +162,20 @@ def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
 
 def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
                 matches: Sequence[Sequence[Match]]) -> int:
-    """Return how many of the samples tried hold only inliers of a pose.
-
-    Parameters
-    ----------
-    frames : sequence of SearchedFrame
-    pose : Finalist
-    matches : sequence of sequence of Match
-        Inliers of the pose in each frame.
-    """
-    return sum(_meetings_in(frame, len(pose.sample), found)
-               for frame, found in zip(frames, matches, strict=True))
-
-
-def _meetings_in(frame: SearchedFrame, size: int, matches: Sequence[Match]) -> int:
-    scene, progress = frame.scene, frame.progress
-    landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
-    for match in matches:
-        landmark_of[match.detection] = match.landmark
-    is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
-    if frame.samples is None:
-        return comb(int(is_inlier[:progress.reach].sum()), size)
-    tried = frame.samples[:round(progress.coverage * len(frame.samples))]
-    return int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
+    """Return how many of the samples tried hold only inliers of a pose."""
+    meetings = 0
+    for frame, found in zip(frames, matches, strict=True):
+        scene, progress = frame.scene, frame.progress
+        landmark_of = np.full(len(scene.bearings), -1, dtype=np.int64)
+        for match in found:
+            landmark_of[match.detection] = match.landmark
+        is_inlier = landmark_of[scene.pairs[:, 0]] == scene.pairs[:, 1]
+        if frame.samples is None:
+            meetings += comb(int(is_inlier[:progress.reach].sum()), len(pose.sample))
+        else:
+            tried = frame.samples[:round(progress.coverage * len(frame.samples))]
+            meetings += int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
+    return meetings
 
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
@@ -219,12 +185,6 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
 
     Parameters
     ----------
-    frames : sequence of SearchedFrame
-    rig : Rig
-        The same frames.
-    pose : Finalist
-    matches : sequence of sequence of Match
-        Inliers of the pose in each frame.
     shared : ndarray (L, 2), optional
         See refined_covariance.
     """

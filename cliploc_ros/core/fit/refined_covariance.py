@@ -53,36 +53,22 @@ POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 class _Fit(NamedTuple):
-    """A fit, linearized in steps of the reference: F frames, m matches of n objects.
+    """A fit, linearized in steps of the reference: F frames, m matches of n objects."""
 
-    Parameters
-    ----------
-    jacobian : ndarray (m, 4, 6)
-    residuals, weights : ndarray (m, 4), (m, 4)
-    own : ndarray (m,)
-        Share of each match's deviation that its edges have, apart from the landmark's position.
-    objects, frames : ndarray (m,) of int
-        Of each match.
-    sigmas : ndarray (n,)
-        Of the objects' positions [m].
-    numbers : ndarray (n,) of int
-        The objects' landmarks.
-    verticals : ndarray (F, 6, 6)
-        Information of each frame's vertical.
-    cameras : ndarray (F, 4, 4)
-        map_from_camera.
-    """
-
-    jacobian: NDArray[np.float64]
+    jacobian: NDArray[np.float64]  #: (m, 4, 6)
+    #: (m, 4), (m, 4)
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
+    #: (m,): share of each match's deviation that its edges have, apart from the landmark's
+    #: position
     own: NDArray[np.float64]
+    #: (m,): of each match
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
-    sigmas: NDArray[np.float64]
-    numbers: NDArray[np.int64]
-    verticals: NDArray[np.float64]
-    cameras: NDArray[np.float64]
+    sigmas: NDArray[np.float64]  #: (n,): of the objects' positions [m]
+    numbers: NDArray[np.int64]  #: (n,): the objects' landmarks
+    verticals: NDArray[np.float64]  #: (F, 6, 6): information of each frame's vertical
+    cameras: NDArray[np.float64]  #: (F, 4, 4): map_from_camera
 
     @property
     def information(self) -> NDArray[np.float64]:
@@ -98,8 +84,6 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 
     Parameters
     ----------
-    rig : Rig
-        F frames.
     rotation, translation : ndarray (3, 3), (3,)
         Of camera_from_map, with information, see refine_rig.
     stamps_ns : ndarray (F,)
@@ -138,17 +122,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of what the covariance gains if each of n objects in turn is left out.
-
-    Parameters
-    ----------
-    information, noise : ndarray (n, 6, 6)
-        Without each object.
-    gradients : ndarray (n, 6)
-        Of each object: the others had the opposite one.
-    matched : ndarray (6, 6)
-        The covariance with all.
-    """
+    """Return the sum of what the covariance gains if each of n objects in turn is left out."""
     limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
@@ -227,31 +201,14 @@ def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.fl
 
 def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
                   ) -> NDArray[np.float64]:
-    """Return what the errors that n objects have in common add to M (6, 6).
-
-    Parameters
-    ----------
-    of_objects : ndarray (n, 6, 6)
-        What each object tells.
-    shared : ndarray (n, 2)
-        See refined_covariance.
-    """
+    """Return what the errors that n objects have in common add to M (6, 6)."""
     pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
     return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
                     stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return what the errors of odometry add to M (6, 6).
-
-    Parameters
-    ----------
-    cameras : ndarray (F, 4, 4)
-        map_from_camera; the last one is the reference.
-    information : ndarray (F, 6, 6)
-        Of each frame, in steps of the reference.
-    stamps_ns : ndarray (F,)
-    """
+    """Return what the errors of odometry add to M (6, 6)."""
     noise = np.zeros((6, 6))
     order = np.argsort(stamps_ns, kind='stable')
     last = int(np.argmax(order == len(order) - 1))

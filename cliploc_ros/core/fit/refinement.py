@@ -37,43 +37,24 @@ _LONGEST_STEP = 1.0
 
 
 class Refined(NamedTuple):
-    """A pose of the reference after refinement.
+    """A pose of the reference after refinement."""
 
-    Parameters
-    ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
-    score : float
-        See verify_rig.
-    information : ndarray (6, 6)
-        Of the reference camera's position [m] and its rotation about the map's axes [rad]; 0 if
-        the pose has too few inliers.
-    """
-
+    #: (3, 3), (3,): of camera_from_map
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    score: float
+    score: float  #: See verify_rig
+    #: (6, 6): of the reference camera's position [m] and its rotation about the map's axes [rad];
+    #: 0 if the pose has too few inliers
     information: NDArray[np.float64]
 
 
 class Inliers(NamedTuple):
-    """The matches of F frames, one detection for each landmark of a frame: m of them.
+    """The matches of F frames, one detection for each landmark of a frame: m of them."""
 
-    Parameters
-    ----------
-    pairs : ndarray (m, 14)
-        See residuals_of.
-    landmarks : ndarray (m,) of int
-        Their rows in the map.
-    starts : ndarray (F + 1,)
-        Where each frame's begin.
-    cameras, verticals : ndarray (F, 3, 4), (F, 7)
-        Of the rig.
-    """
-
-    pairs: NDArray[np.float64]
-    landmarks: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    pairs: NDArray[np.float64]  #: (m, 14): see residuals_of
+    landmarks: NDArray[np.int64]  #: (m,): their rows in the map
+    starts: NDArray[np.int64]  #: (F + 1,): where each frame's begin
+    #: (F, 3, 4), (F, 7): of the rig
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
 

@@ -24,19 +24,13 @@ MAX_FRAMES = 10
 
 
 class FrameStarts(NamedTuple):
-    """Where each frame's rows begin in the arrays of a rig: arrays (F + 1,).
+    """Where each frame's rows begin in the arrays of a rig: arrays (F + 1,)."""
 
-    Parameters
-    ----------
-    boxes, landmarks, pairs : ndarray (F + 1,)
-        In the box ellipses, and in the landmarks and detections of potential.
-    groups, shown, members, levels, spheres : ndarray (F + 1,)
-        In the groups, and in their detections, members, levels and spheres.
-    """
-
+    #: (F + 1,): in the box ellipses, and in the landmarks and detections of potential
     boxes: NDArray[np.int64]
     landmarks: NDArray[np.int64]
     pairs: NDArray[np.int64]
+    #: (F + 1,): in the groups, and in their detections, members, levels and spheres
     groups: NDArray[np.int64]
     shown: NDArray[np.int64]
     members: NDArray[np.int64]
@@ -45,26 +39,16 @@ class FrameStarts(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """The scenes of F frames, one behind the other, and where their cameras are.
+    """The scenes of F frames, one behind the other, and where their cameras are."""
 
-    Parameters
-    ----------
-    scene : Scene
-        All arrays but the map's are concatenated. Numbers in them count within their frame, and
-        starts have an end of their own for each frame. It has no pairs.
-    starts : FrameStarts
-    cameras : ndarray (F, 3, 4)
-        Rotation and translation of each camera_from_reference.
-    verticals : ndarray (F, 7)
-        See VERTICAL_UNKNOWN.
-    sigmas : ndarray (L,)
-        Standard deviation of each landmark's centre on each axis [m].
-    """
-
+    #: All arrays but the map's are concatenated. Numbers in them count within their frame, and
+    #: starts have an end of their own for each frame. It has no pairs.
     scene: Scene
     starts: FrameStarts
+    #: (F, 3, 4): rotation and translation of each camera_from_reference
     cameras: NDArray[np.float64]
-    verticals: NDArray[np.float64]
+    verticals: NDArray[np.float64]  #: (F, 7): see VERTICAL_UNKNOWN
+    #: (L,): standard deviation of each landmark's centre on each axis [m]
     sigmas: NDArray[np.float64]
 
 
@@ -90,17 +74,9 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
              verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
-    """Return the rig of some frames.
+    """Return the rig of F scenes of one map, see Rig.
 
-    Parameters
-    ----------
-    scenes : sequence of Scene
-        F of them, of one map.
-    camera_from_reference : ndarray (F, 4, 4)
-    verticals : ndarray (F, 7)
-        See VERTICAL_UNKNOWN.
-    sigmas : ndarray (L,)
-        See Rig.
+    Cameras are camera_from_reference (F, 4, 4), verticals (F, 7), sigmas (L,).
     """
     first = scenes[0]
     joined = first._replace(

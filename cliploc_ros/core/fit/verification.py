@@ -23,21 +23,11 @@ from cliploc_ros.core.search.leaders import same_place
 
 
 class Verified(NamedTuple):
-    """What a pose explains: n detections, those of several frames one behind the other.
+    """What a pose explains: n detections, those of several frames one behind the other."""
 
-    Parameters
-    ----------
-    score : float
-        Sum of the IoUs.
-    ious : ndarray (n,)
-        IoU of each detection with its landmark; 0 if it has none.
-    landmarks : ndarray (n,) of int
-        Landmark of each detection; -1 if it has none.
-    """
-
-    score: float
-    ious: NDArray[np.float64]
-    landmarks: NDArray[np.int64]
+    score: float  #: Sum of the IoUs
+    ious: NDArray[np.float64]  #: (n,): IoU of each detection with its landmark; 0 if it has none
+    landmarks: NDArray[np.int64]  #: (n,): landmark of each detection; -1 if it has none
 
 
 @compiled
@@ -121,12 +111,7 @@ def choose_distinct(scores: NDArray[np.float64], rotations: NDArray[np.float64],
                     translations: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Return the rows (<= count,) of the best of m poses at distinct places, best first.
 
-    Parameters
-    ----------
-    scores : ndarray (m,)
-    rotations, translations : ndarray (m, 3, 3), (m, 3)
-        Of camera_from_map.
-    count : int
+    Poses are rotations (m, 3, 3) and translations (m, 3) of camera_from_map with scores (m,).
     """
     return _choose_distinct(np.argsort(-scores, kind='stable'), rotations, translations, count)
 

@@ -27,31 +27,23 @@ _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 class Camera:
     """A pinhole camera with distortion, as in sensor_msgs/CameraInfo.
 
-    Parameters
-    ----------
-    width, height : int
-        Image size [px].
-    fx, fy, cx, cy : float
-        Focal lengths and principal point [px].
-    distortion_model : str
-        'plumb_bob', 'rational_polynomial' or 'equidistant'; '' with no coefficients.
-    distortion : tuple of float
-        The model's coefficients, in OpenCV's order.
-
     Raises
     ------
     CameraError
         For values that no camera can have.
     """
 
+    #: Image size [px]
     width: int
     height: int
+    #: Focal lengths and principal point [px]
     fx: float
     fy: float
     cx: float
     cy: float
+    #: 'plumb_bob', 'rational_polynomial' or 'equidistant'; '' with no coefficients
     distortion_model: str = ''
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  #: The model's coefficients, in OpenCV's order
 
     def __post_init__(self) -> None:
         """Refuse values that no camera can have."""
@@ -64,10 +56,8 @@ class Camera:
                 'be positive and all values finite (is the camera calibrated?)')
         if not np.all(np.isfinite(self.distortion)):
             raise CameraError(f'distortion {self.distortion} has values that are not finite')
-        if any(self.distortion):
-            self._check_distortion_model()
-
-    def _check_distortion_model(self) -> None:
+        if not any(self.distortion):
+            return
         counts = _COEFFICIENT_COUNTS.get(self.distortion_model)
         if counts is None:
             raise CameraError(f"distortion model '{self.distortion_model}' is none of "

@@ -27,12 +27,7 @@ def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float6
                    ) -> NDArray[np.float64]:
     """Return the shape matrices (n, 6) of ellipsoids as upper triangles.
 
-    Parameters
-    ----------
-    semi_axes : ndarray (n, 3)
-        Half lengths along the ellipsoids' own axes [m].
-    quats_xyzw : ndarray (n, 4)
-        Rotations from the ellipsoids' axes into the map's.
+    From their semi-axes (n, 3) [m] and the rotations (n, 4) from their axes into the map's.
     """
     rotations = Rotation.from_quat(quats_xyzw).as_matrix().reshape(-1, 3, 3)
     shapes = np.einsum('nij,nj,nkj->nik', rotations, np.square(semi_axes), rotations)

@@ -13,13 +13,9 @@ from cliploc_ros.core.kernels.compiled import compiled
 
 
 class Poses(NamedTuple):
-    """Poses camera_from_map, as a minimal solver writes them.
+    """Poses camera_from_map, as a minimal solver writes them."""
 
-    Parameters
-    ----------
-    rotations, translations : ndarray (p, 3, 3), (p, 3)
-    """
-
+    #: (p, 3, 3), (p, 3)
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
 
@@ -40,14 +36,9 @@ def project(landmarks, first, last, poses, which, outlines, out):
     ----------
     landmarks : ndarray (u, 9)
         Centre and shape of each.
-    first, last : int
-    poses : Poses
-    which : int
-        Row of the pose.
     outlines : ndarray (o, 6)
         Centre x and y, half extents x and y, exy, and the product of the semi-axes. The half
         extents are minus infinity where an ellipsoid is not wholly in front of the camera.
-    out : int
     """
     rotations, translations = poses.rotations, poses.translations
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]

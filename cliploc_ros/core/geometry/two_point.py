@@ -15,52 +15,30 @@ Vertical Direction", ACCV 2010).
 
 from math import sqrt
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
-MAX_TWO_POINT_SOLUTIONS = 2
 # Relative limit below which a baseline is vertical or bearings are level.
 _MIN_SINE = 1e-9
 _ROUNDING = 1e-12
 
 
-def solve_two_point(bearings: NDArray[np.float64], points: NDArray[np.float64],
-                    up_in_camera: NDArray[np.float64], up_in_map: NDArray[np.float64]
-                    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses with a known vertical from which two points are seen along two bearings.
+@compiled
+def two_point(bearings, points, verticals, rotations, translations):
+    """Write the poses with a known vertical from which two points are seen along two bearings.
 
     Parameters
     ----------
-    bearings : ndarray (2, 3)
-        Unit vectors in the camera's optical frame, one a row.
-    points : ndarray (2, 3)
-        The points in the map frame [m], one a row.
-    up_in_camera, up_in_map : ndarray (3,)
-        The vertical, unit vectors in the camera's optical frame and in the map frame.
+    bearings, points : ndarray (2, 3)
+        Unit vectors in the camera's optical frame, and points in the map frame [m], one a row.
+    verticals : ndarray (6,) or more
+        Up in the camera and up in the map, unit vectors.
+    rotations, translations : ndarray (2, 3, 3), (2, 3)
+        Of camera_from_map [m]. Both points lie in front of the camera along their bearings.
 
     Returns
     -------
-    rotations : ndarray (s, 3, 3)
-        Rotation of ``camera_from_map`` of each of the s = 0 to 2 solutions.
-    translations : ndarray (s, 3)
-        Its translation [m]. Both points lie in front of the camera along their bearings.
-    """
-    rotations = np.empty((MAX_TWO_POINT_SOLUTIONS, 3, 3))
-    translations = np.empty((MAX_TWO_POINT_SOLUTIONS, 3))
-    count = two_point(np.ascontiguousarray(bearings, dtype=np.float64),
-                      np.ascontiguousarray(points, dtype=np.float64),
-                      np.concatenate([up_in_camera, up_in_map]).astype(np.float64), rotations,
-                      translations)
-    return rotations[:count], translations[:count]
-
-
-@compiled
-def two_point(bearings, points, verticals, rotations, translations):
-    """Write up to two poses into the two arrays; return their number (see solve_two_point).
-
-    The first six values of verticals are up in the camera and up in the map.
+    int
+        Number of poses, 0 to 2.
     """
     b10, b11, b12 = bearings[0, 0], bearings[0, 1], bearings[0, 2]
     b20, b21, b22 = bearings[1, 0], bearings[1, 1], bearings[1, 2]

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that are compiled to machine code: the decorator, and the code on disk."""
+"""Functions that are compiled to machine code."""

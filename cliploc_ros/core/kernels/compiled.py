@@ -1,21 +1,234 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the numerical kernels are compiled: one decorator, so that all share its settings."""
+"""How numerical kernels are compiled, and the compiled code on disk.
 
+numba's own cache misses a change of a kernel that another one calls, compiles again after a copy,
+and fails on a damaged file. Here the name of a file holds a digest of all that decides the machine
+code: the source of the kernel's module and of all modules that it imports, the types of the
+arguments, the processor, and the versions of Python, numba and NumPy. So a file is never outdated,
+and machines, users and versions may share a folder.
+"""
+
+import hashlib
 import logging
+import os
+import pickle
+import re
+import stat
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+import llvmlite
+import numba
 import numpy as np
 from numba import njit
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
-from cliploc_ros.core.kernels.cache import KERNEL_FOLDERS, KernelCache
+from cliploc_ros.files.storage import resolve_cache_dir
 
+_PACKAGE = Path(__file__).resolve().parents[2]
+_ROOT = _PACKAGE.name
+_IMPORTED = re.compile(rb'^(?:from|import) (%s[\w.]*)(?: import (\w+)$)?' % _ROOT.encode(), re.M)
+_VERSIONS = (sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__)
+_DIGEST_BYTES = 32
 #: A literal 0 as an argument compiles a further specialization of a kernel; this one does not.
 ZERO = np.int64(0)
 
 logger = logging.getLogger(__name__)
+
+
+class KernelFolders:
+    """Where compiled kernels lie: the folders of this process, the preferred one first.
+
+    NUMBA_CACHE_DIR replaces all others.
+
+    Attributes
+    ----------
+    found, missing : int
+        How many kernels were read, and how many were looked for in vain.
+    kept_in : Path or None
+        Where the last new kernel was stored; None where no folder takes them.
+    """
+
+    def __init__(self) -> None:
+        self.found = self.missing = 0
+        self.kept_in: Path | None = None
+        self._preferred: Path | None = None
+        self._is_warned = False
+
+    def prefer(self, folder: Path) -> None:
+        """Look for kernels in a folder first, and keep them there."""
+        self._preferred = folder
+
+    def read(self, name: str) -> bytes | None:
+        """Return what is stored under a name, or None."""
+        for number, folder in enumerate(self._all()):
+            content = _read(folder / name)
+            if content is not None:
+                self.found += 1
+                if number and self._preferred is not None:
+                    self._write(self._preferred / name, content)
+                return content
+        self.missing += 1
+        if self.missing == 1:
+            logger.info('compiling the search for this processor, once after an installation: '
+                        'about 20 s of processor time')
+        return None
+
+    def store(self, name: str, content: bytes, outdated: str) -> None:
+        """Store content in the first folder that takes it, and remove what the pattern matches."""
+        failures = []
+        for folder in self._all():
+            old = [file for file in folder.glob(outdated) if file.name != name]
+            failure = self._write(folder / name, content)
+            if not failure:
+                self.kept_in = folder
+                for file in old:
+                    file.unlink(missing_ok=True)
+                return
+            failures.append(failure)
+        if not self._is_warned:
+            self._is_warned = True
+            logger.warning('cannot keep compiled kernels (%s): each start compiles them again; '
+                           'set cache_dir to a folder with room', '; '.join(failures))
+
+    def _all(self) -> Iterator[Path]:
+        given = os.environ.get('NUMBA_CACHE_DIR')
+        if given:
+            yield Path(given)
+            return
+        if self._preferred is not None:
+            yield self._preferred
+        own = _PACKAGE / '__pycache__' / 'kernels'
+        yield own
+        if not os.access(own if own.exists() else _PACKAGE, os.W_OK):
+            yield resolve_cache_dir('') / 'kernels'
+
+    @staticmethod
+    def _write(file: Path, content: bytes) -> str:
+        """Write a file in one step; return what failed, or ''."""
+        partial = file.with_name(f'.{file.name}.{os.getpid()}.partial')
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(hashlib.sha256(content).digest() + content)
+            partial.replace(file)
+        except OSError as error:
+            if file.parent.is_dir() and os.access(file.parent, os.W_OK):
+                partial.unlink(missing_ok=True)
+            return f'{file.parent}: {error.strerror}'
+        return ''
+
+
+KERNEL_FOLDERS = KernelFolders()
+
+
+class KernelCache(NullCache):
+    """The compiled versions of one kernel on disk, in the place of numba's cache.
+
+    A damaged file, or a folder that cannot be written to, costs the time to compile and no more.
+    """
+
+    def __init__(self, kernel: Dispatcher) -> None:
+        self._kernel = kernel
+        function = kernel.py_func
+        self._name = f'{function.__module__.removeprefix(f"{_ROOT}.")}.{function.__qualname__}'
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the machine code for the types of arguments, or None."""
+        target_context.refresh()
+        name, _ = self._file_names(sig, target_context.codegen())
+        content = KERNEL_FOLDERS.read(name)
+        if content is None:
+            return None
+        try:
+            return CompileResult._rebuild(target_context, *pickle.loads(content))
+        except Exception as error:  # pickle and LLVM raise many kinds
+            logger.warning('a compiled kernel cannot be used (%r): compiling %s again', error,
+                           self._name)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep machine code for the types of arguments."""
+        if not data.library.has_dynamic_globals:
+            name, outdated = self._file_names(sig, data.codegen)
+            KERNEL_FOLDERS.store(name, dumps(data._reduce()), outdated)
+
+    def _file_names(self, sig: Any, codegen: Any) -> tuple[str, str]:
+        """Return the name of the file, and a pattern of the names it had with other sources."""
+        place = _hash((_VERSIONS, codegen.magic_tuple(), [_describe(each) for each in sig]))
+        stamp = _hash((source_stamp(self._kernel.py_func.__module__),
+                       sorted(self._kernel.targetoptions.items())))
+        return (f'{self._name}-{place}-{stamp}.kernel',
+                f'{self._name}-{place}-*.kernel')
+
+
+@cache
+def source_stamp(module: str) -> str:
+    """Return a digest of a module's source and of those of this package that it imports."""
+    sources: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        if (name := waiting.pop()) not in sources:
+            sources[name], imported = _read_source(name)
+            waiting += imported
+    return _hash(sorted(sources.items()))
+
+
+@cache
+def _read_source(module: str) -> tuple[bytes, list[str]]:
+    """Return the digest of a module's file, and the modules of this package that it imports."""
+    source = Path(str(sys.modules[module].__file__)).read_bytes()
+    names = [part.decode() for match in _IMPORTED.finditer(source)
+             for part in (match[1], match[2] and match[1] + b'.' + match[2]) if part]
+    return (hashlib.sha256(source).digest(),
+            [name for name in names if name in sys.modules and name != module])
+
+
+def _describe(kind: Type) -> object:
+    """Return what identifies a type of argument; the fields of a named tuple are part of it."""
+    if isinstance(kind, BaseTuple):
+        named = getattr(kind, 'instance_class', None)
+        identity = named and (named.__module__, named.__qualname__, named._fields)
+        return type(kind).__name__, identity, [_describe(each) for each in kind.types]
+    return str(kind)
+
+
+def _hash(value: object) -> str:
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:20]
+
+
+def _read(file: Path) -> bytes | None:
+    """Return the content of a file if it is whole, and only trusted users can write to it."""
+    try:
+        content = file.read_bytes()
+    except OSError:
+        return None
+    if _is_foreign(file):
+        logger.warning('%s is not used: other users own it or can write to it', file)
+        return None
+    digest, content = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() != digest:
+        logger.warning('%s is damaged: compiling it again', file)
+        return None
+    return content
+
+
+def _is_foreign(file: Path) -> bool:
+    """Return whether a user could have written it who owns neither this package nor the process.
+
+    A forged kernel runs code. Who owns the package can run code anyway.
+    """
+    trusted = {os.getuid(), 0, Path(__file__).stat().st_uid}
+    return any(each.stat().st_uid not in trusted or each.stat().st_mode & stat.S_IWOTH
+               for each in (file, file.parent))
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -31,13 +244,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def warm_up(run: Callable[[], object]) -> None:
-    """Run the kernels once. Where they must be compiled, say so and how long it takes.
-
-    Parameters
-    ----------
-    run : callable
-        Calls every kernel that requests use.
-    """
+    """Run the kernels once. Where they must be compiled, say so and how long it takes."""
     start, missing = time.monotonic(), KERNEL_FOLDERS.missing
     run()
     compiled_now = KERNEL_FOLDERS.missing - missing

@@ -27,20 +27,11 @@ _RATIO = 0.85
 
 @dataclass(frozen=True)
 class Features:
-    """The n features of an image.
+    """The n features of an image."""
 
-    Parameters
-    ----------
-    pixels : ndarray (n, 2)
-        [px] in the image as it is, distorted.
-    descriptors : ndarray (n, 128) uint8
-    strengths : ndarray (n,) float32
-        Response of the detector; the strongest is first.
-    """
-
-    pixels: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
-    strengths: NDArray[np.float32]
+    pixels: NDArray[np.float64]  #: (n, 2) [px] in the image as it is, distorted
+    descriptors: NDArray[np.uint8]  #: (n, 128)
+    strengths: NDArray[np.float32]  #: (n,): response of the detector; the strongest is first
 
     def __len__(self) -> int:
         """Return the number of features."""
@@ -85,14 +76,9 @@ def unit_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the pairs (k, 2) of rows of two images' descriptors that show the same point.
+    """Return the pairs (k, 2) of rows of two images' unit descriptors that show the same point.
 
     Each is the other's most similar one, and clearly more similar than the second of theirs.
-
-    Parameters
-    ----------
-    ours, theirs : ndarray (n, d), (m, d)
-        Unit vectors, see unit_rows.
     """
     if len(ours) == 0 or len(theirs) < 2:
         return np.empty((0, 2), dtype=np.int64)

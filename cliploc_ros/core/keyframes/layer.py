@@ -32,52 +32,28 @@ PIXEL_SCALE = 16.0
 
 @dataclass(frozen=True)
 class KeyframeLayer:
-    """K keyframes with n points in total. The large arrays may lie in a file.
+    """K keyframes with n points in total. The large arrays may lie in a file."""
 
-    Parameters
-    ----------
-    frame_id : str
-        Coordinate frame of the poses: the map's.
-    landmark_ids : tuple of str
-        The map's landmarks when the layer was made, which identify the map.
-    landmark_centers : ndarray (L, 3) float32
-        Where they were [m].
-    camera : Camera
-        That took the keyframes, of the undistorted images.
-    map_from_camera : ndarray (K, 4, 4)
-    offsets : ndarray (K + 1,) of int
-        Keyframe k has the points from offsets[k] up to offsets[k + 1].
-    pixels : ndarray (n, 2) uint16
-        Where the keyframe shows each point, undistorted [1/16 px].
-    points : ndarray (n, 3) float32
-        In the optical coordinate frame of their keyframe [m].
-    descriptors : ndarray (n, 128) uint8
-    words : ndarray (n,) uint16
-        Word of each descriptor.
-    vocabulary : ndarray (W, 128) uint8
-        The words' mean descriptors.
-    deviation_per_metre : float
-        How far a pose is off that was found from a keyframe a metre away, as a standard
-        deviation on each axis [m]: the error that its points share.
-    images : ndarray (b,) uint8, optional
-        Small undistorted JPEG images, one after another: for people, no answer needs them.
-    image_offsets : ndarray (K + 1,) of int, optional
-        Keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1].
-    """
-
-    frame_id: str
+    frame_id: str  #: Coordinate frame of the poses: the map's
+    #: The map's landmarks when the layer was made, which identify the map
     landmark_ids: tuple[str, ...]
-    landmark_centers: NDArray[np.float32]
-    camera: Camera
-    map_from_camera: NDArray[np.float64]
+    landmark_centers: NDArray[np.float32]  #: (L, 3): where they were [m]
+    camera: Camera  #: That took the keyframes, of the undistorted images
+    map_from_camera: NDArray[np.float64]  #: (K, 4, 4)
+    #: (K + 1,): keyframe k has the points from offsets[k] up to offsets[k + 1]
     offsets: NDArray[np.int64]
+    #: (n, 2): where the keyframe shows each point, undistorted [1/16 px]
     pixels: NDArray[np.uint16]
-    points: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-    words: NDArray[np.uint16]
-    vocabulary: NDArray[np.uint8]
+    points: NDArray[np.float32]  #: (n, 3): in the optical coordinate frame of their keyframe [m]
+    descriptors: NDArray[np.uint8]  #: (n, 128)
+    words: NDArray[np.uint16]  #: (n,): word of each descriptor
+    vocabulary: NDArray[np.uint8]  #: (W, 128): the words' mean descriptors
+    #: How far a pose is off that was found from a keyframe a metre away, as a standard deviation
+    #: on each axis [m]: the error that its points share
     deviation_per_metre: float = FROM_DEPTH
+    #: (b,): small undistorted JPEG images, one after another: for people, no answer needs them
     images: NDArray[np.uint8] | None = None
+    #: (K + 1,): keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1]
     image_offsets: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:

@@ -4,7 +4,6 @@
 
 import time
 from collections.abc import Sequence
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.tolerances import SAME_ANSWER, SAME_SIGHT
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -30,12 +30,11 @@ _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 _ENOUGH_INLIERS, _MORE = 100, 5
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
-# Places differ by more than 1 m or 45 degrees, as poses that do not agree.
+# Similar keyframes of which those elsewhere are chosen.
 _MOST_RANKED = 500
-_SAME_M, _SAME_COS = 1.0, np.cos(np.radians(45.0))
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
-NEAR_M, NEAR_DEG = 2.0, 40.0
+NEAR_M, NEAR_DEG = SAME_SIGHT
 # Samples of three points that are tried: for the first place, and for each one elsewhere.
 _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
@@ -100,12 +99,7 @@ class _Place(NamedTuple):
 
 
 class KeyframeLocalizer:
-    """Localizes images in a layer of keyframes.
-
-    Parameters
-    ----------
-    layer : KeyframeLayer
-    """
+    """Localizes images in a layer of keyframes."""
 
     def __init__(self, layer: KeyframeLayer) -> None:
         self.layer = layer
@@ -119,8 +113,6 @@ class KeyframeLocalizer:
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
-        camera : Camera
-            Of the image.
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
@@ -185,9 +177,10 @@ class KeyframeLocalizer:
         """Return the keyframes to match: similar ones, and those near the guesses."""
         poses = self.layer.map_from_camera
         chosen = list(ranks[:_SIMILAR])
-        others = (one for one in ranks[_SIMILAR:_MOST_RANKED]
-                  if not any(_same_place(poses[one], poses[other]) for other in chosen))
-        chosen += islice(others, _ELSEWHERE)
+        others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
+        for _ in range(_ELSEWHERE):
+            others = others[~SAME_ANSWER.agreeing(poses[others], poses[chosen]).any(axis=1)]
+            chosen += others[:1].tolist()
         for guess in guesses:
             near = keyframes_near(poses, guess)
             chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
@@ -257,7 +250,8 @@ def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.prior.allows(place.map_from_camera):
             found += 1
-            if not any(_same_place(place.map_from_camera, one.map_from_camera) for one in places):
+            if not any(SAME_ANSWER.agree(place.map_from_camera, one.map_from_camera)
+                       for one in places):
                 places.append(place)
         if found == MOST_PLACES:
             break
@@ -289,12 +283,6 @@ def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
     (ratio, aspect), inliers = np.exp(found[0]), found[2]
     deviation, of_aspect = np.hypot(_MUCH_ALIKE * found[1], _STRETCHED)
     return ratio, deviation, aspect, of_aspect, len(np.unique(among.features[inliers]))
-
-
-def _same_place(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Return whether two poses (4, 4) agree to 1 m and 45 degrees."""
-    cosine = 0.5 * (np.sum(one[:3, :3] * other[:3, :3]) - 1.0)
-    return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < _SAME_M and cosine > _SAME_COS)
 
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -9,76 +9,50 @@ from numpy.typing import NDArray
 
 
 class RecognizedPlace(NamedTuple):
-    """A pose by keyframes, and the evidence for and against it.
+    """A pose by keyframes, and the evidence for and against it."""
 
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    covariance, shared : ndarray (6, 6)
-        In the order of core.fit.covariance; and its part that the keyframes cause, which looks at
-        the same keyframes share.
-    inliers : int
-        Number of features that agree, without those that agree with a place found before.
-    confirmed : float
-        Share of the comparable cells of the image that show what the keyframes have there.
-    expected : float
-        The share that so many inliers would confirm if they were spread as usual: 0 to 1.
-    cells : tuple of int
-        Number of cells that confirm, and of those that are comparable: the keyframes expect points
-        there, and the image has features.
-    focal_ratio, focal_deviation : float
-        The focal length that the points suggest as a multiple of the camera's, and its relative
-        standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
-        wrong intrinsics, and a picture of the place of another size, suggest another one.
-    aspect_ratio, aspect_deviation : float
-        The same of the root of its aspect, x to y: a picture that is seen from the side is narrow.
-    focal_inliers : int
-        Number of features that agree under that focal length and aspect.
-    tilt_error : float
-        Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
-        place: the vertical may be wrong, as with a wrong camera mount.
-    keyframes, shares : tuple of int, tuple of float
-        Those that points agree with, the most points first, and the share of the points.
-    pixels : ndarray (k, 2)
-        Where the image, as it is, shows each point that agrees [px].
-    rows : ndarray (k,) of int
-        Which point of the layer that is.
-    points : ndarray (k, 3)
-        Where it is in the map [m].
-    """
-
-    map_from_camera: NDArray[np.float64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    #: (6, 6): in the order of core.fit.covariance; and its part that the keyframes cause, which
+    #: looks at the same keyframes share
     covariance: NDArray[np.float64]
     shared: NDArray[np.float64]
+    #: Number of features that agree, without those that agree with a place found before
     inliers: int
+    #: Share of the comparable cells of the image that show what the keyframes have there
     confirmed: float
+    #: The share that so many inliers would confirm if they were spread as usual: 0 to 1
     expected: float
+    #: Number of cells that confirm, and of those that are comparable: the keyframes expect points
+    #: there, and the image has features
     cells: tuple[int, int] = (0, 0)
+    #: The focal length that the points suggest as a multiple of the camera's, and its relative
+    #: standard deviation; 1 and inf where they suggest none. Right poses suggest a ratio of 1;
+    #: wrong intrinsics, and a picture of the place of another size, suggest another one.
     focal_ratio: float = 1.0
     focal_deviation: float = np.inf
+    #: The same of the root of its aspect, x to y: a picture that is seen from the side is narrow
     aspect_ratio: float = 1.0
     aspect_deviation: float = np.inf
-    focal_inliers: int = 0
+    focal_inliers: int = 0  #: Number of features that agree under that focal length and aspect
+    #: Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
+    #: place: the vertical may be wrong, as with a wrong camera mount.
     tilt_error: float = 0.0
+    #: Those that points agree with, the most points first, and the share of the points
     keyframes: tuple[int, ...] = ()
     shares: tuple[float, ...] = ()
+    #: (k, 2): where the image, as it is, shows each point that agrees [px]
     pixels: NDArray[np.float64] = np.empty((0, 2))
+    #: (k,): which point of the layer that is
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-    points: NDArray[np.float64] = np.empty((0, 3))
+    points: NDArray[np.float64] = np.empty((0, 3))  #: (k, 3): where it is in the map [m]
 
 
 class Recognition(NamedTuple):
-    """The places where keyframes recognize an image.
+    """The places where keyframes recognize an image."""
 
-    Parameters
-    ----------
-    places : tuple of RecognizedPlace
-        None agrees with another one. The one whose points lie in the most cells of the image is
-        first: a poster has many points, but shows only a part of its place.
-    is_complete : bool
-        Whether all keyframes were matched that should be. A search that the deadline cut has no
-        places: it may have missed their rivals.
-    """
-
+    #: None agrees with another one. The one whose points lie in the most cells of the image is
+    #: first: a poster has many points, but shows only a part of its place.
     places: tuple[RecognizedPlace, ...] = ()
+    #: Whether all keyframes were matched that should be. A search that the deadline cut has no
+    #: places: it may have missed their rivals.
     is_complete: bool = True

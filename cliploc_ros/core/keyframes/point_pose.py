@@ -31,19 +31,11 @@ _FROM_MEDIAN = 1.4826
 
 
 class PointPose(NamedTuple):
-    """A pose that many points agree with.
+    """A pose that many points agree with."""
 
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    inliers : ndarray (k,) of int
-        Rows of the points that agree.
-    covariance : ndarray (6, 6)
-        From the features' deviations alone; in the order of core.fit.covariance.
-    """
-
-    map_from_camera: NDArray[np.float64]
-    inliers: NDArray[np.int64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    inliers: NDArray[np.int64]  #: (k,): rows of the points that agree
+    #: (6, 6): from the features' deviations alone; in the order of core.fit.covariance
     covariance: NDArray[np.float64]
 
 
@@ -52,16 +44,8 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
     """Return the pose that most points agree with; None where there is none.
 
     MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
-    optimization, MAGSAC++ and PoseLib took longer at equal success.
-
-    Parameters
-    ----------
-    points : ndarray (n, 3)
-        In the map [m].
-    bearings : ndarray (n, 2)
-        Where the image shows them, on the plane z = 1.
-    iterations : int
-        Most samples of three points.
+    optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map
+    [m], bearings (n, 2) where the image shows them, on the plane z = 1.
     """
     if len(points) < LEAST_INLIERS:
         return None

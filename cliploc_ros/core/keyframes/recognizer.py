@@ -25,12 +25,8 @@ class ImageRecognizer:
 
     Parameters
     ----------
-    keyframes : KeyframeLocalizer
     features : Features or callable
         Of the image; a callable is called when they are needed first.
-    camera : Camera
-    deadline : float
-        See KeyframeLocalizer.localize.
     begin_stage : callable
         Takes the name of a stage that begins: 'keyframes', and 'search' after them.
     """

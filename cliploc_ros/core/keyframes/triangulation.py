@@ -23,19 +23,11 @@ _DEPTHS_M = (0.2, 40.0)
 
 
 class PosedFeatures(NamedTuple):
-    """The n features of a posed image.
+    """The n features of a posed image."""
 
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    bearings : ndarray (n, 2)
-        On the plane z = 1.
-    descriptors : ndarray (n, 128) uint8
-    """
-
-    map_from_camera: NDArray[np.float64]
-    bearings: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    bearings: NDArray[np.float64]  #: (n, 2): on the plane z = 1
+    descriptors: NDArray[np.uint8]  #: (n, 128)
 
 
 def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64]:

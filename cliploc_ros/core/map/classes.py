@@ -15,26 +15,15 @@ class ClassIndex:
     """The landmarks of each class: L landmarks, C classes, m memberships.
 
     A landmark is a member of its own class, and of others that the detector takes it for.
-
-    Parameters
-    ----------
-    numbers : mapping
-        Number of each class name, 0 to C - 1; own classes come first.
-    of_landmarks : ndarray (L,) of int
-        Number of each landmark's own class.
-    landmarks : ndarray (m,) of int
-        Landmarks grouped by class, in the map's order within a class.
-    starts : ndarray (C + 1,) of int
-        Where each class begins in landmarks.
-    weights : mapping
-        Of (landmark, class), its share over that of the landmark's most frequent class, 0 to 1;
-        missing ones count 1.
     """
 
-    numbers: Mapping[str, int]
-    of_landmarks: NDArray[np.int64]
+    numbers: Mapping[str, int]  #: Number of each class name, 0 to C - 1; own classes come first
+    of_landmarks: NDArray[np.int64]  #: (L,): number of each landmark's own class
+    #: (m,): landmarks grouped by class, in the map's order within a class
     landmarks: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    starts: NDArray[np.int64]  #: (C + 1,): where each class begins in landmarks
+    #: Of (landmark, class), its share over that of the landmark's most frequent class, 0 to 1;
+    #: missing ones count 1
     weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
@@ -44,8 +33,6 @@ class ClassIndex:
 
         Parameters
         ----------
-        landmark_classes : sequence of str
-            Own class of each landmark.
         others : sequence of (int, str)
             A landmark and another class of it, each pair once.
         weights : mapping, optional

@@ -31,53 +31,33 @@ class SortedLandmarks(NamedTuple):
     """All landmarks of a map along a Morton curve, so that neighbours have near rows: m rows.
 
     A landmark has a row for each of its classes.
-
-    Parameters
-    ----------
-    landmarks : ndarray (m, 9)
-        Centre and shape of each.
-    radii : ndarray (m,)
-        Greatest semi-axis of each [m].
-    numbers : ndarray (m,)
-        Row of each in the map.
-    classes : ndarray (m,) of int32
-        Class number of each.
     """
 
-    landmarks: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    numbers: NDArray[np.int64]
-    classes: NDArray[np.int32]
+    landmarks: NDArray[np.float64]  #: (m, 9): centre and shape of each
+    radii: NDArray[np.float64]  #: (m,): greatest semi-axis of each [m]
+    numbers: NDArray[np.int64]  #: (m,): row of each in the map
+    classes: NDArray[np.int32]  #: (m,): class number of each
 
 
 class Groups(NamedTuple):
     """The landmarks of the classes that a frame shows: g classes, w landmarks, m spheres.
 
     A group is a class: its detections may show any of its landmarks, the members.
-
-    Parameters
-    ----------
-    starts : ndarray (g + 1,)
-        Where the detections of each group begin in detections.
-    detections : ndarray (v,)
-    frusta : ndarray (g + 1, 4, 2)
-        Unit normals, inwards, of the sides of the frustum through the boxes of each group: x and z
-        of left and right, y and z of top and bottom. The last row is the frustum through all.
-    members : ndarray (w, 2) of int32
-        Row among the sorted landmarks, in their order, and group.
-    levels : ndarray (d + 1,)
-        Where each level of the tree begins in spheres. The first level has a sphere for each
-        member, the next one for each eight of them, up to the root.
-    spheres : ndarray (m, 5)
-        Centre and radius of a sphere around all members below, and the depth of the centre beyond
-        which all of them appear too small [m].
     """
 
-    starts: NDArray[np.int64]
-    detections: NDArray[np.int64]
+    starts: NDArray[np.int64]  #: (g + 1,): where the detections of each group begin in detections
+    detections: NDArray[np.int64]  #: (v,)
+    #: (g + 1, 4, 2): unit normals, inwards, of the sides of the frustum through the boxes of each
+    #: group: x and z of left and right, y and z of top and bottom. The last row is the frustum
+    #: through all.
     frusta: NDArray[np.float64]
+    #: (w, 2): row among the sorted landmarks, in their order, and group
     members: NDArray[np.int32]
+    #: (d + 1,): where each level of the tree begins in spheres. The first level has a sphere for
+    #: each member, the next one for each eight of them, up to the root.
     levels: NDArray[np.int64]
+    #: (m, 5): centre and radius of a sphere around all members below, and the depth of the centre
+    #: beyond which all of them appear too small [m]
     spheres: NDArray[np.float64]
 
 
@@ -114,7 +94,6 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
 
     Parameters
     ----------
-    sorted_landmarks : SortedLandmarks
     classes : ndarray (n,) of int
         Class of each detection, as the sorted landmarks have them; below 0 for none.
     boxes : ndarray (n, 4)
@@ -125,8 +104,11 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
     shown = np.unique(classes[classes >= 0])
     rows = [np.nonzero(classes == one)[0] for one in shown]
     frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
+    # of the greatest angle between the optical axis and a corner of each box
+    tangents = np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1)
     reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
-                               _widest_angle(boxes[some])) for some in rows], dtype=np.float64)
+                               float(np.arctan(tangents[some].max()))) for some in rows],
+                       dtype=np.float64)
     members = _members(sorted_landmarks.classes, shown)
     radii = sorted_landmarks.radii[members[:, 0]]
     return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
@@ -148,15 +130,7 @@ def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np
 
 def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
                depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return levels and spheres of the tree over some landmarks, see Groups.
-
-    Parameters
-    ----------
-    centers, radii : ndarray (w, 3), (w,)
-        Of landmarks along a Morton curve.
-    depths : ndarray (w,)
-        The depth beyond which each appears too small.
-    """
+    """Return levels and spheres of the tree over some landmarks, see Groups."""
     spheres = [np.c_[centers, radii, depths]]
     low = high = centers
     while len(low) > 1:
@@ -193,23 +167,11 @@ def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     return sides / np.linalg.norm(sides, axis=1, keepdims=True)
 
 
-def _widest_angle(boxes: NDArray[np.float64]) -> float:
-    """Return the greatest angle between the optical axis and a corner of some boxes [rad]."""
-    return float(np.arctan(np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1).max()))
-
-
 def _reach(least_axes: float, angle: float) -> float:
     """Return the depth, in radii of a landmark, beyond which its outline is too small.
 
     A sphere of radius r at a depth z and a distance d has an outline on the plane z = 1 whose
     semi-axes have the product ``r^2 sqrt(d^2 - r^2) / (z^2 - r^2)^(3/2)``.
-
-    Parameters
-    ----------
-    least_axes : float
-        Outlines with a smaller product of semi-axes are too small.
-    angle : float
-        Greatest angle between the optical axis and a landmark [rad].
     """
     widest = angle + _NEAR_ANGLE
     nearness = (np.sin(_NEAR_ANGLE) / np.cos(widest))**2 if widest < np.pi / 2 else 1.0
@@ -227,10 +189,6 @@ def visible_members(groups, poses, which, seen):
 
     Parameters
     ----------
-    groups : Groups
-    poses : Poses
-    which : int
-        Row of the pose.
     seen : ndarray (2, w) of int
         The second row holds their parents in the tree.
     """
@@ -277,11 +235,8 @@ def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out
     ----------
     landmarks : ndarray (L, 9)
         See SortedLandmarks.
-    groups, poses, which, seen
-        See visible_members.
     outlines, owners : ndarray (o, 6), (o,)
         Outlines that are visible and the group of each, written from row out on.
-    out : int
     """
     members = groups.members
     for place in range(visible_members(groups, poses, which, seen)):

@@ -27,38 +27,19 @@ _APART = 100_000.0
 
 
 class MapPart(NamedTuple):
-    """One of several maps.
+    """One of several maps."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        In its own coordinate frame.
-    first : int
-        Row of its first landmark among those of all maps.
-    shift : ndarray (3,)
-        From its own coordinates to those of all maps, level [m].
-    """
-
-    landmark_map: LandmarkMap
-    first: int
-    shift: NDArray[np.float64]
+    landmark_map: LandmarkMap  #: In its own coordinate frame
+    first: int  #: Row of its first landmark among those of all maps
+    shift: NDArray[np.float64]  #: (3,): from its own coordinates to those of all maps, level [m]
 
 
 class Place(NamedTuple):
-    """A pose in the map that it belongs to.
-
-    Parameters
-    ----------
-    part : MapPart
-    map_from_camera : ndarray (4, 4)
-        In the coordinate frame of that map.
-    name : str
-        Of the map; empty where there is only one.
-    """
+    """A pose in the map that it belongs to."""
 
     part: MapPart
-    map_from_camera: NDArray[np.float64]
-    name: str
+    map_from_camera: NDArray[np.float64]  #: (4, 4): in the coordinate frame of that map
+    name: str  #: Of the map; empty where there is only one
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -69,15 +50,9 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class JoinedMap(LandmarkMap):
-    """The landmarks of several maps in one coordinate frame, that of the first map.
+    """The landmarks of several maps in one coordinate frame, that of the first map."""
 
-    Parameters
-    ----------
-    parts : tuple of MapPart
-        Along the x axis.
-    """
-
-    parts: tuple[MapPart, ...] = ()
+    parts: tuple[MapPart, ...] = ()  #: Along the x axis
 
     def prepare(self) -> None:
         """Compute the indices now, those of the single maps, too."""
@@ -88,13 +63,9 @@ class JoinedMap(LandmarkMap):
     @cached_property
     def starts(self) -> NDArray[np.float64]:
         """Return the x where the stretch of each map begins (M,), halfway between two maps [m]."""
-        ends = np.array([_range_x(part) for part in self.parts])
-        return np.concatenate([[-np.inf], (ends[:-1, 1] + ends[1:, 0]) / 2])
-
-
-def _range_x(part: MapPart) -> tuple[float, float]:
-    x = part.landmark_map.centers[:, 0] + part.shift[0]
-    return float(x.min()), float(x.max())
+        columns = [part.landmark_map.centers[:, 0] + part.shift[0] for part in self.parts]
+        ends, begins = [x.max() for x in columns[:-1]], [x.min() for x in columns[1:]]
+        return np.concatenate([[-np.inf], np.add(ends, begins) / 2])
 
 
 def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMap:
@@ -104,8 +75,6 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
     ----------
     maps : sequence of LandmarkMap
         At least one, each in a coordinate frame of its own.
-    sources : sequence of str
-        Where each comes from, for messages.
 
     Raises
     ------
@@ -116,7 +85,12 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         return maps[0]
     if len(maps) > MAX_MAPS:
         raise MapError(f'{len(maps)} maps: at most {MAX_MAPS} are searched at once')
-    _check_frames(maps, sources)
+    for frame_id, count in Counter(one.frame_id for one in maps).items():
+        if count > 1:
+            alike = [source for one, source in zip(maps, sources, strict=True)
+                     if one.frame_id == frame_id]
+            raise MapError(f"{' and '.join(alike[:2])}: both have frame_id '{frame_id}', so poses "
+                           'would not say in which map they are; give each its own frame_id')
     gap = _APART * max(float(one.semi_axes.max()) for one in maps)
     parts: list[MapPart] = []
     first, begin = 0, 0.0
@@ -136,16 +110,6 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         np.concatenate([part.landmark_map.centers + part.shift for part in parts]),
         np.concatenate([one.semi_axes for one in maps]),
         np.concatenate([one.quats_xyzw for one in maps]), _details(maps), tuple(parts))
-
-
-def _check_frames(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> None:
-    """Raise MapError if two maps have the same coordinate frame."""
-    for frame_id, count in Counter(one.frame_id for one in maps).items():
-        if count > 1:
-            alike = [source for one, source in zip(maps, sources, strict=True)
-                     if one.frame_id == frame_id]
-            raise MapError(f"{' and '.join(alike[:2])}: both have frame_id '{frame_id}', so poses "
-                           'would not say in which map they are; give each its own frame_id')
 
 
 def _details(maps: Sequence[LandmarkMap]) -> tuple[LandmarkDetails, ...]:

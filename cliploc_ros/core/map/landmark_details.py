@@ -17,41 +17,23 @@ WeightedLabels = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True)
 class LandmarkDetails:
-    """Optional fields of one landmark. Each is None where the map has none.
+    """Optional fields of one landmark. Each is None where the map has none."""
 
-    Parameters
-    ----------
-    labels : tuple of (str, float)
-        Phrases with their weights, all above 0.
-    class_weights : tuple of (str, float)
-        Detector classes with their share of the landmark's boxes, all above 0.
-    position_sigma : float
-        Standard deviation of the centre on each axis [m].
-    shared_sigma, shared_sigma_deg : float
-        Besides, the landmark and its neighbours are displaced together, and turned together about
-        the cameras near them: standard deviations on each axis [m] [deg].
-    support : int
-        Frames that the landmark was fitted to.
-    seen_ratio : float
-        Share of the frames which show the landmark's place in which it was detected, 0 to 1.
-    baseline_deg : float
-        Greatest angle between two directions from which it was seen [deg].
-    last_seen : float
-        Time of the last frame that showed it [s].
-    source : str
-        Where it comes from.
-    """
-
-    labels: WeightedLabels | None = None
+    labels: WeightedLabels | None = None  #: Phrases with their weights, all above 0
+    #: Detector classes with their share of the landmark's boxes, all above 0
     class_weights: tuple[tuple[str, float], ...] | None = None
-    position_sigma: float | None = None
+    position_sigma: float | None = None  #: Standard deviation of the centre on each axis [m]
+    #: Besides, the landmark and its neighbours are displaced together, and turned together about
+    #: the cameras near them: standard deviations on each axis [m] [deg]
     shared_sigma: float | None = None
     shared_sigma_deg: float | None = None
-    support: int | None = None
+    support: int | None = None  #: Frames that the landmark was fitted to
+    #: Share of the frames which show the landmark's place in which it was detected, 0 to 1
     seen_ratio: float | None = None
+    #: Greatest angle between two directions from which it was seen [deg]
     baseline_deg: float | None = None
-    last_seen: float | None = None
-    source: str | None = None
+    last_seen: float | None = None  #: Time of the last frame that showed it [s]
+    source: str | None = None  #: Where it comes from
 
     def labels_with(self, label: str) -> WeightedLabels:
         """Return the labels; one that they lack, such as an edited one, counts like the best."""

@@ -46,27 +46,17 @@ _SCHEMA = Schema('file of embeddings', {
 
 @dataclass(frozen=True)
 class LandmarkEmbeddings:
-    """Image embeddings of L landmarks: d numbers each.
+    """Image embeddings of L landmarks: d numbers each."""
 
-    Parameters
-    ----------
-    encoder_key : str
-        Identifies the encoder: crops of another one must not be compared with these.
-    landmark_ids : tuple of str
-        The landmarks, each once.
-    means : ndarray (L, d) float16
-        The mean direction of each landmark's crops, unit rows; a zero row is unknown.
-    medoids : ndarray (m, d) float16
-        Crops that stand for all crops of their landmark, unit rows.
-    medoid_offsets : ndarray (L + 1,) of int
-        Landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at most
-        five.
-    """
-
+    #: Identifies the encoder: crops of another one must not be compared with these
     encoder_key: str
-    landmark_ids: tuple[str, ...]
+    landmark_ids: tuple[str, ...]  #: The landmarks, each once
+    #: (L, d): the mean direction of each landmark's crops, unit rows; a zero row is unknown
     means: NDArray[np.float16]
+    #: (m, d): crops that stand for all crops of their landmark, unit rows
     medoids: NDArray[np.float16]
+    #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
+    #: most five
     medoid_offsets: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -79,13 +69,7 @@ class LandmarkEmbeddings:
         return np.asarray(self.means.any(axis=1))
 
     def in_order(self, landmark_ids: Sequence[str]) -> 'LandmarkEmbeddings':
-        """Return the embeddings of some landmarks, in the order given; missing ones are unknown.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of str
-            Of a map, each once.
-        """
+        """Return the embeddings of some landmarks in the order given; missing ones are unknown."""
         rows_of = {landmark_id: row for row, landmark_id in enumerate(self.landmark_ids)}
         rows = np.array([rows_of.get(landmark_id, -1) for landmark_id in landmark_ids],
                         dtype=np.int64)
@@ -100,14 +84,7 @@ class LandmarkEmbeddings:
 
 def concatenated(several: Sequence[LandmarkEmbeddings], landmark_ids: Sequence[str]
                  ) -> LandmarkEmbeddings:
-    """Return the embeddings of several maps, of one encoder and in their order, as one.
-
-    Parameters
-    ----------
-    several : sequence of LandmarkEmbeddings
-    landmark_ids : sequence of str
-        New names of all landmarks, each once.
-    """
+    """Return the embeddings of several maps, of one encoder and in their order, as one."""
     counts = np.concatenate([np.diff(one.medoid_offsets) for one in several])
     return LandmarkEmbeddings(
         several[0].encoder_key, tuple(landmark_ids),

@@ -72,31 +72,18 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """Landmarks of one map frame. L is their number, at least 1.
+    """Landmarks of one map frame. L is their number, at least 1."""
 
-    Parameters
-    ----------
-    frame_id : str
-        The coordinate frame of centres and orientations.
-    landmark_ids, labels, class_ids : tuple of str
-        Name, description in natural language and detector class of each landmark.
-    centers : ndarray (L, 3)
-        [m].
-    semi_axes : ndarray (L, 3)
-        Half lengths along each landmark's own axes [m].
-    quats_xyzw : ndarray (L, 4)
-        Unit quaternions that rotate landmark axes into map axes.
-    details : tuple of LandmarkDetails
-        Optional fields of each landmark; empty where the map has none.
-    """
-
-    frame_id: str
+    frame_id: str  #: The coordinate frame of centres and orientations
+    #: Name, description in natural language and detector class of each landmark
     landmark_ids: tuple[str, ...]
     labels: tuple[str, ...]
     class_ids: tuple[str, ...]
-    centers: NDArray[np.float64]
-    semi_axes: NDArray[np.float64]
+    centers: NDArray[np.float64]  #: (L, 3) [m]
+    semi_axes: NDArray[np.float64]  #: (L, 3): half lengths along each landmark's own axes [m]
+    #: (L, 4): unit quaternions that rotate landmark axes into map axes
     quats_xyzw: NDArray[np.float64]
+    #: Optional fields of each landmark; empty where the map has none
     details: tuple[LandmarkDetails, ...] = ()
 
     def __len__(self) -> int:
@@ -242,13 +229,6 @@ class LandmarkMap:
     @staticmethod
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
         """Build a map from a tree with the keys frame_id and landmarks.
-
-        Parameters
-        ----------
-        tree : mapping
-            As in the map file, below the key 'map'.
-        source : str
-            Where the tree came from, for messages.
 
         Raises
         ------

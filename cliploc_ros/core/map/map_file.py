@@ -28,17 +28,8 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
               ) -> None:
     """Write a map file in one step: an existing file is replaced complete, or stays.
 
-    The image embeddings of a map that is replaced are removed: they are not of the new one.
-
-    Parameters
-    ----------
-    path : str or path
-        A YAML file.
-    landmark_map : LandmarkMap
-    comments : iterable of str
-        Lines for the head of the file.
-    embeddings : LandmarkEmbeddings, optional
-        Image embeddings of these landmarks, written next to the map.
+    Comments are lines for the head of the file. Image embeddings are written next to the map;
+    those of a map that is replaced are removed: they are not of the new one.
 
     Raises
     ------
@@ -53,11 +44,7 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
-    _replace_embeddings(embeddings_path(path), embeddings)
-
-
-def _replace_embeddings(path: Path, embeddings: LandmarkEmbeddings | None) -> None:
-    """Write embeddings, or remove those of the map that was there before."""
+    path = embeddings_path(path)
     if embeddings is not None:
         save_landmark_embeddings(path, embeddings)
         return

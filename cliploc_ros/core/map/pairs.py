@@ -38,46 +38,26 @@ _SLOTS, _MOST_COMPARED = 1 << 15, 100_000
 
 
 class LandmarkPairs(NamedTuple):
-    """Pairs of a landmark and a neighbour: L landmarks, p pairs.
+    """Pairs of a landmark and a neighbour: L landmarks, p pairs."""
 
-    Parameters
-    ----------
-    neighbours : ndarray (L, k) of int
-        Neighbours of each landmark; -1 for none.
-    centers, classes : ndarray (L, 3), (L,)
-        Of the landmarks.
-    keys : ndarray (p,) of int
-        What each pair looks like, ascending.
-    landmarks : ndarray (p,) of int
-        First landmark of each pair.
-    offsets : ndarray (p, 3) float32
-        Horizontal distance and difference in height [m], and direction [rad] of each pair.
-    """
-
-    neighbours: NDArray[np.int32]
+    neighbours: NDArray[np.int32]  #: (L, k): neighbours of each landmark; -1 for none
+    #: (L, 3), (L,): of the landmarks
     centers: NDArray[np.float64]
     classes: NDArray[np.int64]
-    keys: NDArray[np.int64]
-    landmarks: NDArray[np.int32]
+    keys: NDArray[np.int64]  #: (p,): what each pair looks like, ascending
+    landmarks: NDArray[np.int32]  #: (p,): first landmark of each pair
+    #: (p, 3): horizontal distance and difference in height [m], and direction [rad] of each pair
     offsets: NDArray[np.float32]
 
 
 class Repeats(NamedTuple):
-    """Landmarks that may be where others would be after a turn and a shift, r of them.
+    """Landmarks that may be where others would be after a turn and a shift, r of them."""
 
-    Parameters
-    ----------
-    landmarks, others : ndarray (r,) of int
-    turns : ndarray (r,)
-        About the vertical, from landmark to other [rad].
-    votes : ndarray (r,) of int
-        Number of neighbours that agree.
-    """
-
+    #: (r,)
     landmarks: NDArray[np.int64]
     others: NDArray[np.int64]
-    turns: NDArray[np.float64]
-    votes: NDArray[np.int64]
+    turns: NDArray[np.float64]  #: (r,): about the vertical, from landmark to other [rad]
+    votes: NDArray[np.int64]  #: (r,): number of neighbours that agree
 
 
 def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: cKDTree

@@ -27,20 +27,13 @@ _BLOCK = 2048
 
 @dataclass(frozen=True)
 class LabelEmbeddings:
-    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d).
+    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d)."""
 
-    Parameters
-    ----------
-    unique : ndarray (U, d) float32
-        One row for each different label: of unit length, or a weighted mean of such rows.
-    of_landmarks : ndarray (L,) of int
-        The row of each landmark's label. Every row belongs to a landmark.
-    parts : tuple of LabelEmbeddings
-        Those of each of several maps, see in_parts; empty for a single map.
-    """
-
+    #: (U, d): one row for each different label: of unit length, or a weighted mean of such rows
     unique: NDArray[np.float32]
+    #: (L,): the row of each landmark's label. Every row belongs to a landmark.
     of_landmarks: NDArray[np.int64]
+    #: Those of each of several maps, see in_parts; empty for a single map
     parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
@@ -54,11 +47,6 @@ class LabelEmbeddings:
         """Return the same embeddings, those of each of several maps in rows of their own.
 
         A label of two maps is stored twice.
-
-        Parameters
-        ----------
-        sizes : sequence of M int
-            Number of landmarks of each map, in order.
         """
         pieces = [np.unique(some, return_inverse=True)
                   for some in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
@@ -97,15 +85,9 @@ class CropSimilarities:
     """Cosine similarities of crops and landmarks, computed when needed.
 
     NumPy sees an array (n, L).
-
-    Parameters
-    ----------
-    crops : ndarray (n, d) float32
-        Unit rows.
-    labels : LabelEmbeddings
     """
 
-    crops: NDArray[np.float32]
+    crops: NDArray[np.float32]  #: (n, d): unit rows
     labels: LabelEmbeddings
 
     @property
@@ -153,8 +135,6 @@ def nearest_landmarks(similarities: Similarities, k: int
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
-    k : int
-        1 to L.
 
     Raises
     ------
@@ -162,26 +142,17 @@ def nearest_landmarks(similarities: Similarities, k: int
         A similarity is not finite.
     """
     if not isinstance(similarities, CropSimilarities):
-        return _nearest_columns(_column_blocks(similarities), len(similarities), k)
-    labels = similarities.labels
-    found, values = _nearest_columns(_label_blocks(similarities), len(similarities.crops),
-                                     min(k, len(labels.unique)))
-    if len(labels.unique) == len(labels.of_landmarks):
-        landmarks = labels.landmarks[found]
-        return _best(landmarks, values, k)
-    return _expanded(labels, found, values, k)
-
-
-def _column_blocks(similarities: NDArray[np.float32]
-                   ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    for start in range(0, similarities.shape[1], _BLOCK):
-        yield start, similarities[:, start:start + _BLOCK]
-
-
-def _label_blocks(similarities: CropSimilarities) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    unique = similarities.labels.unique
-    for start in range(0, len(unique), _BLOCK):
-        yield start, similarities.crops @ unique[start:start + _BLOCK].T
+        return _nearest_columns(((start, similarities[:, start:start + _BLOCK]) for start in
+                                 range(0, similarities.shape[1], _BLOCK)), len(similarities), k)
+    labels, crops = similarities.labels, similarities.crops
+    found, values = _nearest_columns(((start, crops @ labels.unique[start:start + _BLOCK].T)
+                                      for start in range(0, len(labels.unique), _BLOCK)),
+                                     len(crops), min(k, len(labels.unique)))
+    if len(labels.unique) < len(labels.of_landmarks):
+        return _expanded(labels, found, values, k)
+    landmarks = labels.landmarks[found]
+    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # of equals, the first landmark first
+    return np.take_along_axis(landmarks, order, axis=1), np.take_along_axis(values, order, axis=1)
 
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
@@ -230,13 +201,6 @@ def keep_greatest(block, start, columns, values):
             values[row, place], columns[row, place] = value, start + column
             least = values[row, last]
     return True
-
-
-def _best(columns: NDArray[np.int64], values: NDArray[np.float32], k: int
-          ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k best of each row, best first; of equals, the lower column first."""
-    order = np.lexsort((columns, -values), axis=1)[:, :k]
-    return np.take_along_axis(columns, order, axis=1), np.take_along_axis(values, order, axis=1)
 
 
 def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray[np.float32],

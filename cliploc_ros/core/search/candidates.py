@@ -20,21 +20,14 @@ from cliploc_ros.errors import OptionsError
 
 @dataclass(frozen=True)
 class Candidates:
-    """Correspondence candidates, in the order in which a sampler prefers them.
+    """Correspondence candidates, in the order in which a sampler prefers them."""
 
-    Parameters
-    ----------
-    detections, landmarks : ndarray (c,) of int
-        Indices of the pair.
-    ranks : ndarray (c,) of int
-        0 for a detection's most similar landmark, 1 for the next, and so on.
-    similarities : ndarray (c,)
-        Cosine similarity of crop and label; 0 where only the class is known.
-    """
-
+    #: (c,): indices of the pair
     detections: NDArray[np.int64]
     landmarks: NDArray[np.int64]
+    #: (c,): 0 for a detection's most similar landmark, 1 for the next, and so on
     ranks: NDArray[np.int64]
+    #: (c,): cosine similarity of crop and label; 0 where only the class is known
     similarities: NDArray[np.float64]
 
     def __len__(self) -> int:
@@ -65,7 +58,6 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64]) -> Candidate
 
     Parameters
     ----------
-    index : ClassIndex
     classes : ndarray (n,) of int
         Class of each detection, as the index numbers them; below 0 for none.
     """
@@ -97,13 +89,6 @@ def check_k(k: int, landmark_count: int) -> None:
 
 def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
-
-    Parameters
-    ----------
-    similarities : ndarray (n, L) or CropSimilarities
-        Cosine similarity of each crop and label.
-    k : int
-        1 to L.
 
     Raises
     ------
@@ -140,14 +125,7 @@ def concatenated(some: Sequence[Candidates]) -> Candidates:
 
 
 def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
-    """Return the first candidates, followed by those of the second that are new.
-
-    Parameters
-    ----------
-    first, second : Candidates
-    landmark_count : int
-        Number of landmarks of the map.
-    """
+    """Return the first candidates, followed by those of the second that are new."""
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return concatenated([first, second.select(new)])

@@ -39,34 +39,17 @@ _UNIT_TOLERANCE = 1e-3
 
 
 class SearchedFrame(NamedTuple):
-    """A frame and the result of the search among its samples.
-
-    Parameters
-    ----------
-    observation : Observation
-    scene : Scene
-        Of the observation.
-    vertical : ndarray (7,)
-        See VERTICAL_UNKNOWN.
-    leaders : Leaders
-        The best hypotheses, as poses of this frame's camera.
-    tilted : Leaders
-        The best hypotheses that ignore the vertical, where it is known; else none.
-    progress : Progress
-    samples : ndarray (t, 3) or None
-        The samples tried; None for all samples of the first candidates, see progress.reach.
-    firsts : tuple of int
-        Row of the first landmark of each of several maps.
-    """
+    """A frame and the result of the search among its samples."""
 
     observation: Observation
-    scene: Scene
-    vertical: NDArray[np.float64]
-    leaders: Leaders
-    tilted: Leaders
+    scene: Scene  #: Of the observation
+    vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
+    leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
+    tilted: Leaders  #: The best hypotheses that ignore the vertical, where it is known; else none
     progress: Progress
+    #: (t, 3): the samples tried; None for all samples of the first candidates, see progress.reach
     samples: NDArray[np.int64] | None = None
-    firsts: tuple[int, ...] = (0,)
+    firsts: tuple[int, ...] = (0,)  #: Row of the first landmark of each of several maps
 
     @property
     def sample_size(self) -> int:
@@ -91,15 +74,7 @@ class SearchedFrame(NamedTuple):
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
                  options: RelocalizerOptions, deadline: float) -> SearchedFrame:
-    """Search one frame.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    observation : Observation
-    options : RelocalizerOptions
-    deadline : float
-        When to stop, of time.perf_counter [s].
+    """Search one frame, until a deadline of time.perf_counter [s].
 
     Raises
     ------
@@ -112,7 +87,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
-        samples, prior = _draw(scene, options), prior_of(observation, options)
+        prior = prior_of(observation, options)
         if options.algorithm == 'auto':
             try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
                               limit=options.iterations)
@@ -122,12 +97,17 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                 # boxes alone suggest must be among the rivals.
                 free = _run(try_all(tilted), deadline)
                 progress = progress._replace(tried=progress.tried + free.tried)
-        elif samples is None:
+        elif options.algorithm == 'bf':
             progress = _run(search_exhaustively(scene, leaders, prior), deadline)
         else:
+            draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+            seed = options.random_seed if options.random_seed >= 0 else None
+            samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
             progress = _run(search_samples(scene, samples, leaders, prior), deadline)
-        progress = progress._replace(
-            coverage=progress.coverage * _kept_share(len(scene.pairs), left_out))
+        if left_out:  # the share of all samples that consist of the candidates kept
+            kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
+                comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
+            progress = progress._replace(coverage=progress.coverage * kept)
     return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
                          tuple(part.first for part in parts_of(landmark_map)))
 
@@ -155,13 +135,6 @@ def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 
-def _kept_share(kept: int, left_out: int) -> float:
-    """Return the share of all samples that consist of the candidates kept."""
-    if not left_out:
-        return 1.0
-    return comb(kept, SAMPLE_SIZE) / max(comb(kept + left_out, SAMPLE_SIZE), 1)
-
-
 def _is_known(vertical: NDArray[np.float64]) -> bool:
     return bool(vertical[6] > 0.0)
 
@@ -173,15 +146,6 @@ def _sample_size(vertical: NDArray[np.float64]) -> int:
 def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
     distinct = min(len(np.unique(scene.pairs[:, 0])), len(np.unique(scene.pairs[:, 1])))
     return distinct >= _sample_size(vertical)
-
-
-def _draw(scene: Scene, options: RelocalizerOptions) -> NDArray[np.int64] | None:
-    """Return the samples (t, 3) of an algorithm that draws them; None for the others."""
-    if options.algorithm in ('auto', 'bf'):
-        return None
-    draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
-    seed = options.random_seed if options.random_seed >= 0 else None
-    return draw(scene.pairs, options.iterations, np.random.default_rng(seed))
 
 
 def _run(search: Iterator[Progress], deadline: float) -> Progress:

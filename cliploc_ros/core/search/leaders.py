@@ -18,22 +18,12 @@ _TIE = 1e-9
 
 
 class Leaders(NamedTuple):
-    """The best hypotheses so far, at distinct places; unused rows have the score -1.
+    """The best hypotheses so far, at distinct places; unused rows have the score -1."""
 
-    Parameters
-    ----------
-    scores : ndarray (m,)
-    iterations : ndarray (m,) of int
-        In which iteration each was found, from 1.
-    samples : ndarray (m, 3) of int
-        Its minimal sample, as candidate numbers.
-    rotations, translations : ndarray (m, 3, 3), (m, 3)
-        Of camera_from_map.
-    """
-
-    scores: NDArray[np.float64]
-    iterations: NDArray[np.int64]
-    samples: NDArray[np.int64]
+    scores: NDArray[np.float64]  #: (m,)
+    iterations: NDArray[np.int64]  #: (m,): in which iteration each was found, from 1
+    samples: NDArray[np.int64]  #: (m, 3): its minimal sample, as candidate numbers
+    #: (m, 3, 3), (m, 3): of camera_from_map
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
 

@@ -40,12 +40,6 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
                 ) -> tuple[Scene, int]:
     """Associate one frame with the map.
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    observation : Observation
-    options : RelocalizerOptions
-
     Returns
     -------
     scene : Scene

@@ -14,26 +14,18 @@ VERTICAL_UNKNOWN = np.zeros(7)
 
 
 class Prior(NamedTuple):
-    """What is known of the camera; by default nothing.
+    """What is known of the camera; by default nothing."""
 
-    Parameters
-    ----------
-    up_in_camera, up_in_map : tuple of float
-        The vertical, unit vectors in the camera's optical frame and in the map frame.
-    min_height, max_height : float
-        Of the camera's centre, along up_in_map from the map's origin [m].
-    max_tilt : float
-        Greatest angle between both verticals at a pose from three points [rad]. Poses from two
-        points hold them equal.
-    vertical_deviation : float
-        Standard deviation of the angle between both verticals [rad]; inf: only max_tilt counts.
-    """
-
+    #: The vertical, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
     up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    #: Of the camera's centre, along up_in_map from the map's origin [m]
     min_height: float = -inf
     max_height: float = inf
+    #: Greatest angle between both verticals at a pose from three points [rad]. Poses from two
+    #: points hold them equal.
     max_tilt: float = pi
+    #: Standard deviation of the angle between both verticals [rad]; inf: only max_tilt counts
     vertical_deviation: float = inf
 
     def as_array(self) -> NDArray[np.float64]:
@@ -51,16 +43,10 @@ class Prior(NamedTuple):
 
     def tilt_error(self, map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
                    ) -> float:
-        """Return the angle between both verticals at a pose, in its standard deviations.
+        """Return the angle between both verticals at a pose (4, 4), in its standard deviations.
 
-        Those of the vertical and of the pose count. Of right poses, one of 1,000 exceeds 3.7, if
-        the vertical is right. 0 where the vertical is unknown.
-
-        Parameters
-        ----------
-        map_from_camera : ndarray (4, 4)
-        covariance : ndarray (6, 6)
-            Of the pose, in the order of core.fit.covariance.
+        Those of the vertical and of the pose, with covariance (6, 6), count. Of right poses, one
+        of 1,000 exceeds 3.7, if the vertical is right. 0 where the vertical is unknown.
         """
         up = map_from_camera[:3, :3] @ self.up_in_camera
         axis = np.cross(up, self.up_in_map)

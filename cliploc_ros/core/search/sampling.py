@@ -19,22 +19,11 @@ _MAX_ATTEMPTS = 100
 
 
 def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
-    """Return T'_m .. T'_N: the last iteration of PROSAC with each size of its candidate set.
+    """Return T'_3 .. T'_N (N - 2,): PROSAC's last iteration with each size of its candidate set.
 
-    Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, with T_N = iterations (with
-    the textbook's 200,000 a search of 500 never leaves its first five candidates).
-
-    Parameters
-    ----------
-    candidate_count : int
-        N, at least 3.
-    iterations : int
-        T_N, the iterations after which PROSAC becomes RANSAC.
-
-    Returns
-    -------
-    ndarray (N - 2,) of int
-        For set sizes 3 to N.
+    Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, for N >= 3 candidates. T_N,
+    after which PROSAC becomes RANSAC, is the number of iterations: with the textbook's 200,000 a
+    search of 500 never leaves its first five candidates.
     """
     sizes = np.arange(SAMPLE_SIZE, candidate_count)
     drawn = iterations * np.prod([(SAMPLE_SIZE - i) / (candidate_count - i)
@@ -193,14 +182,8 @@ def _compatible_before(compatible, newest, earlier):
 def enumerate_compatible_pairs(compatible, cursor, samples):
     """Write the next pairs of compatible candidates, by their newer; return their number.
 
-    Parameters
-    ----------
-    compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.search.compatibility.
-    cursor : ndarray (2,)
-        Newer and older candidate, at first 1, 0; updated. The newer is c at the end.
-    samples : ndarray (t, 3)
-        Its first two columns are filled from the first row on: older, newer.
+    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) is at
+    first 1, 0, and its first value is c at the end.
     """
     count = compatible.shape[0]
     newest, first = cursor[0], cursor[1]

@@ -11,52 +11,30 @@ from cliploc_ros.core.map.culling import Groups, SortedLandmarks, make_groups, n
 
 
 class Potential(NamedTuple):
-    """Landmarks that single detections may show: u landmarks, p pairs.
+    """Landmarks that single detections may show: u landmarks, p pairs."""
 
-    Parameters
-    ----------
-    landmarks : ndarray (u,)
-        Rows in the map, each once.
-    starts : ndarray (u + 1,)
-        Where the detections of each landmark begin in detections.
-    detections : ndarray (p,)
-        The detections that may show each landmark.
-    """
-
-    landmarks: NDArray[np.int64]
+    landmarks: NDArray[np.int64]  #: (u,): rows in the map, each once
+    #: (u + 1,): where the detections of each landmark begin in detections
     starts: NDArray[np.int64]
-    detections: NDArray[np.int64]
+    detections: NDArray[np.int64]  #: (p,): the detections that may show each landmark
 
 
 class Scene(NamedTuple):
-    """One frame and the map: n detections, L landmarks, c candidates.
+    """One frame and the map: n detections, L landmarks, c candidates."""
 
-    Parameters
-    ----------
-    box_ellipses : ndarray (n, 4)
-        Centre x, y and semi-axes x, y of the ellipse inscribed in each box, on the plane z = 1.
-    bearings : ndarray (n, 3)
-        Unit vectors through the box centres.
-    centers, shapes : ndarray (L, 3), (L, 6)
-        Of the landmarks, see cliploc_ros.core.geometry.ellipsoid.
-    potential : Potential
-        Landmarks that single detections may show.
-    pairs : ndarray (c, 2)
-        Detection and landmark of each correspondence candidate, in order of preference.
-    iou_threshold : float
-        A detection and a landmark match only if their IoU is above this.
-    sorted_landmarks, groups : SortedLandmarks, Groups
-        Of a large map, the landmarks that detections may show because of their class. In a small
-        map both are empty, and these pairs are in potential.
-    """
-
+    #: (n, 4): centre x, y and semi-axes x, y of the ellipse inscribed in each box, on the plane z
+    #: = 1
     box_ellipses: NDArray[np.float64]
-    bearings: NDArray[np.float64]
+    bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
+    #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]
     shapes: NDArray[np.float64]
-    potential: Potential
+    potential: Potential  #: Landmarks that single detections may show
+    #: (c, 2): detection and landmark of each correspondence candidate, in order of preference
     pairs: NDArray[np.int64]
-    iou_threshold: float
+    iou_threshold: float  #: A detection and a landmark match only if their IoU is above this
+    #: Of a large map, the landmarks that detections may show because of their class. In a small
+    #: map both are empty, and these pairs are in potential.
     sorted_landmarks: SortedLandmarks
     groups: Groups
 
@@ -90,15 +68,12 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
     boxes = np.ascontiguousarray(np.concatenate([middle, half], axis=1))
     single = np.argwhere(potential) if potential.dtype == np.bool_ else potential.astype(np.int64)
+    single = single[np.lexsort(single.T)]
+    shown, starts = np.unique(single[:, 1], return_index=True)
     if sorted_landmarks is None or classes is None:
         sorted_landmarks, classes = no_landmarks(), np.full(len(boxes), -1, dtype=np.int64)
+    by_landmark = Potential(shown, np.append(starts, len(single)),
+                            np.ascontiguousarray(single[:, 0]))
     return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
-                 _by_landmark(single), np.ascontiguousarray(pairs), float(iou_threshold),
+                 by_landmark, np.ascontiguousarray(pairs), float(iou_threshold),
                  sorted_landmarks, make_groups(sorted_landmarks, classes, boxes, iou_threshold))
-
-
-def _by_landmark(pairs: NDArray[np.int64]) -> Potential:
-    """Return pairs of detection and landmark (p, 2), sorted by landmark."""
-    pairs = pairs[np.lexsort(pairs.T)]
-    landmarks, starts = np.unique(pairs[:, 1], return_index=True)
-    return Potential(landmarks, np.append(starts, len(pairs)), np.ascontiguousarray(pairs[:, 0]))

@@ -56,26 +56,14 @@ class Targets(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Memory of one minimal sample: three candidates, or two.
+    """Memory of one minimal sample: three candidates, or two."""
 
-    Parameters
-    ----------
-    bearings : ndarray (3, 3)
-        Through the box centres.
-    boxes : ndarray (3, 4)
-        Box ellipses.
-    landmarks : ndarray (3, 9)
-        Centres and shapes.
-    outlines : ndarray (12, 6)
-        Outlines of the landmarks at each of up to four poses, see project.
-    uppers : ndarray (4,)
-        Upper bound of the summed IoUs at each pose; -1 where the pose is impossible.
-    """
-
-    bearings: NDArray[np.float64]
-    boxes: NDArray[np.float64]
-    landmarks: NDArray[np.float64]
+    bearings: NDArray[np.float64]  #: (3, 3): through the box centres
+    boxes: NDArray[np.float64]  #: (3, 4): box ellipses
+    landmarks: NDArray[np.float64]  #: (3, 9): centres and shapes
+    #: (12, 6): outlines of the landmarks at each of up to four poses, see project
     outlines: NDArray[np.float64]
+    #: (4,): upper bound of the summed IoUs at each pose; -1 where the pose is impossible
     uppers: NDArray[np.float64]
 
 
@@ -84,63 +72,35 @@ class Overlaps(NamedTuple):
 
     There is room for every landmark and every pair. The system provides only the pages that are
     written.
-
-    Parameters
-    ----------
-    visible : ndarray (2, w)
-        Members of the groups that the pose may see, see visible_members.
-    outlines : ndarray (o, 6)
-        Outlines of all landmarks that it may see, see project.
-    owners : ndarray (o,)
-        Row in the starts of each outline's detections.
-    pairs, bounds : ndarray (x, 2), (x,)
-        Pairs of detection and outline that may overlap enough, and upper bounds of their IoUs.
-    best_bounds : ndarray (n,)
-        The greatest bound of each detection.
     """
 
+    #: (2, w): members of the groups that the pose may see, see visible_members
     visible: NDArray[np.int64]
+    #: (o, 6): outlines of all landmarks that it may see, see project
     outlines: NDArray[np.float64]
-    owners: NDArray[np.int64]
+    owners: NDArray[np.int64]  #: (o,): row in the starts of each outline's detections
+    #: (x, 2), (x,): pairs of detection and outline that may overlap enough, and upper bounds of
+    #: their IoUs
     pairs: NDArray[np.int64]
     bounds: NDArray[np.float64]
-    best_bounds: NDArray[np.float64]
+    best_bounds: NDArray[np.float64]  #: (n,): the greatest bound of each detection
 
 
 class Bench(NamedTuple):
-    """A scene laid out for one search, and the memory that its hypotheses reuse.
+    """A scene laid out for one search, and the memory that its hypotheses reuse."""
 
-    Parameters
-    ----------
-    candidates : ndarray (c, 16)
-        Bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of the
-        landmark of each correspondence candidate.
-    prior : ndarray (9,)
-        See Prior.as_array.
-    targets : Targets
-    sample : Sample
-    poses : Poses
-        Those that the sample allows.
-    overlaps : Overlaps
-    """
-
+    #: (c, 16): bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of
+    #: the landmark of each correspondence candidate
     candidates: NDArray[np.float64]
-    prior: NDArray[np.float64]
+    prior: NDArray[np.float64]  #: (9,): see Prior.as_array
     targets: Targets
     sample: Sample
-    poses: Poses
+    poses: Poses  #: Those that the sample allows
     overlaps: Overlaps
 
 
 def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
-    """Return the bench of a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-    """
+    """Return the bench of a scene."""
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     candidates = np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                                  scene.centers[landmarks], scene.shapes[landmarks]], axis=1)
@@ -178,8 +138,6 @@ def make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou
         Of the bench. A bench as a whole is slow to pass: its arrays are counted at each call.
     samples : ndarray (t, 3) of int
         Three candidates, or two and -1.
-    number : int
-        Row of the sample.
     least_iou : float
         A pose whose sampled pairs have a smaller sum of IoUs is not verified.
     """
@@ -290,17 +248,7 @@ def _outline_iou(boxes, box, outlines, out):
 
 @compiled
 def verify_beyond(targets, poses, which, overlaps, floor):
-    """Return the score of a pose if it is above a floor; if not, the floor.
-
-    Parameters
-    ----------
-    targets : Targets
-    poses : Poses
-    which : int
-        Row of the pose.
-    overlaps : Overlaps
-    floor : float
-    """
+    """Return the score of a pose if it is above a floor; if not, the floor."""
     groups, outlines = targets.groups, overlaps.outlines
     overlaps.best_bounds[:] = targets.iou_threshold
     single = targets.landmarks.shape[0]

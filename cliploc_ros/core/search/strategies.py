@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which minimal samples a search tries: given ones, all of them, or the likeliest first."""
+"""Which minimal samples a search tries: given ones, all of them, or the likeliest first.
+
+Leaders take the best hypotheses; poses that contradict the prior are not verified. Each search
+yields its progress after each block of samples, and the caller may stop there.
+"""
 
 import time
 from collections.abc import Iterator
@@ -37,21 +41,11 @@ _FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 class Progress(NamedTuple):
-    """How far a search is.
+    """How far a search is."""
 
-    Parameters
-    ----------
-    tried : int
-        Hypotheses tried so far.
-    coverage : float
-        The share of its samples that were tried, 0 to 1.
-    reach : int
-        A progressive search has tried all samples among so many first candidates.
-    """
-
-    tried: int
-    coverage: float
-    reach: int = 0
+    tried: int  #: Hypotheses tried so far
+    coverage: float  #: The share of its samples that were tried, 0 to 1
+    reach: int = 0  #: A progressive search has tried all samples among so many first candidates
 
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
@@ -60,18 +54,8 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
 
     Parameters
     ----------
-    scene : Scene
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
     """
     bench = set_up(scene, prior)
     tried = 0
@@ -88,21 +72,7 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
 
 def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
                         ) -> Iterator[Progress]:
-    """Try every valid sample, a block at a time, without storing them.
-
-    Parameters
-    ----------
-    scene : Scene
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
-    """
+    """Try every valid sample, a block at a time, without storing them."""
     bench = set_up(scene, prior)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
@@ -129,24 +99,12 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
 
     Parameters
     ----------
-    scene : Scene
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.compatibility.
-    leaders : Leaders
-        Takes the best hypotheses.
-    prior : Prior, optional
-        Poses that contradict it are not verified.
-    limit : float, optional
-        The most samples to try.
     size : int, optional
         Candidates in a sample: three, or two where the prior's vertical is known (see
         cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
         is -1.
-
-    Yields
-    ------
-    Progress
-        After each block; the caller may stop there.
     """
     bench = set_up(scene, prior)
     count = len(scene.pairs)
@@ -164,13 +122,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
 
 
 class _Pace:
-    """Blocks of samples of about equal time. Results do not depend on their sizes.
-
-    Parameters
-    ----------
-    limit : float
-        How many samples to try in all.
-    """
+    """Blocks of samples of about equal time. Results do not depend on their sizes."""
 
     def __init__(self, limit: float = inf) -> None:
         self._memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
