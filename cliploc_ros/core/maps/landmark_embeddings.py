@@ -166,16 +166,17 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise _ArrayError('is no complete npz file') from error
     if not isinstance(content, np.lib.npyio.NpzFile):
         raise _ArrayError('is a single array, not an npz file of named arrays')
-    arrays = {}
     with content:
-        for name in _LAYOUT:
-            if name not in content.files:
-                raise _ArrayError(f'array {name} is missing')
-            try:
-                arrays[name] = np.asarray(content[name])
-            except Exception as error:  # whatever numpy and zipfile meet in a broken file
-                raise _ArrayError(f'array {name} cannot be read: {error}') from error
-    return arrays
+        return {name: _read_array(content, name) for name in _LAYOUT}
+
+
+def _read_array(content: Any, name: str) -> NDArray[Any]:
+    if name not in content.files:
+        raise _ArrayError(f'array {name} is missing')
+    try:
+        return np.asarray(content[name])
+    except Exception as error:  # whatever numpy and zipfile meet in a broken file
+        raise _ArrayError(f'array {name} cannot be read: {error}') from error
 
 
 def _check_layout(arrays: dict[str, NDArray[Any]]) -> None:
