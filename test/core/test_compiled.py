@@ -62,12 +62,9 @@ def kernels(compiled_kernels, tmp_path):
 
 @pytest.fixture
 def package(tmp_path):
-    """Copy the modules that the program needs to another place."""
+    """Copy the package to another place, with new times of modification."""
     copy = tmp_path / 'elsewhere'
-    for file in (PROJECT / 'cliploc_ros').glob('*.py'):
-        (copy / 'cliploc_ros').mkdir(parents=True, exist_ok=True)
-        shutil.copy(file, copy / 'cliploc_ros')  # with a new time of modification
-    shutil.copytree(PROJECT / 'cliploc_ros/core', copy / 'cliploc_ros/core',
+    shutil.copytree(PROJECT / 'cliploc_ros', copy / 'cliploc_ros', copy_function=shutil.copy,
                     ignore=shutil.ignore_patterns('__pycache__'))
     return copy
 

@@ -68,9 +68,16 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
 def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
            camera_from_map: NDArray[np.float64]) -> PointPose | None:
     """Return a pose after least squares with Cauchy's weights; None with too few inliers."""
-    fit = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(6)), _ROUGH)
-    return fit and PointPose(invert_transform(fit[0].camera_from_map), fit[1],
-                             _about_map_axes(fit[0]))
+    found = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(6)), _ROUGH)
+    if found is None:
+        return None
+    fit, inliers = found
+    # A step (v, w) from the left of camera_from_map moves the camera's place by -R^T v, and turns
+    # it by -R^T w about the map's axes; R is the rotation of camera_from_map.
+    turn = np.kron(np.eye(2), -fit.camera_from_map[:3, :3].T)
+    covariance = turn @ np.linalg.inv(fit.information) @ turn.T
+    return PointPose(invert_transform(fit.camera_from_map), inliers,
+                     (covariance + covariance.T) / 2)
 
 
 def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
@@ -169,14 +176,3 @@ def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], f
         if np.abs(step).max() < _SMALL_STEP:
             break
     return fit
-
-
-def _about_map_axes(fit: _Fit) -> NDArray[np.float64]:
-    """Return the covariance of the camera's pose in the map, in ROS order.
-
-    A step (v, w) from the left of camera_from_map moves the camera's place by -R^T v, and turns
-    it by -R^T w about the map's axes; R is the rotation of camera_from_map.
-    """
-    turn = np.kron(np.eye(2), -fit.camera_from_map[:3, :3].T)
-    moved = turn @ np.linalg.inv(fit.information) @ turn.T
-    return np.asarray((moved + moved.T) / 2)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +103,8 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
             shift[1] = maps[0].centers[:, 1].min() - low[1]
         parts.append(MapPart(one, first, shift))
         first, begin = first + len(one), float(high[0] + shift[0]) + gap
+    details = [one.details or (LandmarkDetails(),) * len(one)
+               for one in maps] if any(one.details for one in maps) else []
     return JoinedMap(
         maps[0].frame_id,
         tuple(f'{one.frame_id}/{name}' for one in maps for name in one.landmark_ids),
@@ -109,14 +112,8 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         tuple(name for one in maps for name in one.class_ids),
         np.concatenate([part.landmark_map.centers + part.shift for part in parts]),
         np.concatenate([one.semi_axes for one in maps]),
-        np.concatenate([one.quats_xyzw for one in maps]), _details(maps), tuple(parts))
-
-
-def _details(maps: Sequence[LandmarkMap]) -> tuple[LandmarkDetails, ...]:
-    if not any(one.details for one in maps):
-        return ()
-    return tuple(details for one in maps
-                 for details in one.details or (LandmarkDetails(),) * len(one))
+        np.concatenate([one.quats_xyzw for one in maps]),
+        tuple(chain.from_iterable(details)), tuple(parts))
 
 
 def parts_of(landmark_map: LandmarkMap) -> tuple[MapPart, ...]:
