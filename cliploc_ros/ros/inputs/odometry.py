@@ -58,12 +58,7 @@ class BodyPose(NamedTuple):
 
 
 class OdometrySource:
-    """Subscribes to odometry while the node is active: it costs little, and links frames.
-
-    Parameters
-    ----------
-    node : Node
-    """
+    """Subscribes to odometry while the node is active: it costs little, and links frames."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -88,11 +83,8 @@ class OdometrySource:
     def on_restart(self, callback: Callable[[int], None]) -> None:
         """Have each restart of odometry reported: its poses are not related to those before.
 
-        Parameters
-        ----------
-        callback : callable
-            Takes the stamp of the first message after the restart [ns]. Called in the thread that
-            takes odometry; it must not block. What this node itself forgets is not reported.
+        The callback takes the stamp of the first message after the restart [ns], in the thread
+        that takes odometry; it must not block. What this node itself forgets is not reported.
         """
         self._on_restart.append(callback)
 
@@ -136,16 +128,10 @@ class OdometrySource:
                 callback(at_ns)
 
     def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
-        """Return the newest message, or the next one if that arrives in time; else None.
+        """Return the newest message, if it is not older than `max_age_s` by its arrival.
 
-        Parameters
-        ----------
-        max_age_s : float
-            The newest message counts if it arrived at most this long ago [s].
-        patience_s : float
-            How long to wait for another one [s].
-
-        Returns at once where nobody publishes odometry.
+        Else the next one if that arrives within `patience_s`, else None; at once where nobody
+        publishes odometry.
         """
         def is_recent() -> bool:
             return (self._newest is not None
