@@ -46,30 +46,20 @@ _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 
 
 class Localized(NamedTuple):
-    """The result of one frame.
+    """The result of one frame."""
 
-    Parameters
-    ----------
-    found : Relocalization
-        In the coordinate frame of the map.
-    landmark_map : LandmarkMap
-        Of several maps, the one of the best pose.
-    seen : SeenImage
-        With the crops that were compared, and their similarities to this map.
-    compared : int
-        Number of crops that were compared with labels.
-    is_cut : bool
-        Whether there was no time for the other crops, which could have helped.
-    for_filter : ndarray (6, 6) or None
-        Covariance for a filter that fuses all accepted poses: in continuous mode, that of what is
-        new, see cliploc_ros.core.succession.
-    """
-
+    #: In the coordinate frame of the map.
     found: Relocalization
+    #: Of several maps, the one of the best pose.
     landmark_map: LandmarkMap
+    #: With the crops that were compared, and their similarities to this map.
     seen: SeenImage
+    #: Number of crops that were compared with labels.
     compared: int
+    #: Whether there was no time for the other crops, which could have helped.
     is_cut: bool
+    #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
+    #: the new information, see cliploc_ros.core.succession.
     for_filter: NDArray[np.float64] | None
 
 
@@ -147,17 +137,8 @@ class Localizer:
                  times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        Parameters
-        ----------
-        frame : Frame
-        values : mapping
-            The relocalizer's parameters, as they are now.
-        state : RobotState
-            At the stamp of the frame.
-        times : StageTimes
-            Of this frame.
-        deadline : float
-            When to stop comparing crops (monotonic clock) [s].
+        `values` are the relocalizer's parameters as they are now, `state` is that at the stamp of
+        the frame. No crops are compared after `deadline` (monotonic clock) [s].
 
         Raises
         ------

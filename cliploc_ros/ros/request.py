@@ -55,15 +55,8 @@ class Requests:
     after the request: clients that ask together cost one search and reset the localizer once.
     Otherwise it looks at fresh frames itself.
 
-    Parameters
-    ----------
-    node : ManagedNode
-    frames : FrameSource
-    robot : RobotStateSource
-    localize : callable
-        Takes a frame, its StageTimes and the deadline (monotonic clock) [s]; returns its Answer.
-        Called in the worker's thread.
-    handoff : HandOff
+    `localize` takes a frame, its StageTimes and the deadline (monotonic clock) [s]; it returns
+    the frame's Answer. It is called in the worker's thread.
     """
 
     def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
@@ -168,12 +161,6 @@ class Pipeline:
     """Localizes with one frame at a time and publishes the result.
 
     All methods but open and close run in the node's worker, one after another.
-
-    Parameters
-    ----------
-    node : ManagedNode
-    robot : RobotStateSource
-    jumps : TimeJumps
     """
 
     def __init__(self, node: ManagedNode, robot: RobotStateSource, jumps: TimeJumps) -> None:
@@ -216,15 +203,10 @@ class Pipeline:
 
     def localize(self, frame: Frame, times: StageTimes | None = None,
                  deadline: float = math.inf) -> Answer:
-        """Localize with one frame and publish what was found.
+        """Localize with one frame and publish the result.
 
-        Parameters
-        ----------
-        frame : Frame
-        times : StageTimes, optional
-            Of this frame; new ones since its image arrived by default.
-        deadline : float
-            When to stop comparing crops (monotonic clock) [s].
+        `times` are new ones since the image arrived by default. No crops are compared after
+        `deadline` (monotonic clock) [s].
 
         Raises
         ------

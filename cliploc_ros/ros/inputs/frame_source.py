@@ -43,20 +43,12 @@ class NoFrameError(CliplocError):
 
 @dataclass(frozen=True)
 class Frame:
-    """The messages of one stamp.
-
-    Parameters
-    ----------
-    image : Image or CompressedImage
-    camera_info : CameraInfo
-    detections : Detection2DArray
-    received_at, detected_at : float
-        When the image arrived, and when its detections did (monotonic clock) [s].
-    """
+    """The messages of one stamp."""
 
     image: Image | CompressedImage
     camera_info: CameraInfo
     detections: Detection2DArray
+    #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
 
@@ -141,10 +133,7 @@ class FrameSource:
     def next_frame(self, after: float, deadline: float) -> Frame:
         """Return the first complete frame whose image arrived after a moment.
 
-        Parameters
-        ----------
-        after, deadline : float
-            Of the monotonic clock [s].
+        Both times are of the monotonic clock [s].
 
         Raises
         ------
@@ -290,15 +279,9 @@ class TimedImage(NamedTuple):
 
 
 class ImageSource:
-    """Subscribes to images while it is open.
+    """Subscribes to images, 'raw' or 'compressed', while it is open.
 
-    Parameters
-    ----------
-    node : Node
-    transport : str
-        'raw' or 'compressed'.
-    on_image : callable
-        Takes each TimedImage, in the executor's thread.
+    `on_image` takes each TimedImage, in the executor's thread.
     """
 
     def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None]

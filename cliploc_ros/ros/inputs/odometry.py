@@ -38,22 +38,14 @@ MOMENT_PATIENCE_S = 2.0
 
 
 class BodyPose(NamedTuple):
-    """Where odometry had the robot at the stamp of an image.
-
-    Parameters
-    ----------
-    odom_from_body : ndarray (4, 4)
-    body_frame : str
-        The coordinate frame that odometry tracks (child_frame_id).
-    run : int
-        Poses of one run share their odometry frame; those of different runs do not compare.
-    way_m : float
-        Driven since the run began [m].
-    """
+    """Where odometry had the robot at the stamp of an image."""
 
     odom_from_body: NDArray[np.float64]
+    #: The coordinate frame that odometry tracks (child_frame_id).
     body_frame: str
+    #: Poses of one run share their odometry frame; those of different runs do not compare.
     run: int
+    #: Driven since the run began.
     way_m: float
 
 

@@ -28,38 +28,24 @@ _DISCOVERY_S = 1.0
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where odometry had the camera.
-
-    Parameters
-    ----------
-    odom_from_camera : ndarray (4, 4)
-    run : int
-        Places of one run share their odometry frame.
-    way_m : float
-        Driven since the run began [m].
-    """
+    """Where odometry had the camera."""
 
     odom_from_camera: NDArray[np.float64]
+    #: Places of one run share their odometry frame.
     run: int
+    #: Driven since the run began.
     way_m: float
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The robot at the stamp of one image.
+    """The robot at the stamp of one image."""
 
-    Parameters
-    ----------
-    camera_from_base : ndarray (4, 4)
-        The mount; identity where the camera's own pose is wanted.
-    up_in_camera : ndarray (3,) or None
-        The vertical, a unit vector in the camera's optical frame; None where it is not known.
-    place : CameraPlace or None
-        None where odometry does not cover the image.
-    """
-
+    #: The mount (4, 4); identity where the camera's own pose is wanted.
     camera_from_base: NDArray[np.float64]
+    #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
     up_in_camera: NDArray[np.float64] | None = None
+    #: None where odometry does not cover the image.
     place: CameraPlace | None = None
 
 

@@ -44,54 +44,35 @@ _INFINITE_S = 2**31 - 1
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """How to play a recording.
+    """How to play a recording."""
 
-    Parameters
-    ----------
-    rate : float
-        Speed; 1 is as recorded.
-    start_offset_s : float
-        Begin this long after the recording's start [s].
-    topics : collection of str, optional
-        Play these only.
-    exclude : collection of str
-        Leave these out.
-    remap : mapping of str to str
-        New names of topics, by recorded name.
-    clock_hz : float, optional
-        Publish the recording's time on /clock this often per second of real time.
-    loop : bool
-        Begin again at the end, until stopped.
-    """
-
+    #: Speed; 1 is as recorded.
     rate: float = 1.0
+    #: Begin this long after the recording's start.
     start_offset_s: float = 0.0
+    #: Play these only.
     topics: Collection[str] | None = None
+    #: Leave these out.
     exclude: Collection[str] = ()
+    #: New names of topics, by recorded name.
     remap: Mapping[str, str] = field(default_factory=dict)
+    #: Publish the recording's time on /clock this often per second of real time.
     clock_hz: float | None = None
+    #: Begin again at the end, until stopped.
     loop: bool = False
 
 
 @dataclass(frozen=True)
 class PlayReport:
-    """What was published.
+    """What was published."""
 
-    Parameters
-    ----------
-    counts : Counter
-        Messages by recorded topic name.
-    passes : int
-        How often the recording was played to its end.
-    unread : int
-        Messages that the recording lists but that were not found in it.
-    worst_lateness_s : float
-        The longest that a message was published after its time [s].
-    """
-
+    #: Messages by recorded topic name.
     counts: Counter[str]
+    #: How often the recording was played to its end.
     passes: int = 0
+    #: Messages that the recording lists but that were not found in it.
     unread: int = 0
+    #: The longest that a message was published after its time.
     worst_lateness_s: float = 0.0
 
 
@@ -125,14 +106,7 @@ class Player:
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
-        """Wait until each of some topics has a subscriber.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Recorded names; if empty, all topics that are played.
-        timeout_s : float
-            How long to wait at most [s].
+        """Wait until each of some topics, by recorded name, has a subscriber; of all if empty.
 
         Raises
         ------
@@ -188,17 +162,8 @@ class Player:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
 
         The middleware resends lost messages only while their publisher exists: a process that
-        ends right after its last message loses it under load.
-
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait at most [s]. Fast DDS requests acknowledgements every 3 s.
-
-        Returns
-        -------
-        tuple of str
-            Topics with a subscriber that did not acknowledge all messages in time.
+        ends right after its last message loses it under load. Fast DDS requests acknowledgements
+        every 3 s. Returns the topics with a subscriber that did not acknowledge all in time.
         """
         deadline = time.monotonic() + timeout_s
         waiting = list(self._publishers.values())
