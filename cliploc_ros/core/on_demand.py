@@ -10,8 +10,8 @@ Each of these searches is another chance of a false accept. So a pose from a par
 needs a greater confidence, see cliploc_ros.core.acceptance.verdict.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,26 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 
 #: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
 BATCH = 4
-_NONE = np.empty(0, dtype=np.int64)
 _NO_LOOKS = Looks()
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The crops of one frame, which a search compares with the labels as it needs them.
+
+    Parameters
+    ----------
+    compare : callable
+        Takes the rows of m detections; returns their similarities (m, L).
+    known : ndarray (m,) of int
+        Detections whose similarities cost nothing; the first search has them.
+    room : callable
+        Returns how many crops to compare next; 0 ends.
+    """
+
+    compare: Callable[[NDArray[np.int64]], Similarities]
+    known: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    room: Callable[[], int] = lambda: BATCH
 
 
 def can_do_without_crops(options: RelocalizerOptions) -> bool:
@@ -37,47 +55,15 @@ def can_do_without_crops(options: RelocalizerOptions) -> bool:
     return options.algorithm == 'auto' and options.matching == 'hybrid'
 
 
-def stages_of(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
-              ) -> Iterator[Observation]:
-    """Yield an observation that has all similarities, at once or crop after crop.
+def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
+    """Return the crops on demand of an observation that has all similarities.
 
-    Crops on demand that a search does not need are withheld from it.
+    A search gets only those that it needs; None where the options give it all at once.
     """
     if options.crops != 'on_demand' or not can_do_without_crops(options):
-        return iter([observation])
+        return None
     recorded = np.asarray(observation.similarities)
-    return crops_on_demand(landmark_map, observation, lambda rows: recorded[rows])
-
-
-def crops_on_demand(landmark_map: LandmarkMap, observation: Observation,
-                    compare: Callable[[NDArray[np.int64]], Similarities],
-                    known: NDArray[np.int64] = _NONE,
-                    room: Callable[[], int] = lambda: BATCH) -> Iterator[Observation]:
-    """Yield an observation with the similarities of more and more of its crops.
-
-    Parameters
-    ----------
-    observation : Observation
-        Its similarities are ignored.
-    compare : callable
-        Takes the rows of m detections; returns their similarities (m, L).
-    known : ndarray (m,) of int, optional
-        Detections whose similarities cost nothing; the first observation has them.
-    room : callable, optional
-        Returns how many crops to compare next; 0 ends.
-
-    Yields
-    ------
-    Observation
-        The first one has no similarities but the known ones, the last one has all if time allows.
-    """
-    compared = known
-    yield replace(observation, similarities=compare(compared), compared=compared)
-    left = informative_first(landmark_map, observation)
-    left = left[~np.isin(left, known)]
-    while len(left) and (count := room()) > 0:
-        compared, left = np.append(compared, left[:count]), left[count:]
-        yield replace(observation, similarities=compare(compared), compared=compared)
+    return Crops(lambda rows: recorded[rows])
 
 
 def informative_first(landmark_map: LandmarkMap, observation: Observation) -> NDArray[np.int64]:
@@ -94,21 +80,50 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 
 
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
-                       observations: Iterable[Observation], looks: Looks = _NO_LOOKS,
-                       recognizer: ImageRecognizer | None = None
+                       observation: Observation, crops: Crops | None = None,
+                       looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
-    The observations, one at least, are the frame with more and more of its crops, see
-    crops_on_demand. Returns the frame with the crops that it took; the result's time is that of
-    all searches. Raises OptionsError, see Relocalizer.relocalize.
+    Parameters
+    ----------
+    relocalizer : Relocalizer
+    earlier : sequence of SearchedFrame
+        Frames before it, linked by odometry.
+    observation : Observation
+    crops : Crops, optional
+        They take the place of its similarities; without them it is localized once, as it is.
+    looks : Looks, optional
+        Results of earlier frames, which have to agree.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes.
+
+    Returns
+    -------
+    frame : SearchedFrame
+        With the crops that it took.
+    found : Relocalization
+        Its time is that of all searches.
+
+    Raises
+    ------
+    OptionsError
+        See Relocalizer.relocalize.
     """
-    search_ms = 0.0
-    for observation in observations:
+    search_ms, left = 0.0, np.empty(0, dtype=np.int64)
+    if crops is not None:
+        compared = crops.known
+        observation = replace(observation, similarities=crops.compare(compared),
+                              compared=compared)
+        left = informative_first(relocalizer.landmark_map, observation)
+        left = left[~np.isin(left, compared)]
+    while True:
         budget = relocalizer.begin(len(earlier) + 1)
         frame = relocalizer.search(observation, budget.search_end())
         found = relocalizer.locate([*earlier, frame], budget, looks, recognizer)
         search_ms += found.search_ms
-        if found.accepted:
-            break
-    return frame, replace(found, search_ms=search_ms)
+        if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
+            return frame, replace(found, search_ms=search_ms)
+        compared, left = np.append(compared, left[:count]), left[count:]
+        observation = replace(observation, similarities=crops.compare(compared),
+                              compared=compared)

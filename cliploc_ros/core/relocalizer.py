@@ -99,6 +99,11 @@ class Relocalizer:
         self._options = options
 
     @property
+    def landmark_map(self) -> LandmarkMap:
+        """Return the map."""
+        return self._map
+
+    @property
     def options(self) -> RelocalizerOptions:
         """Return the options."""
         return self._options

@@ -6,9 +6,8 @@ A session fuses each frame with the last few that odometry links to it, and acce
 where the successive looks are sure of it on average.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from cliploc_ros.core.geometry.tolerances import SAME_VIEW
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import localize_on_demand
+from cliploc_ros.core.on_demand import Crops, localize_on_demand
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
@@ -51,7 +50,7 @@ class Session:
         self.observation: Observation | None = None
 
     def localize(self, observation: Observation, run: int = 0, limit: int = 1,
-                 length_s: float = 0.0, more: Iterable[Observation] = (),
+                 length_s: float = 0.0, crops: Crops | None = None,
                  recognizer: ImageRecognizer | None = None) -> Relocalization:
         """Localize with a frame and, where odometry places it, with those before it.
 
@@ -68,9 +67,8 @@ class Session:
             The most frames to fuse, this one included.
         length_s : float
             Older frames are dropped [s].
-        more : iterable of Observation, optional
-            The same frame with more and more of its crops, taken until the pose is accepted, see
-            cliploc_ros.core.on_demand.
+        crops : Crops, optional
+            Of this frame, compared until the pose is accepted, see cliploc_ros.core.on_demand.
         recognizer : ImageRecognizer, optional
             Of the keyframes, for the image of this frame.
 
@@ -79,9 +77,8 @@ class Session:
         OptionsError
             See Relocalizer.relocalize. The session drops this frame.
         """
-        stages = chain([observation], more)
         if observation.odom_from_camera is None:
-            alone, found = localize_on_demand(self._relocalizer, (), stages,
+            alone, found = localize_on_demand(self._relocalizer, (), observation, crops,
                                               recognizer=recognizer)
             self.observation = alone.observation
             return found
@@ -90,8 +87,8 @@ class Session:
         self._run, self._stamp_ns = run, observation.stamp_ns
         earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
         newest, found = localize_on_demand(
-            self._relocalizer, [one.searched for one in earlier], stages, self._looks,
-            recognizer)
+            self._relocalizer, [one.searched for one in earlier], observation, crops,
+            self._looks, recognizer)
         self._frames = [*earlier, KeptFrame(newest, anchor)]
         self.observation = newest.observation
         if found.map_from_camera is not None:

@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import localize_on_demand, stages_of
+from cliploc_ros.core.on_demand import localize_on_demand, recorded_crops
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.bag_reader import BagReader
@@ -271,8 +271,8 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
     relocalizer = Relocalizer(landmark_map, method)
 
     def relocalize(observation: Observation) -> Relocalization:
-        return localize_on_demand(relocalizer, (),
-                                  stages_of(landmark_map, observation, method))[1]
+        return localize_on_demand(relocalizer, (), observation,
+                                  recorded_crops(observation, method))[1]
     return Reviewer(sequence, camera, observe, relocalize,
                     values['max_detections'],
                     str if options.wake_up_map is None else options.wake_up_map.landmark_of)

@@ -18,9 +18,8 @@ from cliploc_ros.core.keyframes.localization import (
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import stages_of
+from cliploc_ros.core.on_demand import recorded_crops
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
 from cliploc_ros.datasets.bag_messages import detections_of
@@ -107,22 +106,17 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
         image, seen = _seen(frame, parameters)
         recognizer = None if keyframes is None else ImageRecognizer(
             keyframes, query_features(image), seen.camera)
-        found = _localize(session, observe(image, seen), landmark_map, options, parameters,
-                          recognizer)
+        observation = observe(image, seen)
+        crops = recorded_crops(observation, options)
+        if observation.odom_from_camera is None:
+            found = session.localize(observation, crops=crops, recognizer=recognizer)
+        else:
+            found = session.localize(observation, 0, parameters['fuse_frames'],
+                                     parameters['fuse_window_s'], crops, recognizer)
     assert found is not None  # a case has a frame
     accepted = case.report.get('found') == 'accepted'
     reason = '' if accepted else str(case.report.get('reason', '')).rpartition(' [')[0]
     return Replayed(accepted, found.accepted, reason, found.reason)
-
-
-def _localize(session: Session, observation: Observation, landmark_map: LandmarkMap,
-              options: RelocalizerOptions, parameters: Mapping[str, Any],
-              recognizer: ImageRecognizer | None) -> Relocalization:
-    stages = stages_of(landmark_map, observation, options)
-    if observation.odom_from_camera is None:
-        return session.localize(next(stages), more=stages, recognizer=recognizer)
-    return session.localize(next(stages), 0, parameters['fuse_frames'],
-                            parameters['fuse_window_s'], stages, recognizer)
 
 
 def _seen(frame: CaseFrame, parameters: Mapping[str, Any]

@@ -21,7 +21,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import (
     can_do_without_crops,
     localize_on_demand,
-    stages_of,
+    recorded_crops,
 )
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -207,7 +207,7 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
         recognizer, spent_ms = None, 0.0
         if keyframes is not None and query.image is not None and method.keyframes:
             recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
-        found, crops_share = localize(landmark_map, relocalizer, query, recognizer)
+        found, crops_share = localize(relocalizer, query, recognizer)
         if recognizer is not None and query.image is not None:
             spent_ms = query.image.spent_ms + recognizer.spent_ms
         results.append(replace(_judge(landmark_map, method.name, trial, query, found, crops_share),
@@ -215,20 +215,20 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     return results
 
 
-def _localize(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query,
-              recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
+def _localize(relocalizer: Relocalizer, query: Query, recognizer: ImageRecognizer | None
+              ) -> tuple[Relocalization, float]:
     """Localize with all crops; return the result and the share of crops compared."""
     found = relocalizer.relocalize([*query.neighbours, query.observation], recognizer)
     return found, float(relocalizer.options.needs_similarities)
 
 
-def _localize_on_demand(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query,
+def _localize_on_demand(relocalizer: Relocalizer, query: Query,
                         recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
     """Localize as the node does: with each frame after those before it, crops on demand."""
     frames: list[SearchedFrame] = []
     for observation in (*query.neighbours, query.observation):
         frame, found = localize_on_demand(
-            relocalizer, frames, stages_of(landmark_map, observation, relocalizer.options),
+            relocalizer, frames, observation, recorded_crops(observation, relocalizer.options),
             recognizer=recognizer if observation is query.observation else None)
         frames.append(frame)
     crops = sum(len(one.observation.detections) for one in frames)

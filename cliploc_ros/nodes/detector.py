@@ -18,7 +18,7 @@ from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.inputs.image_source import ImageSource, TimedImage
+from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.parameters import Value

@@ -26,8 +26,7 @@ from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
-from cliploc_ros.ros.pipeline import Pipeline
-from cliploc_ros.ros.requests import Requests
+from cliploc_ros.ros.request import Pipeline, Requests
 
 _LOG_PERIOD_S = 5.0
 

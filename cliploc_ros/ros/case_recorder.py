@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
-from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.ros.answer import Answer, Verdict
@@ -40,13 +39,7 @@ class _Seen(NamedTuple):
 
 
 class CaseRecorder:
-    """The last frames that requests looked at; older ones are forgotten.
-
-    Parameters
-    ----------
-    keeps : bool
-        Whether to keep frames at all: false costs no memory.
-    """
+    """The last frames that requests looked at, if it keeps any; older ones are forgotten."""
 
     def __init__(self, keeps: bool) -> None:
         self._keeps = keeps
@@ -77,11 +70,6 @@ class CaseRecorder:
     def store(self, values: Mapping[str, Any]) -> str:
         """Store the last request in record_folder; return what was stored, in one line.
 
-        Parameters
-        ----------
-        values : mapping
-            The relocalizer's parameters.
-
         Raises
         ------
         NoCaseError
@@ -99,7 +87,11 @@ class CaseRecorder:
                                ) from error
         seen, last = self._linked()
         folder = _made_folder(values['record_folder'])
-        case = Case(tuple(_case_frame(one) for one in seen), _report(seen[-1], last, values))
+        found = seen[-1].answer
+        case = Case(tuple(_case_frame(one) for one in seen), {
+            'verdict': str(last.verdict), 'message': last.message, 'found': str(found.verdict),
+            'reason': found.detail, 'map_hash': found.map_hash, 'parameters': dict(values),
+            'options': asdict(relocalizer_options(values))})
         _check_room(folder, case, values['record_limit_mb'])
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}'
@@ -136,27 +128,17 @@ def _case_frame(seen: _Seen) -> 'CaseFrame':
     frame, state = seen.frame, seen.answer.state
     place = None if state is None else state.place
     kind = 'Image' if isinstance(frame.image, Image) else 'CompressedImage'
+    detections = frame.detections
+    if any(one.bbox.center.theta != 0.0 for one in detections.detections):
+        # only rclpy's reader understands turned boxes
+        detections = detections_to_msg(detections_from_msg(detections), detections.header)
     return CaseFrame(
         stamp_ns(frame.image.header.stamp), f'sensor_msgs/msg/{kind}',
         image=bytes(serialize_message(frame.image)),
         camera_info=bytes(serialize_message(frame.camera_info)),
-        detections=bytes(serialize_message(_upright(frame.detections))),
+        detections=bytes(serialize_message(detections)),
         up_in_camera=None if state is None else state.up_in_camera,
         odom_from_camera=None if place is None else place.odom_from_camera)
-
-
-def _upright(msg: Detection2DArray) -> Detection2DArray:
-    """Return detections without turned boxes, which only rclpy's reader understands."""
-    if all(one.bbox.center.theta == 0.0 for one in msg.detections):
-        return msg
-    return detections_to_msg(detections_from_msg(msg), msg.header)
-
-
-def _report(newest: _Seen, last: Answer, values: Mapping[str, Any]) -> dict[str, Any]:
-    return {'verdict': str(last.verdict), 'message': last.message,
-            'found': str(newest.answer.verdict), 'reason': newest.answer.detail,
-            'map_hash': newest.answer.map_hash, 'parameters': dict(values),
-            'options': asdict(relocalizer_options(values))}
 
 
 def _made_folder(name: str) -> Path:

@@ -4,8 +4,7 @@
 
 import math
 import time
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, split_similarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import BATCH, can_do_without_crops, crops_on_demand
+from cliploc_ros.core.on_demand import BATCH, Crops, can_do_without_crops, informative_first
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -46,30 +45,20 @@ _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 
 
 class Localized(NamedTuple):
-    """The result of one frame.
+    """The result of one frame."""
 
-    Parameters
-    ----------
-    found : Relocalization
-        In the coordinate frame of the map.
-    landmark_map : LandmarkMap
-        Of several maps, the one of the best pose.
-    seen : SeenImage
-        With the crops that were compared, and their similarities to this map.
-    compared : int
-        Number of crops that were compared with labels.
-    is_cut : bool
-        Whether there was no time for the other crops, which could have helped.
-    for_filter : ndarray (6, 6) or None
-        Covariance for a filter that fuses all accepted poses: in continuous mode, that of what is
-        new, see cliploc_ros.core.succession.
-    """
-
+    #: In the coordinate frame of the map.
     found: Relocalization
+    #: Of several maps, the one of the best pose.
     landmark_map: LandmarkMap
+    #: With the crops that were compared, and their similarities to this map.
     seen: SeenImage
+    #: Number of crops that were compared with labels.
     compared: int
+    #: Whether there was no time for the other crops, which could have helped.
     is_cut: bool
+    #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
+    #: the new information, see cliploc_ros.core.succession.
     for_filter: NDArray[np.float64] | None
 
 
@@ -147,17 +136,8 @@ class Localizer:
                  times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        Parameters
-        ----------
-        frame : Frame
-        values : mapping
-            The relocalizer's parameters, as they are now.
-        state : RobotState
-            At the stamp of the frame.
-        times : StageTimes
-            Of this frame.
-        deadline : float
-            When to stop comparing crops (monotonic clock) [s].
+        `values` are the relocalizer's parameters as they are now, `state` is that at the stamp of
+        the frame. No crops are compared after `deadline` (monotonic clock) [s].
 
         Raises
         ------
@@ -179,15 +159,15 @@ class Localizer:
             odom_way_m=0.0 if place is None else place.way_m)
         options = relocalizer_options(values)
         session = self._session_for(options)
-        times.begin('search')
-        stages = self._stages(image, observation, options, times, deadline)
+        crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, camera, deadline, times)
+        times.begin('search')
         if place is None:
-            found = session.localize(next(stages), more=stages, recognizer=recognizer)
+            found = session.localize(observation, crops=crops, recognizer=recognizer)
         else:
-            found = session.localize(next(stages), place.run, values['fuse_frames'],
-                                     values['fuse_window_s'], stages, recognizer)
+            found = session.localize(observation, place.run, values['fuse_frames'],
+                                     values['fuse_window_s'], crops, recognizer)
         seen = session.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
@@ -199,39 +179,42 @@ class Localizer:
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
                          for_filter)
 
-    def _stages(self, image: NDArray[np.uint8], observation: Observation,
-                options: RelocalizerOptions, times: StageTimes, deadline: float
-                ) -> Iterator[Observation]:
-        """Return the observation with more and more of its crops, or at once as it is localized.
+    def _crops(self, image: NDArray[np.uint8], observation: Observation,
+               options: RelocalizerOptions, times: StageTimes, deadline: float
+               ) -> tuple[Crops | None, Observation]:
+        """Return crops that the search compares as it needs them, or a frame with compared crops.
 
         The paper's algorithms compare all crops, however long that takes.
         """
-        observer, detections = self._observer, observation.detections
+        observer, boxes = self._observer, observation.detections.bboxes_xyxy
         if observer is None:
-            return iter([observation])
+            return None, observation
         if not can_do_without_crops(options):
             times.begin('CLIP')
-            seen = observer.observe(image, observation.camera, detections, observation.stamp_ns)
-            times.begin('search')
-            return iter([replace(observation, similarities=seen.similarities)])
-        on_demand = options.crops == 'on_demand'
-        crops = observer.crops(image, detections.bboxes_xyxy) if on_demand \
-            else ObservedCrops(observer, image, detections.bboxes_xyxy, {})
+            seen = observer.observe(image, observation.camera, observation.detections,
+                                    observation.stamp_ns)
+            return None, replace(observation, similarities=seen.similarities)
         end = deadline - _ANSWER_S - min(_SEARCHES * options.time_budget_s,
                                          _MOST_SHARE * (deadline - time.monotonic()))
+        if options.crops == 'on_demand':
+            crops = observer.crops(image, boxes)
 
-        def compare(rows: NDArray[np.int64]) -> Similarities:
-            times.begin('CLIP')
-            similarities = crops.compare(rows)
-            times.begin('search')
-            return similarities
+            def compare(rows: NDArray[np.int64]) -> Similarities:
+                times.begin('CLIP')
+                similarities = crops.compare(rows)
+                times.begin('search')
+                return similarities
 
-        def room() -> int:
-            fitting = observer.crops_within(end - time.monotonic())
-            return min(BATCH, fitting) if on_demand else fitting
-
-        stages = crops_on_demand(self._map, observation, compare, crops.known, room)
-        return stages if on_demand else iter(deque(stages, maxlen=1))
+            return Crops(compare, crops.known, lambda: min(
+                BATCH, observer.crops_within(end - time.monotonic()))), observation
+        times.begin('CLIP')
+        every = ObservedCrops(observer, image, boxes, {})
+        rows, count = informative_first(self._map, observation), 0
+        while count < len(rows) and (room := observer.crops_within(end - time.monotonic())) > 0:
+            count += room
+            every.compare(rows[:count])
+        return None, replace(observation, similarities=every.compare(rows[:count]),
+                             compared=rows[:count])
 
     def _session_for(self, options: RelocalizerOptions) -> Session:
         """Return the session; other options begin a new one."""

@@ -15,7 +15,7 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.pipeline import Pipeline
+from cliploc_ros.ros.request import Pipeline
 
 
 class MapServices:

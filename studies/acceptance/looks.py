@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import stages_of
+from cliploc_ros.core.on_demand import recorded_crops
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
@@ -67,8 +67,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
-            stages = stages_of(landmark_map, look, options)
-            found = session.localize(next(stages), more=stages)
+            found = session.localize(look, crops=recorded_crops(look, options))
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
                 replace(found.evidence, earlier=()), options))

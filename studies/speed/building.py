@@ -27,7 +27,7 @@ from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.on_demand import crops_on_demand, localize_on_demand
+from cliploc_ros.core.on_demand import Crops, localize_on_demand
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -152,9 +152,10 @@ def _localize(query: Query, where: Searched, options: argparse.Namespace) -> Rel
         return CropSimilarities(query.crops[rows], where.labels)
 
     observation = query.observation
-    stages = crops_on_demand(where.landmark_map, observation, compare) if options.on_demand \
-        else [replace(observation, similarities=compare(np.arange(len(query.crops))))]
-    return localize_on_demand(where.relocalizer, (), stages)[1]
+    if options.on_demand:
+        return localize_on_demand(where.relocalizer, (), observation, Crops(compare))[1]
+    observation = replace(observation, similarities=compare(np.arange(len(query.crops))))
+    return localize_on_demand(where.relocalizer, (), observation)[1]
 
 
 def simulate(options: argparse.Namespace

@@ -13,10 +13,10 @@ from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.on_demand import (
     BATCH,
-    crops_on_demand,
+    Crops,
     informative_first,
     localize_on_demand,
-    stages_of,
+    recorded_crops,
 )
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -30,8 +30,28 @@ VIEW = Observation(CAMERA, SEEN, SURE)
 
 
 def localize(options, observation=VIEW):
-    return localize_on_demand(Relocalizer(ROOM, options), (),
-                              stages_of(ROOM, observation, options))
+    return localize_on_demand(Relocalizer(ROOM, options), (), observation,
+                              recorded_crops(observation, options))
+
+
+class Searches(Relocalizer):
+    """A relocalizer that keeps the observations of its searches."""
+
+    def __init__(self, options=OPTIONS):
+        super().__init__(ROOM, options)
+        self.seen = []
+
+    def search(self, observation, deadline=np.inf):
+        self.seen.append(observation)
+        return super().search(observation, deadline)
+
+
+def searches(crops, observation=VIEW):
+    """Return the observations of each search of a frame that no search accepts."""
+    relocalizer = Searches(replace(OPTIONS, min_confidence=1.0))
+    frame, found = localize_on_demand(relocalizer, (), observation, crops)
+    assert not found.accepted and frame.observation is relocalizer.seen[-1]
+    return relocalizer.seen
 
 
 def poses_of(found):
@@ -47,7 +67,7 @@ def test_the_crops_that_say_most_come_first():
 
 
 def test_each_stage_has_more_crops_and_the_last_one_all():
-    stages = list(crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], np.array([5])))
+    stages = searches(Crops(lambda rows: SURE[rows], np.array([5])))
     assert [len(one.compared) for one in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
     assert stages[0].compared.tolist() == [5], 'what is known costs nothing'
     assert sorted(stages[-1].compared) == list(range(len(SEEN)))
@@ -60,11 +80,11 @@ def test_each_stage_has_more_crops_and_the_last_one_all():
 
 def test_crops_end_when_there_is_no_room():
     rooms = iter([3, 0])
-    stages = list(crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: next(rooms)))
+    stages = searches(Crops(lambda rows: SURE[rows], room=lambda: next(rooms)))
     assert [len(one.compared) for one in stages] == [0, 3]
     none = Observation(CAMERA, SEEN.select(np.array([], dtype=np.int64)))
-    (stage,) = crops_on_demand(ROOM, none, lambda rows: SURE[rows])
-    assert not Relocalizer(ROOM, OPTIONS).relocalize([stage]).accepted
+    (stage,) = searches(Crops(lambda rows: SURE[rows]), none)
+    assert len(stage.compared) == 0
 
 
 @pytest.mark.parametrize('embedded', [False, True])
@@ -72,7 +92,7 @@ def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
     """Of an array and of embeddings."""
     unit = np.eye(len(ROOM), dtype=np.float32)
     labels = LabelEmbeddings.of(unit)
-    *_, last = stages = list(crops_on_demand(ROOM, VIEW, lambda rows: CropSimilarities(
+    *_, last = stages = searches(Crops(lambda rows: CropSimilarities(
         unit[rows], labels) if embedded else unit[rows]))
     hybrid = Relocalizer(ROOM, RelocalizerOptions())
     by_class = Relocalizer(ROOM, RelocalizerOptions(matching='class')).relocalize([VIEW])
@@ -105,8 +125,8 @@ def test_an_early_stop_is_surer_than_the_last_one():
 def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     sure = localize(OPTIONS)[1].confidence
     options = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
-    stages = crops_on_demand(ROOM, VIEW, lambda rows: SURE[rows], room=lambda: 0)
-    _, found = localize_on_demand(Relocalizer(ROOM, options), (), stages)
+    crops = Crops(lambda rows: SURE[rows], room=lambda: 0)
+    _, found = localize_on_demand(Relocalizer(ROOM, options), (), VIEW, crops)
     assert found.confidence == sure > options.min_confidence
     assert not found.accepted and 'without 12 crops; raise timeout_s' in found.reason
     assert found.refusal_kind == 'not_all_crops'
@@ -116,7 +136,9 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     RelocalizerOptions(crops='all'), RelocalizerOptions(matching='clip'),
     RelocalizerOptions(algorithm='b-prosac', iterations=100)])
 def test_other_methods_see_all_crops_at_once(options):
-    assert list(stages_of(ROOM, VIEW, options)) == [VIEW]
+    assert recorded_crops(VIEW, options) is None
+    frame, _ = localize(options)
+    assert frame.observation is VIEW
 
 
 def test_similarities_of_another_number_of_crops_are_named():
@@ -133,7 +155,7 @@ def test_real_boxes_need_a_part_of_their_crops(office_map, queries, observe):
         for crops, found in verdicts.items():
             options = RelocalizerOptions(crops=crops)
             searched, result = localize_on_demand(
-                Relocalizer(office_map, options), (), stages_of(office_map, view, options))
+                Relocalizer(office_map, options), (), view, recorded_crops(view, options))
             right = result.solved and pose_error(result.map_from_camera,
                                                  frame.map_from_camera)[0] < 1.0
             found.append((result.accepted, right))

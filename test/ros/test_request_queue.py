@@ -27,7 +27,7 @@ from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameter_tables import RELOCALIZER
-from cliploc_ros.ros.requests import Requests
+from cliploc_ros.ros.request import Requests
 
 
 class Answering(ManagedNode):

@@ -33,15 +33,23 @@ class CoordinateFrames:
         self._node = node
         self._buffer: TransformBuffer | None = None
 
-    def open(self) -> None:
-        """Listen to transforms, so that those of the first image are known.
+    def open(self) -> 'TransformBuffer':
+        """Listen to transforms from now on, so that those of the first image are known.
 
         Raises
         ------
         NoTransformError
             tf2_ros is not installed.
         """
-        self._opened()
+        buffer = self._buffer
+        if buffer is None:
+            try:
+                from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
+            except ImportError as error:
+                raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
+                                       'install it, or set base_from_camera') from error
+            buffer = self._buffer = TransformBuffer(self._node)
+        return buffer
 
     def close(self) -> None:
         """Stop listening, and forget all transforms."""
@@ -65,9 +73,7 @@ class CoordinateFrames:
             Empty: the camera itself.
         mount : list of float
             base_from_camera as x, y, z [m] and quaternion x, y, z, w; all zeros: ask tf2.
-        camera_frame : str
-            frame_id of the image.
-        stamp : Time
+        camera_frame, stamp
             Of the image: the mount may move.
         timeout_s : float
             How long to wait for tf2 [s].
@@ -86,23 +92,16 @@ class CoordinateFrames:
 
     def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float,
                remedy: str = 'set base_from_camera') -> NDArray[np.float64]:
-        """Return target_from_source (4, 4) by tf2 at a stamp.
+        """Return target_from_source (4, 4) by tf2 at a stamp, which may take `timeout_s`.
 
-        Parameters
-        ----------
-        target_frame, source_frame : str
-        stamp : Time
-        timeout_s : float
-            How long to wait for it [s].
-        remedy : str
-            What helps besides publishing it.
+        The error says to publish it, or `remedy`.
 
         Raises
         ------
         NoTransformError
             tf2 is not installed or has no such transform in time.
         """
-        buffer = self._opened()
+        buffer = self.open()
         try:
             found = buffer.lookup_transform(target_frame, source_frame, RclTime.from_msg(stamp),
                                             Duration(seconds=timeout_s)).transform
@@ -112,15 +111,3 @@ class CoordinateFrames:
                 f'{remedy}') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
-
-    def _opened(self) -> 'TransformBuffer':
-        """Return the buffer, which listens from now on."""
-        buffer = self._buffer
-        if buffer is None:
-            try:
-                from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
-            except ImportError as error:
-                raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
-                                       'install it, or set base_from_camera') from error
-            buffer = self._buffer = TransformBuffer(self._node)
-        return buffer

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from the wire: image, camera_info and detections of the same stamp."""
+"""Frames from the wire: image, camera_info and detections of one stamp; images alone."""
 
 import math
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -42,20 +42,12 @@ class NoFrameError(CliplocError):
 
 @dataclass(frozen=True)
 class Frame:
-    """The messages of one stamp.
-
-    Parameters
-    ----------
-    image : Image or CompressedImage
-    camera_info : CameraInfo
-    detections : Detection2DArray
-    received_at, detected_at : float
-        When the image arrived, and when its detections did (monotonic clock) [s].
-    """
+    """The messages of one stamp."""
 
     image: Image | CompressedImage
     camera_info: CameraInfo
     detections: Detection2DArray
+    #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
 
@@ -140,10 +132,7 @@ class FrameSource:
     def next_frame(self, after: float, deadline: float) -> Frame:
         """Return the first complete frame whose image arrived after a moment.
 
-        Parameters
-        ----------
-        after, deadline : float
-            Of the monotonic clock [s].
+        Both times are of the monotonic clock [s].
 
         Raises
         ------
@@ -279,3 +268,59 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self._topics[name]))
+
+
+class TimedImage(NamedTuple):
+    """An image, and when it arrived (monotonic clock) [s]."""
+
+    msg: Image | CompressedImage
+    received_at: float
+
+
+class ImageSource:
+    """Subscribes to images, 'raw' or 'compressed', while it is open.
+
+    `on_image` takes each TimedImage, in the executor's thread.
+    """
+
+    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None]
+                 ) -> None:
+        self._node = node
+        self._type = Image if transport == 'raw' else CompressedImage
+        self._name = 'image' if transport == 'raw' else 'image/compressed'
+        self._on_image = on_image
+        self._subscription: AdaptiveSubscription | None = None
+        self._heard_at = 0.0
+        self.received = 0
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether it subscribes."""
+        return self._subscription is not None
+
+    def open(self) -> None:
+        """Subscribe, if it does not yet."""
+        if self._subscription is None:
+            self._heard_at = time.monotonic()  # silence counts from here
+            self._subscription = AdaptiveSubscription(self._node, self._type, self._name,
+                                                      self._take, qos.IMAGE)
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+
+    def examine(self, health: Health, stale_after_s: float) -> None:
+        """Report a topic without a publisher, and silence."""
+        topic = self._node.resolve_topic_name(self._name)
+        silent_s = time.monotonic() - self._heard_at
+        if self._node.count_publishers(topic) == 0:
+            health.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
+        elif self.is_open and silent_s > stale_after_s:
+            health.warn(f'no image on {topic} for {silent_s:.1f} s')
+
+    def _take(self, msg: Image | CompressedImage) -> None:
+        self.received += 1
+        self._heard_at = time.monotonic()
+        self._on_image(TimedImage(msg, self._heard_at))

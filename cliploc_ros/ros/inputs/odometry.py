@@ -38,32 +38,19 @@ MOMENT_PATIENCE_S = 2.0
 
 
 class BodyPose(NamedTuple):
-    """Where odometry had the robot at the stamp of an image.
-
-    Parameters
-    ----------
-    odom_from_body : ndarray (4, 4)
-    body_frame : str
-        The coordinate frame that odometry tracks (child_frame_id).
-    run : int
-        Poses of one run share their odometry frame; those of different runs do not compare.
-    way_m : float
-        Driven since the run began [m].
-    """
+    """Where odometry had the robot at the stamp of an image."""
 
     odom_from_body: NDArray[np.float64]
+    #: The coordinate frame that odometry tracks (child_frame_id).
     body_frame: str
+    #: Poses of one run share their odometry frame; those of different runs do not compare.
     run: int
+    #: Driven since the run began.
     way_m: float
 
 
 class OdometrySource:
-    """Subscribes to odometry while the node is active: it costs little, and links frames.
-
-    Parameters
-    ----------
-    node : Node
-    """
+    """Subscribes to odometry while the node is active: it costs little, and links frames."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -88,11 +75,8 @@ class OdometrySource:
     def on_restart(self, callback: Callable[[int], None]) -> None:
         """Have each restart of odometry reported: its poses are not related to those before.
 
-        Parameters
-        ----------
-        callback : callable
-            Takes the stamp of the first message after the restart [ns]. Called in the thread that
-            takes odometry; it must not block. What this node itself forgets is not reported.
+        The callback takes the stamp of the first message after the restart [ns], in the thread
+        that takes odometry; it must not block. What this node itself forgets is not reported.
         """
         self._on_restart.append(callback)
 
@@ -136,16 +120,10 @@ class OdometrySource:
                 callback(at_ns)
 
     def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
-        """Return the newest message, or the next one if that arrives in time; else None.
+        """Return the newest message, if it is not older than `max_age_s` by its arrival.
 
-        Parameters
-        ----------
-        max_age_s : float
-            The newest message counts if it arrived at most this long ago [s].
-        patience_s : float
-            How long to wait for another one [s].
-
-        Returns at once where nobody publishes odometry.
+        Else the next one if that arrives within `patience_s`, else None; at once where nobody
+        publishes odometry.
         """
         def is_recent() -> bool:
             return (self._newest is not None

@@ -28,48 +28,29 @@ _DISCOVERY_S = 1.0
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where odometry had the camera.
-
-    Parameters
-    ----------
-    odom_from_camera : ndarray (4, 4)
-    run : int
-        Places of one run share their odometry frame.
-    way_m : float
-        Driven since the run began [m].
-    """
+    """Where odometry had the camera."""
 
     odom_from_camera: NDArray[np.float64]
+    #: Places of one run share their odometry frame.
     run: int
+    #: Driven since the run began.
     way_m: float
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The robot at the stamp of one image.
+    """The robot at the stamp of one image."""
 
-    Parameters
-    ----------
-    camera_from_base : ndarray (4, 4)
-        The mount; identity where the camera's own pose is wanted.
-    up_in_camera : ndarray (3,) or None
-        The vertical, a unit vector in the camera's optical frame; None where it is not known.
-    place : CameraPlace or None
-        None where odometry does not cover the image.
-    """
-
+    #: The mount (4, 4); identity where the camera's own pose is wanted.
     camera_from_base: NDArray[np.float64]
+    #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
     up_in_camera: NDArray[np.float64] | None = None
+    #: None where odometry does not cover the image.
     place: CameraPlace | None = None
 
 
 class RobotStateSource:
-    """Gathers the mount, the vertical and odometry while the node is active.
-
-    Parameters
-    ----------
-    node : ManagedNode
-    """
+    """Gathers the mount, the vertical and odometry while the node is active."""
 
     def __init__(self, node: ManagedNode) -> None:
         self._node = node
@@ -102,12 +83,7 @@ class RobotStateSource:
     def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
         """Return whether odometry can link the frame that follows an image.
 
-        Parameters
-        ----------
-        stamp : Time
-            Of the image.
-        deadline : float
-            When to stop waiting for odometry that has just begun (monotonic clock) [s].
+        Waits for odometry that has just begun, until `deadline` (monotonic clock) [s].
         """
         patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
         return (self._node.settings['fuse_frames'] > 1
@@ -119,15 +95,8 @@ class RobotStateSource:
 
         Without a vertical, or without odometry, the search does without.
 
-        Parameters
-        ----------
-        image : Header
-            Of the image.
-        values : mapping
-            The relocalizer's parameters.
-        deadline : float
-            Of the request (monotonic clock) [s]; half of the time until then may pass while the
-            mount is not known, and half remains for a newer image.
+        While the mount is not known, half of the time until `deadline` (monotonic clock) [s] may
+        pass, and half remains for a newer image.
 
         Raises
         ------
@@ -135,7 +104,13 @@ class RobotStateSource:
             The mount is not known.
         """
         camera_from_base = self._mount(image, values, deadline)
-        return RobotState(camera_from_base, self._up(image, values, camera_from_base),
+        up_in_camera = None
+        try:
+            up_in_camera = self._vertical.up_in_camera(values, camera_from_base, image.frame_id,
+                                                       image.stamp)
+        except (NoVerticalError, NoTransformError) as error:
+            self._warn(f'localizing without the vertical: {error}')
+        return RobotState(camera_from_base, up_in_camera,
                           self._place(image, values, camera_from_base))
 
     def _mount(self, image: Header, values: Mapping[str, Any], deadline: float
@@ -155,15 +130,6 @@ class RobotStateSource:
                 self._node.check_active()
                 time.sleep(_RETRY_S)
 
-    def _up(self, image: Header, values: Mapping[str, Any],
-            camera_from_base: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        try:
-            return self._vertical.up_in_camera(values, camera_from_base, image.frame_id,
-                                               image.stamp)
-        except (NoVerticalError, NoTransformError) as error:
-            self._warn(f'localizing without the vertical: {error}')
-            return None
-
     def _place(self, image: Header, values: Mapping[str, Any],
                camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
         if values['fuse_frames'] == 1:
@@ -172,8 +138,15 @@ class RobotStateSource:
             body = self.odometry.pose_at(image.stamp)
             if body.body_frame == image.frame_id:
                 return CameraPlace(body.odom_from_body, body.run, body.way_m)
-            camera_from_body = camera_from_base if body.body_frame == values['base_frame'] \
-                else self._camera_from_body(image, body.body_frame, values['tf_timeout_s'])
+            camera_from_body = camera_from_base
+            if body.body_frame != values['base_frame']:
+                # do not wait again for a transform that tf2 did not know the last time
+                is_new = self._unmounted != body.body_frame
+                self._unmounted = body.body_frame
+                camera_from_body = self.transforms.lookup(
+                    image.frame_id, body.body_frame, image.stamp,
+                    values['tf_timeout_s'] if is_new else 0.0)
+                self._unmounted = ''
         except NoOdometryError as error:
             self._node.get_logger().debug(f'one frame alone: {error}')
             return None
@@ -182,16 +155,6 @@ class RobotStateSource:
             return None
         return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run,
                            body.way_m)
-
-    def _camera_from_body(self, image: Header, body_frame: str, timeout_s: float
-                          ) -> NDArray[np.float64]:
-        """Ask tf2; do not wait again for what it did not know the last time."""
-        known = self._unmounted != body_frame
-        self._unmounted = body_frame
-        camera_from_body = self.transforms.lookup(image.frame_id, body_frame, image.stamp,
-                                            timeout_s if known else 0.0)
-        self._unmounted = ''
-        return camera_from_body
 
     def _warn(self, text: str) -> None:
         self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)

@@ -39,11 +39,7 @@ class TimeJumps:
     A change of `use_sim_time` counts as a jump, too. Without simulated time the clock does not
     report jumps: what listens to stamped messages also has to watch their stamps.
 
-    Parameters
-    ----------
-    node : Node
-    forget : callable
-        Called after each jump, in the thread that takes `/clock`. It must not block.
+    `forget` is called after each jump, in the thread that takes `/clock`. It must not block.
     """
 
     def __init__(self, node: Node, forget: Callable[[], None]) -> None:
@@ -59,14 +55,8 @@ class TimeJumps:
     def check(self, stamp: Time, received_at: float) -> None:
         """Raise TimeJumpError if a message is from before the last jump.
 
-        It may arrive after the clock's: then its stamp is in the future.
-
-        Parameters
-        ----------
-        stamp : Time
-            Of the message.
-        received_at : float
-            When it arrived (monotonic clock) [s].
+        It may arrive, at `received_at` (monotonic clock) [s], after the clock's: then its stamp is
+        in the future.
         """
         jump = self._last
         if not jump.name:

@@ -44,19 +44,12 @@ class NoVerticalError(CliplocError):
 
 
 class Sample(NamedTuple):
-    """What an IMU measured at one instant, in its own coordinate frame; at least one of both.
-
-    Parameters
-    ----------
-    stamp_ns : int
-    up : ndarray (3,) or None
-        A unit vector, by the orientation.
-    acceleration : ndarray (3,) or None
-        [m/s^2]; at rest it points up (REP 145).
-    """
+    """What an IMU measured at one instant, in its own coordinate frame; at least one of both."""
 
     stamp_ns: int
+    #: A unit vector (3,), by the orientation.
     up: NDArray[np.float64] | None
+    #: (3,) [m/s^2]; at rest it points up (REP 145).
     acceleration: NDArray[np.float64] | None
 
 
@@ -67,31 +60,19 @@ def sample_from_msg(msg: Imu) -> Sample | None:
     acceleration at all, or no rotation with a covariance of zeros. The latter may be a
     measurement, but then the acceleration says the same.
     """
-    up, acceleration = _up(msg), _acceleration(msg)
-    if up is None and acceleration is None:
+    q, a = msg.orientation, msg.linear_acceleration
+    quat_xyzw, acceleration = np.array([q.x, q.y, q.z, q.w]), np.array([a.x, a.y, a.z])
+    is_default = np.array_equal(quat_xyzw, [0.0, 0.0, 0.0, 1.0]) \
+        and not np.any(msg.orientation_covariance)
+    has_up = (msg.orientation_covariance[0] != _NOT_MEASURED and not is_default
+              and abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01)
+    has_acceleration = (msg.linear_acceleration_covariance[0] != _NOT_MEASURED
+                        and acceleration.any() and np.isfinite(acceleration).all())
+    if not has_up and not has_acceleration:
         return None
-    return Sample(stamp_ns(msg.header.stamp), up, acceleration)
-
-
-def _up(msg: Imu) -> NDArray[np.float64] | None:
-    """Return up by the orientation; None if that is missing."""
-    q, covariance = msg.orientation, msg.orientation_covariance
-    quat_xyzw = np.array([q.x, q.y, q.z, q.w])
-    is_default = np.array_equal(quat_xyzw, [0.0, 0.0, 0.0, 1.0]) and not np.any(covariance)
-    if (covariance[0] == _NOT_MEASURED or is_default
-            or not abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01):
-        return None
-    return np.asarray(Rotation.from_quat(quat_xyzw).inv().apply(_UP))
-
-
-def _acceleration(msg: Imu) -> NDArray[np.float64] | None:
-    """Return the acceleration; None if that is missing."""
-    a = msg.linear_acceleration
-    acceleration = np.array([a.x, a.y, a.z])
-    if (msg.linear_acceleration_covariance[0] == _NOT_MEASURED or not acceleration.any()
-            or not np.isfinite(acceleration).all()):
-        return None
-    return acceleration
+    return Sample(stamp_ns(msg.header.stamp),
+                  np.asarray(Rotation.from_quat(quat_xyzw).inv().apply(_UP)) if has_up else None,
+                  acceleration if has_acceleration else None)
 
 
 class VerticalSource:
@@ -101,11 +82,7 @@ class VerticalSource:
     But many drivers leave the orientation at its default, or fill it wrongly. It has to agree
     with the acceleration at rest, where the IMU measures both.
 
-    Parameters
-    ----------
-    node : Node
-    transforms : CoordinateFrames
-        Knows how the camera and the IMU are mounted.
+    `transforms` knows how the camera and the IMU are mounted.
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
@@ -152,21 +129,7 @@ class VerticalSource:
                      camera_frame: str, stamp: Time) -> NDArray[np.float64] | None:
         """Return the vertical (3,), a unit vector in the camera's optical coordinate frame.
 
-        Parameters
-        ----------
-        values : mapping
-            The relocalizer's parameters.
-        camera_from_base : ndarray (4, 4)
-            How the camera is mounted.
-        camera_frame : str
-            frame_id of the image.
-        stamp : Time
-            Of the image.
-
-        Returns
-        -------
-        ndarray (3,) or None
-            None where gravity is 'none'.
+        None where gravity is 'none'. `camera_frame` and `stamp` are those of the image.
 
         Raises
         ------
@@ -204,33 +167,25 @@ class VerticalSource:
             raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: fill it')
         ups = [one.up for one in near if one.up is not None]
         if not ups:
-            return _up_by_gravity([one.acceleration for one in near
-                                   if one.acceleration is not None]), frame
+            mean = np.mean([one.acceleration for one in near if one.acceleration is not None],
+                           axis=0)
+            if not _is_gravity(mean):
+                raise NoVerticalError(
+                    f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest it '
+                    f'measures {_STANDARD_GRAVITY:.2f}')
+            return np.asarray(mean / np.linalg.norm(mean)), frame
         contradiction_deg = _contradiction_deg(samples)
         if contradiction_deg > _MAX_CONTRADICTION_DEG:
             raise NoVerticalError(
                 f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
                 f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
                 'orientation_covariance[0] to -1')
-        return _mean_up(ups), frame
-
-
-def _mean_up(ups: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the mean (3,) of unit vectors (n, 3)."""
-    mean = np.mean(ups, axis=0)
-    length = float(np.linalg.norm(mean))
-    if not length > _MIN_MEAN_LENGTH:
-        raise NoVerticalError('the IMU turns too fast: its orientations about the image differ')
-    return np.asarray(mean / length)
-
-
-def _up_by_gravity(accelerations: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return up (3,) by accelerations (n, 3)."""
-    mean = np.mean(accelerations, axis=0)
-    if not _is_gravity(mean):
-        raise NoVerticalError(f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, '
-                              f'at rest it measures {_STANDARD_GRAVITY:.2f}')
-    return np.asarray(mean / np.linalg.norm(mean))
+        mean = np.mean(ups, axis=0)
+        length = float(np.linalg.norm(mean))
+        if not length > _MIN_MEAN_LENGTH:
+            raise NoVerticalError(
+                'the IMU turns too fast: its orientations about the image differ')
+        return np.asarray(mean / length), frame
 
 
 def _is_gravity(acceleration: NDArray[np.float64]) -> bool:

@@ -31,33 +31,22 @@ _FOREIGN_NAMES = ('use_sim_time', 'start_type_description_service')
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter of a node.
-
-    Parameters
-    ----------
-    name : str
-    default : str, int, float, bool, list of float or list of str
-        Its type is the parameter's. A list of texts may have any length, and ROS knows the type of
-        one that is not empty only: [''] stands for none.
-    description : str
-        One sentence in prose.
-    unit : str
-        SI symbol, px or ''.
-    low, high : float
-        Range of a number, ends included.
-    choices : tuple of str
-        The allowed values of a text; empty allows any.
-    read_only : bool
-        Read at start-up only. The others change at run time.
-    """
+    """One parameter of a node."""
 
     name: str
+    #: Its type is the parameter's. A list of texts may have any length, and ROS knows the type of
+    #: one that is not empty only: [''] stands for none.
     default: Value
+    #: One sentence in prose.
     description: str
+    #: SI symbol, px or ''.
     unit: str = ''
+    #: Range of a number, ends included.
     low: float = -math.inf
     high: float = math.inf
+    #: The allowed values of a text; empty allows any.
     choices: tuple[str, ...] = ()
+    #: Read at start-up only. The others change at run time.
     read_only: bool = False
 
     @property
@@ -99,11 +88,15 @@ class ParameterRow:
         if isinstance(self.default, float) and type(value) is int:
             value = float(value)
         if isinstance(self.default, list) and isinstance(self.default[0], str):
-            if not _is_text_list(value):
+            if not isinstance(value, list | tuple) \
+                    or not all(isinstance(item, str) for item in value):
                 raise OptionsError(f'{self.name}: must be a list of texts, not {value!r:.60}')
             value = list(value)
         elif isinstance(self.default, list):
-            if not _is_number_list(value) or len(value) != len(self.default):
+            is_numbers = (
+                not isinstance(value, str | bytes) and isinstance(value, Iterable)
+                and all(type(item) in (int, float) and math.isfinite(item) for item in value))
+            if not is_numbers or len(value) != len(self.default):
                 raise OptionsError(f'{self.name}: must be {len(self.default)} finite numbers')
             value = [float(item) for item in value]
         if type(value) is not type(self.default):
@@ -116,15 +109,6 @@ class ParameterRow:
         if isinstance(value, int | float) and not self.low <= value <= self.high:
             raise OptionsError(f'{self.name}: {value} must be {self.allowed}')
         return value
-
-
-def _is_number_list(value: Any) -> bool:
-    return (not isinstance(value, str | bytes) and isinstance(value, Iterable)
-            and all(type(item) in (int, float) and math.isfinite(item) for item in value))
-
-
-def _is_text_list(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
 
 
 class NodeParameters:

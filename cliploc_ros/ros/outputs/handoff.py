@@ -63,11 +63,7 @@ class NoLocalizerError(HandOffError):
 class HandOff:
     """Publishes `initialpose` for a robot at rest, and has its localizer settle there.
 
-    Parameters
-    ----------
-    node : Node
-    odometry : OdometrySource
-        Knows whether the robot moves; has to be listening.
+    `odometry` knows whether the robot moves; it has to be listening.
     """
 
     def __init__(self, node: Node, odometry: OdometrySource) -> None:
@@ -87,13 +83,7 @@ class HandOff:
                                            callback_group=ReentrantCallbackGroup())
 
     def open(self, pose_topic: str) -> None:
-        """Allow hand-overs.
-
-        Parameters
-        ----------
-        pose_topic : str
-            Where the localizer shows its pose; empty: nowhere.
-        """
+        """Allow hand-overs. The localizer shows its pose on `pose_topic`; empty: nowhere."""
         self._stopped.clear()
         if pose_topic:
             self._pose_topic = str(self._node.resolve_topic_name(pose_topic))
@@ -139,11 +129,9 @@ class HandOff:
             Accepted, in the map's coordinate frame, with the image's stamp.
         values : mapping
             The relocalizer's parameters.
-        deadline : float
-            When to return at the latest (monotonic clock) [s]. A hand-over that need not wait is
-            made after it, too.
-        received_at : float
-            When the image arrived (monotonic clock) [s].
+        deadline, received_at : float
+            When to return at the latest, and when the image arrived (monotonic clock) [s]. A
+            hand-over that need not wait is made after the deadline, too.
 
         Raises
         ------
@@ -275,24 +263,20 @@ class HandOff:
         The pose is delivered: what fails here is not worth an error.
         """
         for _ in range(updates):
-            if (not self._updater.service_is_ready() or _left_s(deadline) < _UPDATE_PERIOD_S
-                    or not self._update(min(_UPDATE_PATIENCE_S, _left_s(deadline)))
-                    or self._stopped.wait(_UPDATE_PERIOD_S)):
+            if not self._updater.service_is_ready() or _left_s(deadline) < _UPDATE_PERIOD_S:
                 return
-
-    def _update(self, timeout_s: float) -> bool:
-        """Ask AMCL for one update; return whether it answers."""
-        answered = threading.Event()
-        future = self._updater.call_async(Empty.Request())
-        future.add_done_callback(lambda _: answered.set())
-        if answered.wait(timeout_s):
-            return True
-        self._updater.remove_pending_request(future)
-        self._node.get_logger().warning(
-            f'{self._updater.service_name} did not answer within {timeout_s:.1f} s: the '
-            'localizer has the pose, but may not settle while the robot rests',
-            throttle_duration_sec=5.0)
-        return False
+            timeout_s, answered = min(_UPDATE_PATIENCE_S, _left_s(deadline)), threading.Event()
+            future = self._updater.call_async(Empty.Request())
+            future.add_done_callback(lambda _, answered=answered: answered.set())
+            if not answered.wait(timeout_s):
+                self._updater.remove_pending_request(future)
+                self._node.get_logger().warning(
+                    f'{self._updater.service_name} did not answer within {timeout_s:.1f} s: the '
+                    'localizer has the pose, but may not settle while the robot rests',
+                    throttle_duration_sec=5.0)
+                return
+            if self._stopped.wait(_UPDATE_PERIOD_S):
+                return
 
 
 def _left_s(deadline: float) -> float:
@@ -334,13 +318,8 @@ def usable_pose(pose: PoseWithCovarianceStamped, now: Time) -> PoseWithCovarianc
     """Return a pose that AMCL can use.
 
     Its stamp is not in the future, for which AMCL has no odometry, and no variance is so small
-    that all particles coincide. AMCL reads elements 0, 1, 6, 7 and 35 of the covariance.
-
-    Parameters
-    ----------
-    pose : PoseWithCovarianceStamped
-    now : Time
-        0 where simulated time has not begun.
+    that all particles coincide. AMCL reads elements 0, 1, 6, 7 and 35 of the covariance. `now` is
+    0 where simulated time has not begun.
     """
     usable = deepcopy(pose)
     covariance = np.array(pose.pose.covariance).reshape(6, 6)

@@ -28,13 +28,8 @@ _PERIOD_S = 0.1
 class MapToOdom:
     """Broadcasts the transform from odometry's coordinate frame to the map.
 
-    Odometry broadcasts odom -> base, and drifts from where it began.
-
-    Parameters
-    ----------
-    node : Node
-    transforms : CoordinateFrames
-        Knows where the robot was by odometry.
+    Odometry broadcasts odom -> base, and drifts from where it began. `transforms` knows where the
+    robot was by odometry.
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
@@ -76,11 +71,8 @@ class MapToOdom:
     def forget(self, began_ns: int = 0) -> None:
         """Drop the transform until the next accepted pose: time jumped, or odometry restarted.
 
-        Parameters
-        ----------
-        began_ns : int
-            The stamp of the first odometry after a restart [ns]. Images from before do not count,
-            even those that arrive later.
+        Images from before `began_ns`, the stamp of the first odometry after a restart [ns], do not
+        count, even those that arrive later.
         """
         with self._lock:
             self._transform, self._jumped_at = None, time.monotonic()
@@ -90,15 +82,8 @@ class MapToOdom:
                received_at: float) -> None:
         """Take in where the robot was; does nothing while closed.
 
-        Parameters
-        ----------
-        header : Header
-            Stamp of the image, coordinate frame of the map.
-        map_from_base : ndarray (4, 4)
-        values : mapping
-            The relocalizer's parameters.
-        received_at : float
-            When the image arrived (monotonic clock) [s].
+        The header has the stamp of the image and the coordinate frame of the map; the image
+        arrived at `received_at` (monotonic clock) [s].
 
         Raises
         ------

@@ -168,14 +168,7 @@ class Visualization:
              camera_from_base: NDArray[np.float64]) -> None:
         """Show the matched landmarks and the best hypotheses.
 
-        Parameters
-        ----------
-        header : Header
-            Stamp of the image, coordinate frame of the map.
-        landmark_map : LandmarkMap
-        found : Relocalization
-        camera_from_base : ndarray (4, 4)
-            The pose of the published coordinate frame, seen from the camera.
+        The header has the stamp of the image and the coordinate frame of the map.
         """
         if self._hypotheses.get_subscription_count() > 0:
             self._hypotheses.publish(pose_array_msg(header, [
@@ -190,17 +183,7 @@ class Visualization:
 
     def show_debug_image(self, header: Header, seen: SeenImage, landmark_map: LandmarkMap,
                          found: Relocalization, verdict: str) -> None:
-        """Publish the image with what was found in it.
-
-        Parameters
-        ----------
-        header : Header
-            Of the image.
-        seen : SeenImage
-        landmark_map : LandmarkMap
-        found : Relocalization
-        verdict : str
-        """
+        """Publish the image, which has this header, with the matches and the verdict."""
         self._debug_image.publish(image_to_msg(
             draw_debug_image(seen, found, landmark_map, verdict), header))
 

@@ -9,17 +9,26 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import chain, islice
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.ros.replay.bag_publisher import create_publisher, is_latched
 from cliploc_ros.units import NS_PER_S
 
 CLOCK_TOPIC = '/clock'
@@ -27,74 +36,48 @@ _POLL_S = 0.02
 #: Wait this long after a subscriber appears here: it must discover this publisher too, and ROS
 #: does not report that.
 _DISCOVERY_S = 0.2
+#: Depth where the recording has none: discovery does not report a publisher's history.
+DEFAULT_DEPTH = 10
+#: A recorded duration of this or more is infinite. Foxy's Fast DDS wrote the least such value.
+_INFINITE_S = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """How to play a recording.
+    """How to play a recording."""
 
-    Parameters
-    ----------
-    rate : float
-        Speed; 1 is as recorded.
-    start_offset_s : float
-        Begin this long after the recording's start [s].
-    topics : collection of str, optional
-        Play these only.
-    exclude : collection of str
-        Leave these out.
-    remap : mapping of str to str
-        New names of topics, by recorded name.
-    clock_hz : float, optional
-        Publish the recording's time on /clock this often per second of real time.
-    loop : bool
-        Begin again at the end, until stopped.
-    """
-
+    #: Speed; 1 is as recorded.
     rate: float = 1.0
+    #: Begin this long after the recording's start.
     start_offset_s: float = 0.0
+    #: Play these only.
     topics: Collection[str] | None = None
+    #: Leave these out.
     exclude: Collection[str] = ()
+    #: New names of topics, by recorded name.
     remap: Mapping[str, str] = field(default_factory=dict)
+    #: Publish the recording's time on /clock this often per second of real time.
     clock_hz: float | None = None
+    #: Begin again at the end, until stopped.
     loop: bool = False
 
 
 @dataclass(frozen=True)
 class PlayReport:
-    """What was published.
+    """What was published."""
 
-    Parameters
-    ----------
-    counts : Counter
-        Messages by recorded topic name.
-    passes : int
-        How often the recording was played to its end.
-    unread : int
-        Messages that the recording lists but that were not found in it.
-    worst_lateness_s : float
-        The longest that a message was published after its time [s].
-    """
-
+    #: Messages by recorded topic name.
     counts: Counter[str]
+    #: How often the recording was played to its end.
     passes: int = 0
+    #: Messages that the recording lists but that were not found in it.
     unread: int = 0
+    #: The longest that a message was published after its time.
     worst_lateness_s: float = 0.0
 
 
 class Player:
-    """Publishes an open recording.
-
-    Parameters
-    ----------
-    node : Node
-        Makes the publishers.
-    reader : BagReader
-        The open recording.
-    options : PlayOptions
-        How to play it.
-    stop : Interruption
-        Ends every wait and the playback within milliseconds.
+    """Publishes an open recording; `stop` ends every wait and the playback within milliseconds.
 
     Raises
     ------
@@ -123,41 +106,29 @@ class Player:
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
-        """Wait until each of some topics has a subscriber.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Recorded names; if empty, all topics that are played.
-        timeout_s : float
-            How long to wait at most [s].
+        """Wait until each of some topics, by recorded name, has a subscriber; of all if empty.
 
         Raises
         ------
         DatasetError
             If a topic is not played, or has no subscriber in time; the message names it.
         """
-        publishers = self._named_publishers(list(topics) or list(self._publishers))
+        names = list(topics) or list(self._publishers)
+        if unknown := [name for name in names if name not in self._publishers]:
+            raise DatasetError(f'{unknown[0]} is not among the topics played: '
+                               f'{", ".join(self._publishers)}')
+        publishers = [self._publishers[name] for name in names]
         deadline = time.monotonic() + timeout_s
         while lonely := [one for one in publishers if not one.get_subscription_count()]:
             if time.monotonic() >= deadline:
-                names = ', '.join(publisher.topic_name for publisher in lonely)
-                raise DatasetError(f'no subscriber within {timeout_s:g} s on {names}')
+                raise DatasetError(f'no subscriber within {timeout_s:g} s on '
+                                   f'{", ".join(one.topic_name for one in lonely)}')
             if self._stop.wait(_POLL_S):
                 return
         self._stop.wait(_DISCOVERY_S)
 
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
-        """Publish the messages, each at its time.
-
-        Parameters
-        ----------
-        on_message : callable
-            Called after each publication, to show progress.
-
-        Returns
-        -------
-        PlayReport
+        """Publish the messages, each at its time; `on_message` is called after each.
 
         Raises
         ------
@@ -175,7 +146,9 @@ class Player:
             if self._stop.is_set():
                 break
             passes += 1
-            unread = self._count_unread(played.total())
+            # a recording does not list how many messages follow a start offset
+            unread = 0 if self.start_ns > self._reader.start_ns else max(
+                sum(topic.message_count for topic in self.topics) - played.total(), 0)
             if not self._options.loop:
                 break
             # The next pass follows at the mean distance of messages, and never at once.
@@ -189,17 +162,8 @@ class Player:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
 
         The middleware resends lost messages only while their publisher exists: a process that
-        ends right after its last message loses it under load.
-
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait at most [s]. Fast DDS requests acknowledgements every 3 s.
-
-        Returns
-        -------
-        tuple of str
-            Topics with a subscriber that did not acknowledge all messages in time.
+        ends right after its last message loses it under load. Fast DDS requests acknowledgements
+        every 3 s. Returns the topics with a subscriber that did not acknowledge all in time.
         """
         deadline = time.monotonic() + timeout_s
         waiting = list(self._publishers.values())
@@ -229,21 +193,16 @@ class Player:
         counts: Counter[str] = Counter()
         worst_lateness_s = 0.0
         for message in messages:
-            if not self._wait_for(message.stamp_ns, timeline, ticker):
+            while ticker is not None and ticker.next_ns <= message.stamp_ns \
+                    and timeline.wait_for(ticker.next_ns):
+                ticker.tick()
+            if not timeline.wait_for(message.stamp_ns):
                 break
             worst_lateness_s = max(worst_lateness_s, timeline.lateness_s(message.stamp_ns))
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
             on_message(message)
         return counts, worst_lateness_s
-
-    def _wait_for(self, stamp_ns: int, timeline: '_Timeline', ticker: '_Ticker | None') -> bool:
-        """Wait until a stamp's time, ticking meanwhile; return False if stopped instead."""
-        while ticker is not None and ticker.next_ns <= stamp_ns:
-            if not timeline.wait_for(ticker.next_ns):
-                return False
-            ticker.tick()
-        return timeline.wait_for(stamp_ns)
 
     def _publish_latched(self) -> Counter[str]:
         """Publish what a late subscriber would still receive from before the start offset."""
@@ -255,17 +214,6 @@ class Player:
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
         return counts
-
-    def _count_unread(self, played: int) -> int:
-        if self.start_ns > self._reader.start_ns:
-            return 0  # a recording does not list how many messages follow a start offset
-        return max(sum(topic.message_count for topic in self.topics) - played, 0)
-
-    def _named_publishers(self, names: Collection[str]) -> list[Publisher]:
-        if unknown := [name for name in names if name not in self._publishers]:
-            played = ', '.join(self._publishers)
-            raise DatasetError(f'{unknown[0]} is not among the topics played: {played}')
-        return [self._publishers[name] for name in names]
 
 
 class _Timeline:
@@ -325,3 +273,88 @@ def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
     if not sum(topic.message_count for topic in topics):
         raise DatasetError(f'{reader.path}: holds no messages on the topics to play')
     return topics
+
+
+def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
+    """Make a publisher, named before ROS's own remapping, with the QoS that was recorded.
+
+    Raises
+    ------
+    DatasetError
+        If the type is not installed, or differs from the recorded one.
+    """
+    publisher: Publisher = node.create_publisher(
+        message_class(topic), name, qos_profile(topic.offered_qos)
+    )
+    _check_definition(node, topic, publisher.topic_name)
+    return publisher
+
+
+def message_class(topic: BagTopic) -> Any:
+    """Return the installed class of a topic's messages.
+
+    Raises
+    ------
+    DatasetError
+        Naming the package to install.
+    """
+    package, _, name = topic.msgtype.partition('/')
+    namespace, _, name = name.rpartition('/')
+    try:
+        return getattr(import_module(f'{package}.{namespace or "msg"}'), name)
+    except (ImportError, AttributeError):
+        raise DatasetError(
+            f'{topic.name} needs {topic.msgtype}, but the package {package} with this type is not '
+            f'installed or not sourced: apt install ros-jazzy-{package.replace("_", "-")}, or '
+            f'leave the topic out: --exclude {topic.name}'
+        ) from None
+
+
+def qos_profile(offered: Collection[Qos]) -> QoSProfile:
+    """Return the profile that replays what a topic's publishers offered.
+
+    Of several publishers' offers it takes the strongest reliability and durability, which
+    match all their subscribers. The history's depth is 10 where none was recorded.
+    """
+    if not offered:
+        return QoSProfile(depth=DEFAULT_DEPTH)
+    first = next(iter(offered))
+    best_effort = all(one.reliability == QosReliability.BEST_EFFORT for one in offered)
+    profile = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=first.depth or DEFAULT_DEPTH,
+        reliability=(
+            ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        ),
+        durability=(
+            DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered) else DurabilityPolicy.VOLATILE
+        ),
+    )
+    if first.history == QosHistory.KEEP_ALL:
+        profile.history = HistoryPolicy.KEEP_ALL
+    if first.liveliness == QosLiveliness.MANUAL_BY_TOPIC:
+        profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+    for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
+        recorded = getattr(first, name)
+        if recorded.sec < _INFINITE_S and (recorded.sec or recorded.nsec):
+            setattr(profile, name, Duration(seconds=recorded.sec, nanoseconds=recorded.nsec))
+    return profile
+
+
+def is_latched(offered: Collection[Qos]) -> bool:
+    """Return whether a recorded publisher kept messages for late subscribers."""
+    return any(one.durability == QosDurability.TRANSIENT_LOCAL for one in offered)
+
+
+def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
+    """Refuse bytes that were recorded with another definition than the installed one."""
+    if not topic.type_hash.startswith('RIHS01_'):
+        return  # recorded before Iron, which introduced the hash
+    for endpoint in node.get_publishers_info_by_topic(name):
+        if endpoint.node_name == node.get_name() and str(endpoint.topic_type_hash) not in (
+            topic.type_hash, 'INVALID'
+        ):
+            raise DatasetError(
+                f'{topic.name} was recorded with another definition of {topic.msgtype} than the '
+                f'installed one; leave it out: --exclude {topic.name}'
+            )

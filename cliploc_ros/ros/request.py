@@ -1,0 +1,296 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A request: frame, robot state, localizer, publish, hand over, until accepted or time is up."""
+
+import math
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_msgs.msg import Header
+
+from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.geometry.transforms import move_covariance
+from cliploc_ros.errors import CliplocError, TimeUpError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.conversions import pose_with_covariance_msg
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.localizer import Localized, Localizer, load_localizer
+from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
+from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
+from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
+from cliploc_ros.ros.outputs.visualization import Visualization
+
+# Every frame that odometry does not link is another chance of a false accept.
+_MAX_UNLINKED = 3
+# An earlier request ends at its own deadline, shortly before those that wait for it.
+_GRACE_S = 0.2
+
+_SMALLER = 'choose a faster profile or a smaller'
+# Of each stage its name in a message, and what makes it faster.
+_STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
+           'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
+           'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
+_REMEDIES = {'image': 'raise the rate of the camera or of the detector',
+             'detection': f'{_SMALLER} detector',
+             'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
+             'search': 'lower iterations or time_budget_ms',
+             'keyframes': "set keyframes_file to ''"}
+
+
+class Requests:
+    """Answers requests one at a time.
+
+    A request that had to wait shares the previous answer if the image of that answer arrived
+    after the request: clients that ask together cost one search and reset the localizer once.
+    Otherwise it looks at fresh frames itself.
+
+    `localize` takes a frame, its StageTimes and the deadline (monotonic clock) [s]; it returns
+    the frame's Answer. It is called in the worker's thread.
+    """
+
+    def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
+                 localize: Callable[[Frame, StageTimes, float], Answer], handoff: HandOff) -> None:
+        self._node = node
+        self._frames = frames
+        self._robot = robot
+        self._localize = localize
+        self._handoff = handoff
+        self._turn = threading.Lock()
+        self._previous = Answer(Verdict.FAILED, 'no request yet')
+
+    def answer(self) -> Answer:
+        """Return the answer to a request that arrives now, within timeout_s."""
+        arrived_at = time.monotonic()
+        deadline = arrived_at + self._node.settings['timeout_s']
+        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
+            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
+        try:
+            if self._previous.received_at <= arrived_at:
+                self._previous = self._guarded(arrived_at, deadline)
+            return self._previous
+        finally:
+            self._turn.release()
+
+    def _guarded(self, arrived_at: float, deadline: float) -> Answer:
+        """Return an answer whatever happens, and log it in one line."""
+        try:
+            # A map or weights that were missing may be there now.
+            self._node.bring_up(deadline)
+            answer = self._look_until(deadline, arrived_at)
+        except CliplocError as error:
+            answer = Answer(Verdict.FAILED, str(error))
+        except Exception as error:
+            self._node.report(traceback.format_exc())
+            answer = Answer(Verdict.FAILED,
+                            f'internal error: {error} (the traceback is in the log)')
+        self._node.get_logger().info(answer.message)
+        return answer
+
+    def _look_until(self, deadline: float, arrived_at: float) -> Answer:
+        """Look at one frame after another while another frame can change the answer."""
+        last: Answer | None = None
+        problem: CliplocError | None = None
+        stages_ms: Counter[str] = Counter()
+        looks, unlinked, after, may_go_on, is_up = 0, 0, arrived_at, True, False
+        while may_go_on and unlinked < _MAX_UNLINKED:
+            times = StageTimes('image', after)
+            try:
+                frame = self._frames.next_frame(after, deadline)
+                times.begin('detection', frame.received_at)
+                times.begin('waiting', frame.detected_at)
+                answer = self._node.worker.run(
+                    partial(self._localize, frame, times, deadline), deadline)
+                answer, may_go_on = self._hand_over(answer, deadline)
+            except (TimeJumpError, NoTransformError) as error:  # a newer frame may do
+                problem, after = error, time.monotonic()
+                if after <= deadline - _GRACE_S:
+                    continue
+                if last is None:
+                    raise
+                is_up = True
+                break
+            except (NoFrameError, TimeUpError) as error:
+                if last is not None:
+                    is_up = True
+                    break
+                if isinstance(error, NoFrameError):
+                    raise problem or error from error
+                return Answer(Verdict.REFUSED, _time_is_up(times.ms), kind=RefusalKind.TIME_UP)
+            may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
+                                                                 deadline)
+            last, is_up, after = answer, answer.is_cut, time.monotonic()
+            looks += 1
+            unlinked += not answer.is_linked
+            stages_ms.update(answer.stages_ms)
+        assert last is not None
+        # more images of a place without objects are no remedy
+        if is_up and last.verdict is Verdict.REFUSED and (
+                last.is_cut or last.kind is not RefusalKind.TOO_FEW_OBJECTS):
+            last = replace(last, detail=f'{last.detail}; {_time_is_up(stages_ms)}')
+        if looks == 1:
+            return last
+        return replace(last, detail=f'{last.detail} [{looks} frames in '
+                                    f'{time.monotonic() - arrived_at:.1f} s]')
+
+    def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
+        """Hand an accepted pose to the localizer; return also whether another frame may help."""
+        if answer.pose is None:
+            return answer, True
+        try:
+            self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
+                                    answer.received_at)
+        except HandOffError as error:
+            return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                            detail=f'{error} ({answer.message})'),
+                    not isinstance(error, NoLocalizerError))
+        return answer, False
+
+
+class Pipeline:
+    """Localizes with one frame at a time and publishes the result.
+
+    All methods but open and close run in the node's worker, one after another.
+    """
+
+    def __init__(self, node: ManagedNode, robot: RobotStateSource, jumps: TimeJumps) -> None:
+        self._node = node
+        self._jumps = jumps
+        self._robot = robot
+        self.localizer: Localizer | None = None
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
+        self._map_to_odom = MapToOdom(node, robot.transforms)
+        robot.odometry.on_restart(self._map_to_odom.forget)
+        self._visualization = Visualization(node)
+
+    def load(self) -> str:
+        """Load map and network; return what was loaded, in one line."""
+        return self._use(load_localizer(self._node, self._node.settings.snapshot()))
+
+    def reload_map(self) -> str:
+        """Read the map again; return what was loaded, in one line."""
+        if self.localizer is None:
+            raise NotActiveError(f'the node is {self._node.state}')
+        return self._use(self.localizer.reloaded(self._node, self._node.settings.snapshot()))
+
+    def unload(self) -> None:
+        """Drop map and network."""
+        self.localizer = None
+        self._visualization.set_map(None)
+
+    def open(self) -> None:
+        """Begin to broadcast map -> odom where that is asked for."""
+        if self._node.settings['publish_tf']:
+            self._map_to_odom.open()
+
+    def close(self) -> None:
+        """Stop broadcasting."""
+        self._map_to_odom.close()
+
+    def forget(self) -> None:
+        """Drop map -> odom until the next accepted pose: time jumped."""
+        self._map_to_odom.forget()
+
+    def localize(self, frame: Frame, times: StageTimes | None = None,
+                 deadline: float = math.inf) -> Answer:
+        """Localize with one frame and publish the result.
+
+        `times` are new ones since the image arrived by default. No crops are compared after
+        `deadline` (monotonic clock) [s].
+
+        Raises
+        ------
+        TimeJumpError
+            Time jumped back since the frame arrived, or odometry restarted where its frame is
+            broadcast; nothing was published.
+        CliplocError
+            Names what to fix in the frame or in the parameters.
+        """
+        if times is None:
+            times = StageTimes('detection', frame.received_at)
+            times.begin('waiting', frame.detected_at)
+        values = self._node.settings.snapshot()
+        self._node.check_active()
+        localizer = self.localizer
+        assert localizer is not None  # an active node has one
+        image = frame.image.header
+        self._jumps.check(image.stamp, frame.received_at)
+        state = self._robot.at(image, values, deadline)
+        localized = localizer.localize(frame, values, state, times, deadline)
+        stages_ms = times.ms
+        self._node.stages.add(stages_ms)
+        self._node.check_active()
+        self._jumps.check(image.stamp, frame.received_at)
+        header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
+        found = localized.found
+        answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
+                        None, frame.received_at, state, localized.is_cut, stages_ms,
+                        localizer.map_hash, found.refusal_kind)
+        if found.accepted:
+            answer = self._publish(header, localized, state, replace(
+                answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
+        self._visualization.show(header, localized.landmark_map, found, state.camera_from_base)
+        if self._visualization.wants_debug_image:  # behind the answer
+            self._node.worker.submit(partial(
+                self._visualization.show_debug_image, image, localized.seen,
+                localized.landmark_map, found, answer.message))
+        return answer
+
+    def _use(self, localizer: Localizer) -> str:
+        self.localizer = localizer
+        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
+                                    else localizer.keyframes.layer)
+        return localizer.description
+
+    def _publish(self, header: Header, localized: Localized, state: RobotState,
+                 answer: Answer) -> Answer:
+        """Publish an accepted pose; return the answer with it, withheld without its tf."""
+        found = localized.found
+        assert found.covariance is not None and found.map_from_camera is not None
+        assert localized.for_filter is not None
+        map_from_base = found.map_from_camera @ state.camera_from_base
+        lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
+        pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
+            covariance, lever)) for covariance in (found.covariance, localized.for_filter))
+        x, y, z = map_from_base[:3, 3]
+        answer = replace(answer, pose=pose, detail=(
+            f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} {answer.detail}'))
+        try:
+            self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
+                                     answer.received_at)
+        except NoTransformError as error:
+            answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                             detail=f'publish_tf: {error} (accepted: {answer.detail})')
+        self._pose.publish(for_filter)
+        return answer
+
+
+def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
+    found, seen = localized.found, localized.seen.observation
+    crops = '' if seen.similarities is None else \
+        f', CLIP of {localized.compared} of {len(seen.detections)} crops'
+    keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
+    if found.recognized is not None:
+        keyframes += f', {found.recognized.inliers} points of keyframes agree'
+    return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
+            f'{len(found.matches)} inliers, {found.tried} hypotheses, '
+            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}; '
+            f'{in_words(stages_ms)}]')
+
+
+def _time_is_up(stages_ms: Mapping[str, float]) -> str:
+    """Return which stage used up the time of a request, and what to do about it."""
+    stage = max(stages_ms, key=lambda name: stages_ms[name])
+    total_s = sum(stages_ms.values()) / 1e3
+    return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '
+            f'{_REMEDIES[stage]}, or raise timeout_s')
