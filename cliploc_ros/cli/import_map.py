@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, split_ros_args
+from cliploc_ros.command import printable, run_main
 from cliploc_ros.errors import DatasetError, MapError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -50,10 +50,7 @@ class _Result(NamedTuple):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Import a map; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: import_map(options))
+    return run_main(make_parser(), import_map, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
