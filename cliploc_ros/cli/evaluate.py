@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
+from cliploc_ros.cli.sources import add_topic_options
 from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -135,13 +136,11 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--every', type=positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
-    group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
-    group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC')
+    add_topic_options(group)
     group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
-    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
 
 
 def evaluate(options: argparse.Namespace) -> int:

@@ -99,7 +99,11 @@ def import_map(options: argparse.Namespace) -> int:
                          f'import_map {options.format} {options.input.name}')
     except DatasetError as error:
         raise DatasetError(f'{options.input}: {error}') from error
-    result = _refit(imported, options) if options.refit else _as_given(imported)
+    result = _refit(imported, options) if options.refit else _Result(
+        imported.landmark_map, imported.left_out, (
+            f'{len(imported.landmark_map)} landmarks as the file has them',
+            *(f'note: {note}' for note in imported.notes),
+            'note: maps of other systems localize better after --refit OBSERVATIONS'))
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
                *result.lines[:1]])
@@ -163,13 +167,6 @@ def _read(options: argparse.Namespace) -> 'GivenMap':
     names = COCO if options.class_names is None else read_class_names(options.class_names)
     readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
     return readers[options.format](options.input, names)
-
-
-def _as_given(imported: 'ImportedMap') -> _Result:
-    lines = [f'{len(imported.landmark_map)} landmarks as the file has them',
-             *(f'note: {note}' for note in imported.notes),
-             'note: maps of other systems localize better after --refit OBSERVATIONS']
-    return _Result(imported.landmark_map, imported.left_out, tuple(lines))
 
 
 def _refit(imported: 'ImportedMap', options: argparse.Namespace) -> _Result:

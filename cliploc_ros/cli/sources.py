@@ -4,7 +4,7 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli.networks import add_network_options, clip_options, yolo_options
 from cliploc_ros.errors import DatasetError, OptionsError
@@ -59,12 +59,17 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
                        help='interpolate between poses at most so far apart (%(default)s)')
 
 
-def _add_image_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+def add_topic_options(group: Any) -> None:
+    """Add the options that name the images of a bag to a parser or a group of it."""
     group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
     group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
                        help='(%(default)s)')
-    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
+    group.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+
+
+def _add_image_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+    add_topic_options(group)
     group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
                        help='camera of --tum and --rgbd, where the folder does not say it')

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
+from cliploc_ros.cli.sources import add_topic_options
 from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
@@ -53,10 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='boxes and poses of a recording of the place')
     parser.add_argument('--images', type=Path, metavar='BAG|DIR',
                         help='a rosbag2 recording or a TUM folder with the images of the views')
-    parser.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
-    parser.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
-                        help='(%(default)s)')
-    parser.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+    add_topic_options(parser)
     parser.add_argument('--clip-model', metavar='NAME|JSON',
                         help='offer the five phrases that this CLIP finds best, as build_map')
     parser.add_argument('--clip-pretrained', metavar='TAG|FILE', help='its weights')
