@@ -139,13 +139,16 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
     CliplocError
         The source or the options cannot be used.
     """
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
     from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
 
     if options.bag is not None:
-        return _bag_frames(options)
+        topics = BagTopics(options.image, options.camera_info, options.rectified,
+                           options.depth or '')
+        return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
     if options.pose_topic or options.map_frame or options.depth:
         raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
     folder = FolderOptions(
@@ -158,13 +161,6 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
         return rgbd_frames(options.rgbd, folder)
     return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
                       folder)
-
-
-def _bag_frames(options: argparse.Namespace) -> 'Frames':
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
-
-    topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
-    return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
 
 
 def _read_poses(options: argparse.Namespace) -> 'ReadPoses':

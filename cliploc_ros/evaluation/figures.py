@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's figures and others, as PNG and SVG."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -278,7 +278,9 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
     draw_map(axes, landmark_map)
     axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
               color='#222222', label='truth', zorder=6)
-    for label, color, marker, chosen in _groups(first):
+    for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
+                                          ('refused', '#D55E00', 'X', False)):
+        chosen = [one for one in first if one.error_m is not None and one.accepted == verdict]
         for number, one in enumerate(chosen):
             (x, y), pose = truth[one.query][:2, 3], one.map_from_camera
             assert pose is not None
@@ -287,9 +289,3 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
                       label=f'{label} ({len(chosen)})' if number == 0 else None)
     add_legend(figure)
     return figure
-
-
-def _groups(results: Sequence[Result]) -> Iterator[tuple[str, str, str, list[Result]]]:
-    found = [one for one in results if one.error_m is not None]
-    yield 'accepted', '#0072B2', 'o', [one for one in found if one.accepted]
-    yield 'refused', '#D55E00', 'X', [one for one in found if not one.accepted]
