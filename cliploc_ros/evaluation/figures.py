@@ -5,6 +5,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -79,10 +80,11 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG and as SVG beside it; return the path."""
-    # without its date, an SVG of the same results is the same file
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
-    write_file(path.with_suffix('.svg'),
-               lambda partial: figure.savefig(partial, metadata={'Date': None}))
+    # without its date and with fixed ids, an SVG of the same results is the same file
+    with matplotlib.rc_context({'svg.hashsalt': path.stem}):
+        write_file(path.with_suffix('.svg'),
+                   lambda partial: figure.savefig(partial, metadata={'Date': None}))
     return path
 
 
