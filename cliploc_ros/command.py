@@ -3,17 +3,38 @@
 """Shared by the executables: errors in one line, and a clean end on Ctrl-C or SIGTERM."""
 
 import argparse
+import math
 import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
+
+
+def run_main(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int],
+             args: Sequence[str] | None) -> int:
+    """Run an executable that SIGTERM interrupts as Ctrl-C does; return its exit code.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the arguments that are not for ROS; those go to the options as ``ros_args``.
+    command : callable
+        Takes the options and returns the exit code, see run_command.
+    args : sequence of str, optional
+        The command line without the program's name; None: that of this process.
+    """
+    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
+    options = parser.parse_args(plain_args, argparse.Namespace(ros_args=ros_args))
+    interrupt_on_sigterm()
+    return run_command(lambda: command(options))
 
 
 def run_command(command: Callable[[], int], failure: int = 1) -> int:
@@ -59,6 +80,64 @@ def positive_int(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
     return value
+
+
+def positive(text: str) -> float:
+    """Return a finite number above 0, for argparse."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Return a finite number of 0 or more, for argparse."""
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not a number of 0 or more')
+    return value
+
+
+def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
+    """Return a type for argparse: numbers of the limits' type, from low to high."""
+    def number(text: str) -> Number:
+        value = type(low)(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f'{text} is not within {low:g} and {high:g}')
+        return value
+    return number
+
+
+@contextmanager
+def needs_ros(program: str) -> Iterator[None]:
+    """Turn a failing import of ROS into an error that says how to get it."""
+    try:
+        yield
+    except ImportError as error:
+        raise OptionsError(
+            f'{program} needs ROS 2 ({error}): source it, or run script/setup') from error
+
+
+@contextmanager
+def running_ros(args: Sequence[str]) -> Iterator[None]:
+    """Run rclpy without its signal handlers.
+
+    Raises
+    ------
+    OptionsError
+        It does not start with these arguments.
+    """
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    try:
+        rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl has its own types, for arguments and for missing folders
+        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
 
 
 def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:

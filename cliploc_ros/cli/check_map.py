@@ -13,14 +13,19 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.command import (
-    interrupt_on_sigterm,
+    positive,
     positive_int,
     printable,
-    run_command,
-    split_ros_args,
+    run_main,
+    within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.mapping.checking.relocalization import PosedObservation
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -55,18 +60,9 @@ class StageBar:
         self._bar.refresh()
 
 
-if TYPE_CHECKING:
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
-    from cliploc_ros.mapping.checking.relocalization import PosedObservation
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Check a map; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: check(options))
+    return run_main(make_parser(), check, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -94,15 +90,15 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    group.add_argument('--frames', type=positive_int, default=100, metavar='N',
+    group.add_argument('--frames', type=positive_int, default=CheckOptions.frames, metavar='N',
                        help='the most recorded frames to relocalize (%(default)s)')
-    group.add_argument('--folds', type=int, default=5, metavar='N',
+    group.add_argument('--folds', type=int, default=CheckOptions.folds, metavar='N',
                        help='of the cross-validation, 2 or more (%(default)s)')
-    group.add_argument('--grid', type=_positive, default=0.5, metavar='METRES',
+    group.add_argument('--grid', type=positive, default=CheckOptions.spacing_m, metavar='METRES',
                        help='spacing of the camera positions, larger in large maps (%(default)s)')
-    group.add_argument('--positions', type=positive_int, default=150, metavar='N',
-                       help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=positive_int, default=12, metavar='N',
+    group.add_argument('--positions', type=positive_int, default=CheckOptions.max_positions,
+                       metavar='N', help='the most camera positions (%(default)s)')
+    group.add_argument('--headings', type=positive_int, default=CheckOptions.headings, metavar='N',
                        help='directions at each position (%(default)s)')
     group.add_argument('--camera-height', type=float, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')
@@ -114,17 +110,18 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
-    for name, kind, default, text in (
-            ('min-explained', _share, 0.6, 'share of held-out boxes that a landmark explains'),
-            ('min-iou', _share, 0.6, 'their median IoU'),
-            ('min-accepted', _share, 0.4, 'share of recorded frames that are accepted'),
-            ('max-misled', _share, 0.01, 'share of views in which a wrong pose is accepted'),
-            ('min-positions', _share, 0.4, 'share of grid positions with an accepted heading'),
-            ('max-faulty', _share, 0.15, 'share of landmarks with a serious fault'),
-            ('max-duplicates', _count, 0, 'pairs of landmarks that are one object'),
-            ('max-look-alikes', _count, 0, 'pairs of places that look alike')):
-        group.add_argument(f'--{name}', type=kind, default=default, metavar='N',
-                           help=f'{text} (%(default)s)')
+    share = within(0.0, 1.0)
+    for name, kind, text in (
+            ('min_explained', share, 'share of held-out boxes that a landmark explains'),
+            ('min_iou', share, 'their median IoU'),
+            ('min_accepted', share, 'share of recorded frames that are accepted'),
+            ('max_misled', share, 'share of views in which a wrong pose is accepted'),
+            ('min_positions', share, 'share of grid positions with an accepted heading'),
+            ('max_faulty', share, 'share of landmarks with a serious fault'),
+            ('max_duplicates', _count, 'pairs of landmarks that are one object'),
+            ('max_look_alikes', _count, 'pairs of places that look alike')):
+        group.add_argument(f'--{name.replace("_", "-")}', type=kind, metavar='N',
+                           default=getattr(Thresholds, name), help=f'{text} (%(default)s)')
 
 
 def check(options: argparse.Namespace) -> int:
@@ -139,7 +136,14 @@ def check(options: argparse.Namespace) -> int:
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
-    check_options, thresholds = _check_options(options), _thresholds(options)
+    check_options = CheckOptions(
+        relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
+        folds=options.folds, frames=options.frames, spacing_m=options.grid,
+        max_positions=options.positions, headings=options.headings,
+        camera_height_m=options.camera_height, use_vertical=options.gravity,
+        random_seed=options.seed)
+    thresholds = Thresholds(**{field.name: getattr(options, field.name)
+                               for field in fields(Thresholds)})
     detections = None
     if options.observations is not None:
         detections = load_observations(options.observations)
@@ -162,24 +166,6 @@ def check(options: argparse.Namespace) -> int:
     return 0 if report.passed else 1
 
 
-def _check_options(options: argparse.Namespace) -> 'CheckOptions':
-    from cliploc_ros.mapping.checking.options import CheckOptions
-
-    return CheckOptions(
-        relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
-        folds=options.folds, frames=options.frames, spacing_m=options.grid,
-        max_positions=options.positions, headings=options.headings,
-        camera_height_m=options.camera_height, use_vertical=options.gravity,
-        random_seed=options.seed)
-
-
-def _thresholds(options: argparse.Namespace) -> 'Thresholds':
-    from cliploc_ros.mapping.checking.options import Thresholds
-
-    return Thresholds(**{field.name: getattr(options, field.name) for field in
-                         fields(Thresholds)})
-
-
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:
     from cliploc_ros.datasets.queries import load_queries
     from cliploc_ros.evaluation.trials import make_queries
@@ -194,20 +180,6 @@ def _count(text: str) -> int:
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
-    return value
-
-
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value <= 1.0:
-        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 1')
     return value
 
 

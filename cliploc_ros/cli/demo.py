@@ -7,9 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import needs_ros, positive, positive_int, run_main
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.errors import OptionsError
 
 EPILOG = """\
 The demo plays a recording to the real detector and relocalizer, each in its own process. At each
@@ -21,10 +20,7 @@ walk and compares it with the room; the robot then wakes up in that map.
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: demonstrate(options))
+    return run_main(make_parser(), demonstrate, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -36,10 +32,10 @@ def make_parser() -> argparse.ArgumentParser:
         '--out', type=Path, default=Path('demo_out'), metavar='DIR',
         help='folder for the pictures (default: ./%(default)s)')
     parser.add_argument(
-        '--wake-ups', type=_at_least_one, default=10, metavar='N',
+        '--wake-ups', type=positive_int, default=10, metavar='N',
         help='number of wake-ups along the recording (default: %(default)s)')
     parser.add_argument(
-        '--rate', type=_positive, default=4.0, metavar='X',
+        '--rate', type=positive, default=4.0, metavar='X',
         help='speed between wake-ups; 2 is twice as fast as recorded (default: %(default)g)')
     parser.add_argument(
         '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',
@@ -58,12 +54,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def demonstrate(options: argparse.Namespace) -> int:
     """Run the demo as the command line says; return the exit code."""
-    try:
+    with needs_ros('the demo'):
         import rclpy  # noqa: F401
-    except ImportError as error:
-        raise OptionsError(
-            f'the demo needs ROS 2 ({error}): source it, or run script/setup'
-        ) from error
     from cliploc_ros.demo.run import DemoOptions, run_demo
 
     chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
@@ -75,20 +67,6 @@ def demonstrate(options: argparse.Namespace) -> int:
     else:
         run_demo(chosen)
     return 0
-
-
-def _at_least_one(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not a number of 1 or more')
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
-    return value
 
 
 if __name__ == '__main__':

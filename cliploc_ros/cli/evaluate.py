@@ -13,8 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.sources import add_network_options, clip_options, yolo_options
-from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
+from cliploc_ros.cli.sources import (
+    add_network_options,
+    add_topic_options,
+    clip_options,
+    yolo_options,
+)
+from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -50,10 +55,7 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Evaluate; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: evaluate(options))
+    return run_main(make_parser(), evaluate, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -111,7 +113,7 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--gravity', action='store_true',
                        help=f"'{AUTO}' knows the vertical, from the true poses; the paper's "
                        'methods do not use it')
-    group.add_argument('--gravity-noise-deg', type=_angle, default=0.0, metavar='DEG',
+    group.add_argument('--gravity-noise-deg', type=within(0.0, 45.0), default=0.0, metavar='DEG',
                        help='standard deviation of the vertical (0)')
     group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
@@ -122,7 +124,7 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--fuse', action='store_true',
                        help='localize each query with the other frames of its group, linked by '
                        'odometry from the true poses')
-    group.add_argument('--odometry-noise', type=_deviation, nargs=2, default=(0.0, 0.0),
+    group.add_argument('--odometry-noise', type=not_negative, nargs=2, default=(0.0, 0.0),
                        metavar=('METRES', 'DEGREES'),
                        help='standard deviations of each step of odometry, on each axis (0 0)')
 
@@ -138,13 +140,11 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--every', type=positive_int, default=1, metavar='N',
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
-    group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
-    group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC')
+    add_topic_options(group)
     group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
-    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -332,20 +332,6 @@ def _frames(options: argparse.Namespace) -> 'Frames':
 def _cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-def _deviation(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
-    return value
-
-
-def _angle(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value <= 45.0:
-        raise argparse.ArgumentTypeError(f'{text} is outside 0 to 45 degrees')
-    return value
 
 
 if __name__ == '__main__':

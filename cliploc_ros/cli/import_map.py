@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from cliploc_ros.command import interrupt_on_sigterm, printable, run_command, split_ros_args
+from cliploc_ros.command import printable, run_main
 from cliploc_ros.errors import DatasetError, MapError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -50,10 +50,7 @@ class _Result(NamedTuple):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Import a map; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: import_map(options))
+    return run_main(make_parser(), import_map, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -102,7 +99,11 @@ def import_map(options: argparse.Namespace) -> int:
                          f'import_map {options.format} {options.input.name}')
     except DatasetError as error:
         raise DatasetError(f'{options.input}: {error}') from error
-    result = _refit(imported, options) if options.refit else _as_given(imported)
+    result = _refit(imported, options) if options.refit else _Result(
+        imported.landmark_map, imported.left_out, (
+            f'{len(imported.landmark_map)} landmarks as the file has them',
+            *(f'note: {note}' for note in imported.notes),
+            'note: maps of other systems localize better after --refit OBSERVATIONS'))
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
                *result.lines[:1]])
@@ -166,13 +167,6 @@ def _read(options: argparse.Namespace) -> 'GivenMap':
     names = COCO if options.class_names is None else read_class_names(options.class_names)
     readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
     return readers[options.format](options.input, names)
-
-
-def _as_given(imported: 'ImportedMap') -> _Result:
-    lines = [f'{len(imported.landmark_map)} landmarks as the file has them',
-             *(f'note: {note}' for note in imported.notes),
-             'note: maps of other systems localize better after --refit OBSERVATIONS']
-    return _Result(imported.landmark_map, imported.left_out, tuple(lines))
 
 
 def _refit(imported: 'ImportedMap', options: argparse.Namespace) -> _Result:

@@ -8,9 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import needs_ros, run_main, running_ros
 from cliploc_ros.core.map.parameter_file import read_parameter_file
-from cliploc_ros.errors import OptionsError
 
 EPILOG = """\
 It loads what detector and relocalizer load with these parameters: weights are downloaded, networks
@@ -29,10 +28,7 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Prepare a robot; return the exit code."""
-    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: prepare(options, ros_args))
+    return run_main(make_parser(), prepare, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -57,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def prepare(options: argparse.Namespace, ros_args: Sequence[str]) -> int:
+def prepare(options: argparse.Namespace) -> int:
     """Load both nodes as they start on the robot, and answer a request; return the exit code.
 
     Raises
@@ -67,7 +63,7 @@ def prepare(options: argparse.Namespace, ros_args: Sequence[str]) -> int:
     """
     for file in options.params_file:
         read_parameter_file(file)  # its messages name the line
-    arguments = [*ros_args, '--ros-args', '-p', 'autostart:=false']
+    arguments = [*options.ros_args, '--ros-args', '-p', 'autostart:=false']
     for file in options.params_file:
         arguments += ['--params-file', str(file)]
     if options.cache_dir is not None:
@@ -80,22 +76,12 @@ def prepare(options: argparse.Namespace, ros_args: Sequence[str]) -> int:
     # The nodes here must not meet those of a running robot.
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise OptionsError(
-            f'prepare needs ROS 2 ({error}): source it, or run script/setup') from error
+    with needs_ros('prepare'):
+        import rclpy  # noqa: F401
     from cliploc_ros.cli.preparation import prepare_nodes
 
-    try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # rclpy cannot read the arguments
-        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
-    try:
+    with running_ros(arguments):
         prepare_nodes(options.image, options.cache_dir, not options.without_detector)
-    finally:
-        rclpy.try_shutdown()
     return 0
 
 

@@ -3,23 +3,30 @@
 """The executable ``replay``: publish a recording where no ``ros2 bag`` is installed."""
 
 import argparse
-import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cliploc_ros.command import Interruption, run_command, split_ros_args
-from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.command import (
+    Interruption,
+    needs_ros,
+    not_negative,
+    positive,
+    run_command,
+    running_ros,
+    split_ros_args,
+)
+from cliploc_ros.datasets.bag_reader import BagReader
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from cliploc_ros.ros.replay.player import Player, PlayReport
+    from cliploc_ros.ros.replay.player import Player
 
 NODE_NAME = 'replay'
 
@@ -41,56 +48,39 @@ def main(args: Sequence[str] | None = None) -> int:
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog='replay',
+        prog='replay', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='replay BAG [options] [--ros-args ...]',
         description='Publish the messages of a rosbag2 recording (sqlite3 or mcap, also those of '
-        '`ros2 bag record`) with their recorded bytes, types and QoS.',
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+        '`ros2 bag record`) with their recorded bytes, types and QoS.')
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder, or a .mcap or .db3 file')
-    parser.add_argument(
-        '-r', '--rate', type=_positive, default=1.0, metavar='X',
-        help='speed: 2 is twice as fast as recorded (default: 1)',
-    )
+    parser.add_argument('-r', '--rate', type=positive, default=1.0, metavar='X',
+                        help='speed: 2 is twice as fast as recorded (default: 1)')
     parser.add_argument('-l', '--loop', action='store_true', help='begin again at the end')
-    parser.add_argument(
-        '--start-offset', type=_not_negative, default=0.0, metavar='S',
-        help='begin S seconds after the start of the recording',
-    )
-    parser.add_argument(
-        '--topics', nargs='+', metavar='TOPIC', help='publish these only (default: all)'
-    )
-    parser.add_argument(
-        '--exclude', nargs='+', default=[], metavar='TOPIC', help='leave these out'
-    )
-    parser.add_argument(
-        '-m', '--remap', nargs='+', type=_remap_rule, default=[], metavar='OLD:=NEW',
-        help='publish the recorded topic OLD as NEW',
-    )
-    parser.add_argument(
-        '--clock', nargs='?', type=_positive, const=40.0, metavar='HZ',
-        help="publish the recording's time on /clock, HZ times a second (default: 40), for nodes "
-        'with use_sim_time; with --loop it jumps back at each start',
-    )
-    parser.add_argument(
-        '--wait-for-subscribers', nargs='*', metavar='TOPIC',
-        help='begin when each of these topics (all if none is named) has a subscriber',
-    )
-    parser.add_argument(
-        '--wait-timeout', type=_not_negative, default=30.0, metavar='S',
-        help='give up waiting for subscribers after S seconds (default: 30)',
-    )
-    parser.add_argument(
-        '--wait-for-all-acked', type=_not_negative, default=10.0, metavar='S',
-        help='at the end, wait up to S seconds until reliable subscribers have acknowledged all '
-        'messages, which takes about 3 s (default: 10)',
-    )
+    parser.add_argument('--start-offset', type=not_negative, default=0.0, metavar='S',
+                        help='begin S seconds after the start of the recording')
+    parser.add_argument('--topics', nargs='+', type=_absolute, metavar='TOPIC',
+                        help='publish these only (default: all)')
+    parser.add_argument('--exclude', nargs='+', type=_absolute, default=[], metavar='TOPIC',
+                        help='leave these out')
+    parser.add_argument('-m', '--remap', nargs='+', type=_remap_rule, default=[],
+                        metavar='OLD:=NEW', help='publish the recorded topic OLD as NEW')
+    parser.add_argument('--clock', nargs='?', type=positive, const=40.0, metavar='HZ',
+                        help="publish the recording's time on /clock, HZ times a second (default: "
+                        '40), for nodes with use_sim_time; with --loop it jumps back at each '
+                        'start')
+    parser.add_argument('--wait-for-subscribers', nargs='*', type=_absolute, metavar='TOPIC',
+                        help='begin when each of these topics (all if none is named) has a '
+                        'subscriber')
+    parser.add_argument('--wait-timeout', type=not_negative, default=30.0, metavar='S',
+                        help='give up waiting for subscribers after S seconds (default: 30)')
+    parser.add_argument('--wait-for-all-acked', type=not_negative, default=10.0, metavar='S',
+                        help='at the end, wait up to S seconds until reliable subscribers have '
+                        'acknowledged all messages, which takes about 3 s (default: 10)')
     return parser
 
 
 def replay(args: list[str], stop: Interruption) -> int:
-    """Publish a recording until its end or until stopped.
+    """Publish a recording until its end or until stopped; return the exit code.
 
     Parameters
     ----------
@@ -99,11 +89,6 @@ def replay(args: list[str], stop: Interruption) -> int:
     stop : Interruption
         Ends the replay.
 
-    Returns
-    -------
-    int
-        The exit code.
-
     Raises
     ------
     CliplocError
@@ -111,110 +96,46 @@ def replay(args: list[str], stop: Interruption) -> int:
     """
     plain_args, ros_args = split_ros_args(args)
     options = make_parser().parse_args(plain_args)
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise OptionsError(
-            f'replay needs ROS 2 ({error}): source it, or run script/setup'
-        ) from error
-    try:
-        rclpy.init(args=ros_args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # rclpy cannot read the arguments
-        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
-    try:
-        with BagReader(options.bag) as reader:
-            return _play(_make_player(reader, options, stop), options, stop)
-    finally:
-        rclpy.try_shutdown()
+    with needs_ros('replay'):
+        from rclpy.exceptions import InvalidTopicNameException
+        from rclpy.node import Node
+    with running_ros(ros_args), BagReader(options.bag) as reader:
+        from cliploc_ros.ros.replay.player import Player, PlayOptions
 
-
-def _make_player(
-    reader: BagReader, options: argparse.Namespace, stop: Interruption
-) -> 'Player':
-    from rclpy.exceptions import InvalidTopicNameException
-    from rclpy.node import Node
-
-    from cliploc_ros.ros.replay.player import Player, PlayOptions
-
-    play_options = PlayOptions(
-        rate=options.rate,
-        start_offset_s=options.start_offset,
-        topics=None if options.topics is None else [_absolute(name) for name in options.topics],
-        exclude=[_absolute(name) for name in options.exclude],
-        remap=dict(options.remap),
-        clock_hz=options.clock,
-        loop=options.loop,
-    )
-    # Nothing spins this node, so it could not serve its parameters.
-    node = Node(NODE_NAME, start_parameter_services=False)
-    try:
-        return Player(node, reader, play_options, stop)
-    except InvalidTopicNameException as error:
-        raise OptionsError(f'--remap: {error}') from error
+        # Nothing spins this node, so it could not serve its parameters.
+        node = Node(NODE_NAME, start_parameter_services=False)
+        try:
+            player = Player(node, reader, PlayOptions(
+                rate=options.rate, start_offset_s=options.start_offset, topics=options.topics,
+                exclude=options.exclude, remap=dict(options.remap), clock_hz=options.clock,
+                loop=options.loop), stop)
+        except InvalidTopicNameException as error:
+            raise OptionsError(f'--remap: {error}') from error
+        return _play(player, options, stop)
 
 
 def _play(player: 'Player', options: argparse.Namespace, stop: Interruption) -> int:
     if options.wait_for_subscribers is not None:
-        names = [_absolute(name) for name in options.wait_for_subscribers]
-        player.wait_for_subscribers(names, options.wait_timeout)
+        player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
     length_s = (player.end_ns - player.start_ns) / NS_PER_S
-    print(
-        f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
-        f'at rate {options.rate:g}',
-        flush=True,
-    )
+    print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
+          f'at rate {options.rate:g}', flush=True)
     begin = time.monotonic()
-    with tqdm(
-        total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
-        disable=None,  # draws on a terminal only
-    ) as bar:
-        report = player.play(_progress(bar, player.start_ns))
-    _print_report(report, stopped=stop.is_set(), elapsed_s=time.monotonic() - begin)
-    if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
-        print(
-            f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
-            f'within {options.wait_for_all_acked:g} s',
-            file=sys.stderr,
-        )
-    return 0
-
-
-def _progress(bar: 'tqdm[None]', start_ns: int) -> Callable[[BagMessage], None]:
-    def show(message: BagMessage) -> None:
-        bar.update((message.stamp_ns - start_ns) / NS_PER_S - bar.n)
-
-    return show
-
-
-def _print_report(report: 'PlayReport', stopped: bool, elapsed_s: float) -> None:
+    with tqdm(total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+              disable=None) as bar:  # draws on a terminal only
+        report = player.play(lambda message: bar.update(
+            (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
     passes = f', {report.passes} passes' if report.passes > 1 else ''
-    print(
-        f'{"stopped: " if stopped else ""}published {report.counts.total()} messages on '
-        f'{len(report.counts)} topics in {elapsed_s:.1f} s{passes}; '
-        f'at most {report.worst_lateness_s * 1000:.1f} ms late',
-        flush=True,
-    )
+    print(f'{"stopped: " if stop.is_set() else ""}published {report.counts.total()} messages on '
+          f'{len(report.counts)} topics in {time.monotonic() - begin:.1f} s{passes}; '
+          f'at most {report.worst_lateness_s * 1000:.1f} ms late', flush=True)
     if report.unread:
-        print(
-            f'warning: {report.unread} messages that the recording lists were not found in it; '
-            'is it damaged?',
-            file=sys.stderr,
-        )
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
-    return value
-
-
-def _not_negative(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is not a number of 0 or more')
-    return value
+        print(f'warning: {report.unread} messages that the recording lists were not found in it; '
+              'is it damaged?', file=sys.stderr)
+    if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
+        print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
+              f'within {options.wait_for_all_acked:g} s', file=sys.stderr)
+    return 0
 
 
 def _remap_rule(text: str) -> tuple[str, str]:

@@ -92,12 +92,17 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
                        help='interpolate between poses at most so far apart (%(default)s)')
 
 
-def _add_image_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+def add_topic_options(group: Any) -> None:
+    """Add the options that name the images of a bag to a parser or a group of it."""
     group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
     group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
                        help='(%(default)s)')
-    group.add_argument('--rectified', action='store_true', help='--bag has rectified images')
+    group.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+
+
+def _add_image_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+    add_topic_options(group)
     group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
                        help='camera of --tum and --rgbd, where the folder does not say it')
@@ -166,13 +171,16 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
     CliplocError
         The source or the options cannot be used.
     """
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
     from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
 
     if options.bag is not None:
-        return _bag_frames(options)
+        topics = BagTopics(options.image, options.camera_info, options.rectified,
+                           options.depth or '')
+        return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
     if options.pose_topic or options.map_frame or options.depth:
         raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
     folder = FolderOptions(
@@ -185,13 +193,6 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
         return rgbd_frames(options.rgbd, folder)
     return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
                       folder)
-
-
-def _bag_frames(options: argparse.Namespace) -> 'Frames':
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
-
-    topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
-    return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
 
 
 def _read_poses(options: argparse.Namespace) -> 'ReadPoses':

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.cli.sources import add_topic_options
+from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
@@ -37,11 +38,7 @@ Edits are kept beside the map as they are made: a studio that was killed restore
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the studio; return the exit code."""
-    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    options.ros_args = ros_args
-    interrupt_on_sigterm()
-    return run_command(lambda: serve(options))
+    return run_main(make_parser(), serve, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -57,17 +54,14 @@ def make_parser() -> argparse.ArgumentParser:
                         help='boxes and poses of a recording of the place')
     parser.add_argument('--images', type=Path, metavar='BAG|DIR',
                         help='a rosbag2 recording or a TUM folder with the images of the views')
-    parser.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
-    parser.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
-                        help='(%(default)s)')
-    parser.add_argument('--rectified', action='store_true', help='the bag has rectified images')
+    add_topic_options(parser)
     parser.add_argument('--clip-model', metavar='NAME|JSON',
                         help='offer the five phrases that this CLIP finds best, as build_map')
     parser.add_argument('--clip-pretrained', metavar='TAG|FILE', help='its weights')
     parser.add_argument('--device', default='auto', help='of CLIP (%(default)s)')
     parser.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')
-    parser.add_argument('--port', type=_port, default=8080, metavar='N',
+    parser.add_argument('--port', type=within(0, 65535), default=8080, metavar='N',
                         help='the next free one from this on (%(default)s)')
     parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
                         help='listen at this address too; the URL then holds a token '
@@ -169,13 +163,6 @@ def _free_path() -> Path:
     """Return where a new map goes: the first name that no map has."""
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     return next(path for path in map(Path, names) if not path.exists())
-
-
-def _port(text: str) -> int:
-    value = int(text)
-    if not 0 <= value <= 65535:
-        raise argparse.ArgumentTypeError(f'{text} is not within 0 and 65535')
-    return value
 
 
 if __name__ == '__main__':

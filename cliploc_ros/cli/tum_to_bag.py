@@ -10,16 +10,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.command import interrupt_on_sigterm, run_command, split_ros_args
+from cliploc_ros.command import run_main
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.rosbag import STORAGES
-from cliploc_ros.datasets.tum import TumSequence, read_tum
-from cliploc_ros.datasets.tum_conversion import (
-    ConversionOptions,
-    ConversionResult,
-    convert_tum,
-)
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 
 EPILOG = """\
 topics (with --prefix camera: /camera/image and so on):
@@ -36,109 +32,64 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Convert a sequence; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: convert(options))
+    return run_main(make_parser(), convert, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog='tum_to_bag',
+        prog='tum_to_bag', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt) into a rosbag2 '
-        'recording with the topics of the nodes. Needs no sourced ROS.',
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+        'recording with the topics of the nodes. Needs no sourced ROS.')
     parser.add_argument('folder', type=Path, help='the TUM folder')
     parser.add_argument('output', type=Path, help='folder of the recording; must not exist')
-    parser.add_argument(
-        '--every', type=int, default=1, metavar='N', help='take every N-th image only (default: 1)'
-    )
-    parser.add_argument(
-        '--detections',
-        type=Path,
-        metavar='FILE',
-        help='also write these recorded detections (JSON)',
-    )
-    parser.add_argument(
-        '--intrinsics',
-        metavar='fr1|fr2|fr3|FILE',
-        help="the dataset's camera, or a camera.json (default: the folder's camera.json, else "
-        "the camera in the folder's name)",
-    )
-    parser.add_argument(
-        '--storage', choices=list(STORAGES), default='sqlite3', help='default: %(default)s'
-    )
+    parser.add_argument('--every', type=int, default=1, metavar='N',
+                        help='take every N-th image only (default: 1)')
+    parser.add_argument('--detections', type=Path, metavar='FILE',
+                        help='also write these recorded detections (JSON)')
+    parser.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
+                        help="the dataset's camera, or a camera.json (default: the folder's "
+                        "camera.json, else the camera in the folder's name)")
+    parser.add_argument('--storage', choices=list(STORAGES), default='sqlite3',
+                        help='default: %(default)s')
     images = parser.add_mutually_exclusive_group()
-    images.add_argument(
-        '--raw',
-        dest='image_format',
-        action='store_const',
-        const='raw',
-        default='raw',
-        help='write decoded images (the default)',
-    )
-    images.add_argument(
-        '--compressed',
-        dest='image_format',
-        action='store_const',
-        const='compressed',
-        help='write the bytes of the image files as compressed images',
-    )
+    images.add_argument('--raw', dest='image_format', action='store_const', const='raw',
+                        default='raw', help='write decoded images (the default)')
+    images.add_argument('--compressed', dest='image_format', action='store_const',
+                        const='compressed',
+                        help='write the bytes of the image files as compressed images')
     defaults = ConversionOptions()
     parser.add_argument('--prefix', default=defaults.prefix, help='namespace of all topics')
-    parser.add_argument(
-        '--camera-frame', default=defaults.camera_frame, help='default: %(default)s'
-    )
+    parser.add_argument('--camera-frame', default=defaults.camera_frame,
+                        help='default: %(default)s')
     parser.add_argument('--world-frame', default=defaults.world_frame, help='default: %(default)s')
     return parser
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Convert as the command line says; return the exit code."""
+    """Convert, and print what was written and how many images lack something."""
     begin = time.monotonic()
     sequence = read_tum(options.folder).every(options.every)
     camera, origin = find_camera(options.intrinsics, options.folder)
     detections = None
     if options.detections is not None:
-        size = (camera.width, camera.height)
-        detections = read_recorded_detections(options.detections, size)
+        detections = read_recorded_detections(options.detections, (camera.width, camera.height))
     print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
-    conversion = ConversionOptions(
-        storage=options.storage,
-        image_format=options.image_format,
-        prefix=options.prefix,
-        camera_frame=options.camera_frame,
-        world_frame=options.world_frame,
-    )
     result = convert_tum(
-        sequence,
-        camera,
-        options.output,
-        conversion,
+        sequence, camera, options.output,
+        ConversionOptions(options.storage, options.image_format, prefix=options.prefix,
+                          camera_frame=options.camera_frame, world_frame=options.world_frame),
         detections,
-        progress=lambda images: tqdm(images, unit='image', disable=None),  # on a terminal only
-    )
-    report(sequence, result, options, time.monotonic() - begin)
-    return 0
-
-
-def report(
-    sequence: TumSequence, result: ConversionResult, options: argparse.Namespace, elapsed_s: float
-) -> None:
-    """Print what was written, and how many images lack something."""
-    print(
-        f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
-        f'{result.detections} detection messages in {elapsed_s:.1f} s'
-    )
+        progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
+    print(f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
+          f'{result.detections} detection messages in {time.monotonic() - begin:.1f} s')
     if len(sequence.trajectory) == 0:
         print('the folder has no ground truth')
     elif missing := result.images - result.poses:
         print(f'{missing} images have no ground truth within 20 ms and so no pose')
     if options.detections is not None and (missing := result.images - result.detections):
         print(f'{missing} images have no recorded detections and so no detection message')
+    return 0
 
 
 if __name__ == '__main__':

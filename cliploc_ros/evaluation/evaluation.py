@@ -3,8 +3,7 @@
 """An evaluation, from its queries to its table, files and figures."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -113,7 +112,10 @@ class Evaluation:
             raise OptionsError(f'{self.out} holds an unfinished run; continue with --resume, give '
                                f'another --out, or remove {self.out / _JOURNAL}')
         done = journal.read(run) if journal.exists else []
-        with journal.writing(run, done), self._progress(methods, len(done)) as bar:
+        total = len(self.queries) * sum(count_trials(one, self.trials, bool(self.noisy))
+                                        for one in methods)
+        with (journal.writing(run, done),
+              tqdm(total=total, initial=len(done), unit='search', disable=None) as bar):
             def advance(results: list[Result]) -> None:
                 journal.add(results)
                 bar.update(len(results))
@@ -121,13 +123,6 @@ class Evaluation:
             return run_methods(self.landmark_map, methods, self.queries, trials=self.trials,
                                workers=self.workers, scheduler=self.scheduler, done=done,
                                layer=self.layer, noisy=self.noisy, advance=advance)
-
-    @contextmanager
-    def _progress(self, methods: Sequence[Method], done: int) -> Iterator[Any]:
-        total = len(self.queries) * sum(count_trials(one, self.trials, bool(self.noisy))
-                                        for one in methods)
-        with tqdm(total=total, initial=done, unit='search', disable=None) as bar:
-            yield bar
 
     def _describe(self, methods: Sequence[Method]) -> dict[str, Any]:
         """Return what identifies this run, as JSON keeps it."""

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's figures and others, as PNG and SVG."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib import color_sequences
 from matplotlib.axes import Axes
@@ -129,10 +130,11 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG and as SVG beside it; return the path."""
-    # without its date, an SVG of the same results is the same file
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
-    write_file(path.with_suffix('.svg'),
-               lambda partial: figure.savefig(partial, metadata={'Date': None}))
+    # without its date and with fixed ids, an SVG of the same results is the same file
+    with matplotlib.rc_context({'svg.hashsalt': path.stem}):
+        write_file(path.with_suffix('.svg'),
+                   lambda partial: figure.savefig(partial, metadata={'Date': None}))
     return path
 
 
@@ -328,7 +330,9 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
     draw_map(axes, landmark_map)
     axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
               color='#222222', label='truth', zorder=6)
-    for label, color, marker, chosen in _groups(first):
+    for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
+                                          ('refused', '#D55E00', 'X', False)):
+        chosen = [one for one in first if one.error_m is not None and one.accepted == verdict]
         for number, one in enumerate(chosen):
             (x, y), pose = truth[one.query][:2, 3], one.map_from_camera
             assert pose is not None
@@ -337,9 +341,3 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequ
                       label=f'{label} ({len(chosen)})' if number == 0 else None)
     add_legend(figure)
     return figure
-
-
-def _groups(results: Sequence[Result]) -> Iterator[tuple[str, str, str, list[Result]]]:
-    found = [one for one in results if one.error_m is not None]
-    yield 'accepted', '#0072B2', 'o', [one for one in found if one.accepted]
-    yield 'refused', '#D55E00', 'X', [one for one in found if not one.accepted]

@@ -35,17 +35,23 @@ class Journal:
         Raises
         ------
         OptionsError
-            The file belongs to another run; names what differs.
+            The file belongs to another run (names what differs), or is damaged.
         """
+        done: list[Result] = []
         try:
-            lines = self._path.read_text(encoding='utf-8').splitlines()
-            header = json.loads(lines[0])
-            done = [Result(**fields) for line in _whole(lines[1:]) for fields in line]
+            header, *lines = self._path.read_text(encoding='utf-8').splitlines()
+            begun = json.loads(header)
+            for number, line in enumerate(lines, start=1):
+                try:
+                    done += [Result(**fields) for fields in json.loads(line)]
+                except json.JSONDecodeError:
+                    if number < len(lines):
+                        raise  # the last line only may be cut off
         except OSError as error:
             raise OptionsError(f'{self._path}: cannot be read: {error.strerror}') from error
-        except (ValueError, TypeError, IndexError) as error:
+        except (ValueError, TypeError) as error:
             raise OptionsError(f'{self._path}: is damaged; remove it to start again') from error
-        differing = [key for key in run if header.get(key) != run[key]]
+        differing = [key for key in run if begun.get(key) != run[key]]
         if differing:
             raise OptionsError(f'{self._path}: was begun with another {" and ".join(differing)}; '
                                'give the same, or remove it to start again')
@@ -62,7 +68,7 @@ class Journal:
         """
         try:
             with replace_file(self._path) as partial:  # results of hours stay on a full disk
-                partial.write_text(''.join(map(_line, [run, *([_plain(done)] if done else [])])))
+                partial.write_text(json.dumps(run) + '\n' + (_line(done) if done else ''))
             self._file = self._path.open('a', encoding='utf-8')
         except OSError as error:
             raise self._unwritable(error) from error
@@ -81,7 +87,7 @@ class Journal:
             They cannot be written.
         """
         try:
-            self._file.write(_line(_plain(results)))
+            self._file.write(_line(results))
             self._file.flush()
         except OSError as error:
             raise self._unwritable(error) from error
@@ -95,19 +101,5 @@ class Journal:
                             'continue with --resume')
 
 
-def _plain(results: Sequence[Result]) -> list[dict[str, Any]]:
-    return [result.as_dict() for result in results]
-
-
-def _line(content: object) -> str:
-    return json.dumps(content) + '\n'
-
-
-def _whole(lines: list[str]) -> Iterator[Any]:
-    """Yield the content of each line, except of a last line that was cut off."""
-    for number, line in enumerate(lines, start=1):
-        try:
-            yield json.loads(line)
-        except ValueError:
-            if number < len(lines):
-                raise
+def _line(results: Sequence[Result]) -> str:
+    return json.dumps([result.as_dict() for result in results]) + '\n'

@@ -100,12 +100,11 @@ def _read(path: Path, paper: RelocalizerOptions, landmarks: int) -> list[Method]
         raise OptionsError(f'{path}: is not YAML: {error}') from error
     if not isinstance(content, Mapping) or not content:
         raise OptionsError(f'{path}: is not a mapping of names to options')
-    return [_made(path, str(name), options, paper, landmarks)
+    return [_made(f'{path}: {name}', str(name), options, paper, landmarks)
             for name, options in content.items()]
 
 
-def _made(path: Path, name: str, values: Any, paper: RelocalizerOptions, landmarks: int) -> Method:
-    where = f'{path}: {name}'
+def _made(where: str, name: str, values: Any, paper: RelocalizerOptions, landmarks: int) -> Method:
     if not isinstance(values, Mapping):
         raise OptionsError(f'{where}: is not a mapping of options')
     if '@' in name or '/' in name:

@@ -36,15 +36,10 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     rows = [_HEADER, *(_row(one, best) for one in summaries)]
     if not any(one.has_keyframes for one in summaries):
         return rows
-    return [row + more for row, more in zip(
-        rows, [_KEYFRAMES, *map(_keyframe_cells, summaries)], strict=True)]
-
-
-def _keyframe_cells(one: Summary) -> tuple[str, ...]:
-    if not one.has_keyframes:
-        return ('',) * len(_KEYFRAMES)
-    return (' / '.join(str(int((one.sources == source).sum())) for source in _SOURCES),
-            f'{np.median(one.keyframe_inliers):.0f}', f'{one.keyframes_ms.mean():.1f}')
+    cells = [(' / '.join(str(int((one.sources == source).sum())) for source in _SOURCES),
+              f'{np.median(one.keyframe_inliers):.0f}', f'{one.keyframes_ms.mean():.1f}')
+             if one.has_keyframes else ('',) * len(_KEYFRAMES) for one in summaries]
+    return [row + more for row, more in zip(rows, [_KEYFRAMES, *cells], strict=True)]
 
 
 def _row(one: Summary, best: Summary) -> tuple[str, ...]:
@@ -127,13 +122,10 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
             one.false_accepts(), difference.mean, difference.low, difference.high,
             one.crops_share, _kinds(one),
-            *(_keyframe_figures(one) if one.has_keyframes else [''] * 5)])
+            *([*(float((one.sources == source).mean()) for source in _SOURCES),
+               float(np.median(one.keyframe_inliers)), float(one.keyframes_ms.mean())]
+              if one.has_keyframes else [''] * 5)])
     return text.getvalue()
-
-
-def _keyframe_figures(one: Summary) -> list[float]:
-    return [*map(one.share_from, _SOURCES), float(np.median(one.keyframe_inliers)),
-            float(one.keyframes_ms.mean())]
 
 
 def as_json(results: Sequence[Result]) -> str:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """All trials of all methods on all queries, on all cores or on a cluster."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import batched
@@ -108,9 +108,13 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
     """
     known = {(result.method, result.trial, result.query) for result in done}
     # those that draw no samples first, since they take longest
-    parts = [part for method in sorted(methods, key=lambda method: not method.draws_nothing)
-             for part in _parts(method, queries, count_trials(method, trials, bool(noisy)),
-                                known)]
+    parts = [
+        _Part(method, trial, places)
+        for method in sorted(methods, key=lambda method: not method.draws_nothing)
+        for trial in range(count_trials(method, trials, bool(noisy)))
+        for places in batched((place for place, query in enumerate(queries)
+                               if (method.name, trial, query.number) not in known),
+                              1 if method.draws_nothing else _QUERIES_A_PART)]
     results, lost = list(done), []
     # a few queries are done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
@@ -133,15 +137,6 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
 def count_trials(method: Method, trials: int, are_noisy: bool = False) -> int:
     """Return how many trials of a method differ, where its sensors have noise or not."""
     return trials if are_noisy or not method.draws_nothing else 1
-
-
-def _parts(method: Method, queries: Sequence[Query], trials: int,
-           known: set[tuple[str, int, int]]) -> Iterator[_Part]:
-    for trial in range(trials):
-        places = [place for place, query in enumerate(queries)
-                  if (method.name, trial, query.number) not in known]
-        for some in batched(places, 1 if method.draws_nothing else _QUERIES_A_PART):
-            yield _Part(method, trial, some)
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,10 +71,6 @@ class Summary:
         """Return whether queries were compared with keyframes."""
         return self.sources.size > 0
 
-    def share_from(self, source: str) -> float:
-        """Return the share of all queries whose pose comes from a source."""
-        return float((self.sources == source).mean()) if self.has_keyframes else 0.0
-
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a distance of the truth, accepted or not."""
         return float((self.errors_m < limit_m).mean())
@@ -147,21 +143,19 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     queries = tuple(dict.fromkeys(result.query for result in results))
 
     def column(name: str) -> NDArray[Any]:
-        return np.array([getattr(result, name) for result in results]).reshape(-1, len(queries))
+        values = [getattr(result, name) for result in results]
+        values = [np.inf if value is None else value for value in values]
+        return np.array(values).reshape(-1, len(queries))
 
     kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
-    keyframes = {name: column(name) for name in ('keyframe_inliers', 'keyframes_ms')}
-    if (keyframes['keyframes_ms'] > 0.0).any():
-        keyframes['sources'] = column('source')
-    else:
-        keyframes = {}
-    errors = [np.inf if result.error_m is None else result.error_m for result in results]
+    keyframes = {}
+    if (column('keyframes_ms') > 0.0).any():
+        keyframes = {'sources': column('source'), 'keyframe_inliers': column('keyframe_inliers'),
+                     'keyframes_ms': column('keyframes_ms')}
     return Summary(
-        method, queries, np.array(errors).reshape(-1, len(queries)), column('accepted'),
-        column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        column('hypotheses'), column('boxes')[0],
-        np.array([np.inf if result.nees is None else result.nees for result in results]
-                 ).reshape(-1, len(queries)), float(column('crops_share').mean()),
+        method, queries, column('error_m'), column('accepted'), column('confidence'),
+        column('search_ms'), column('coverage'), column('best_iteration'), column('hypotheses'),
+        column('boxes')[0], column('nees'), float(column('crops_share').mean()),
         dict(kinds.most_common()), **keyframes)
 
 
@@ -188,15 +182,10 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
     Parameters
     ----------
     one, other : Summary
-        Of the same queries.
+        Of the same queries; the success of the other is subtracted.
     limit_m : float
         Limit of success.
     seed : int
-
-    Returns
-    -------
-    Difference
-        Success of the one less that of the other.
     """
     assert one.queries == other.queries
     gains = ((one.errors_m < limit_m).mean(axis=0) - (other.errors_m < limit_m).mean(axis=0))

@@ -212,13 +212,12 @@ def test_signal_ends_the_wait_for_subscribers(tmp_path, start, listener):
     assert 'published 0 messages' in stop(process, signal.SIGTERM)
 
 
-def write_foreign(path, msgtype, definition, type_hash):
+def write_foreign(path, msgtype, definition):
     """Write a recording of a type that the package's own writer does not know."""
+    type_hash = 'RIHS01_' + '1' * 64
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        connection = bag.add_connection(
-            '/odd', msgtype, msgdef=definition, rihs01=type_hash,
-            offered_qos_profiles=[RECORDED_QOS],
-        )
+        connection = bag.add_connection('/odd', msgtype, msgdef=definition, rihs01=type_hash,
+                                        offered_qos_profiles=[RECORDED_QOS])
         bag.write(connection, START_NS, b'\x00\x01\x00\x00\x01\x00\x00\x00')
     return path
 
@@ -232,19 +231,13 @@ def assert_refused(done, *messages):
         assert message in line
 
 
-def test_missing_package_is_named(tmp_path):
-    bag = write_foreign(tmp_path / 'bag', 'my_msgs/msg/Odd', 'int32 x', 'RIHS01_' + '1' * 64)
-    assert_refused(
-        run('replay', bag), '/odd needs my_msgs/msg/Odd', 'package my_msgs', 'ros-jazzy-my-msgs',
-        '--exclude /odd',
-    )
-
-
-def test_other_definition_is_refused(tmp_path):
-    bag = write_foreign(
-        tmp_path / 'bag', 'std_msgs/msg/Int32', 'int32 value', 'RIHS01_' + '1' * 64
-    )
-    assert_refused(run('replay', bag), '/odd', 'another definition of std_msgs/msg/Int32')
+@pytest.mark.parametrize(('msgtype', 'definition', 'messages'), [
+    ('my_msgs/msg/Odd', 'int32 x', ['/odd needs my_msgs/msg/Odd', 'package my_msgs',
+                                    'ros-jazzy-my-msgs', '--exclude /odd']),
+    ('std_msgs/msg/Int32', 'int32 value', ['/odd', 'another definition of std_msgs/msg/Int32']),
+], ids=['missing package', 'other definition'])
+def test_foreign_types_are_named(tmp_path, msgtype, definition, messages):
+    assert_refused(run('replay', write_foreign(tmp_path / 'bag', msgtype, definition)), *messages)
 
 
 @pytest.mark.parametrize(

@@ -172,42 +172,31 @@ def assert_nothing_at(output):
     assert not list(output.parent.glob('.*partial'))
 
 
-def truncate_image(sequence):
-    path = sequence.folder / 'rgb' / f'{sequence.stamps[2]}.png'
-    path.write_bytes(path.read_bytes()[:20])
+def encoded(kind, image):
+    return cv2.imencode(kind, image)[1].tobytes()
 
 
-def empty_image(sequence):
-    (sequence.folder / 'rgb' / f'{sequence.stamps[2]}.png').write_bytes(b'')
+TALL = np.zeros((SIZE[1] * 2, SIZE[0], 3), dtype=np.uint8)
 
 
-def enlarge_image(sequence):
-    path = sequence.folder / 'rgb' / f'{sequence.stamps[2]}.png'
-    assert cv2.imwrite(str(path), np.zeros((SIZE[1] * 2, SIZE[0], 3), dtype=np.uint8))
-
-
-def bitmap_image(sequence):
-    path = sequence.folder / 'rgb' / f'{sequence.stamps[2]}.png'
-    encoded = cv2.imencode('.bmp', sequence.images_bgr[2])[1]
-    path.write_bytes(encoded.tobytes())
-
-
-@pytest.mark.parametrize(
-    ('damage', 'messages'),
-    [
-        (truncate_image, ['100.200000.png', 'cannot be decoded as an image']),
-        (empty_image, ['100.200000.png', 'cannot be decoded as an image']),
-        (enlarge_image, ['100.200000.png', '64x96', '64x48']),
-        (bitmap_image, ['100.200000.png', 'neither PNG nor JPEG']),
-        (lambda sequence: (sequence.folder / 'rgb.txt').unlink(), ['rgb.txt']),
-        (lambda sequence: (sequence.folder / 'camera.json').unlink(), ['--intrinsics']),
-        (lambda sequence: (sequence.folder / 'camera.json').write_text('{'), ['camera.json']),
-    ],
-)
-def test_bad_folders_are_refused(make_sequence, tmp_path, assert_refused, damage, messages):
-    sequence = make_sequence()
-    damage(sequence)
-    assert_refused(sequence.folder, tmp_path / 'bag', ['--compressed'], *messages)
+@pytest.mark.parametrize(('file', 'content', 'messages'), [
+    ('rgb/100.200000.png', encoded('.png', TALL)[:20],
+     ['100.200000.png', 'cannot be decoded as an image']),
+    ('rgb/100.200000.png', b'', ['100.200000.png', 'cannot be decoded as an image']),
+    ('rgb/100.200000.png', encoded('.png', TALL), ['100.200000.png', '64x96', '64x48']),
+    ('rgb/100.200000.png', encoded('.bmp', TALL), ['100.200000.png', 'neither PNG nor JPEG']),
+    ('rgb.txt', None, ['rgb.txt']),
+    ('camera.json', None, ['--intrinsics']),
+    ('camera.json', b'{', ['camera.json']),
+], ids=['truncated', 'empty', 'tall', 'bitmap', 'no list', 'no camera', 'no JSON'])
+def test_bad_folders_are_refused(make_sequence, tmp_path, assert_refused, file, content,
+                                 messages):
+    folder = make_sequence().folder
+    if content is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_bytes(content)
+    assert_refused(folder, tmp_path / 'bag', ['--compressed'], *messages)
 
 
 def test_bad_options_are_refused(make_sequence, tmp_path, assert_refused):
@@ -246,9 +235,8 @@ def test_full_disk_leaves_nothing(make_sequence, tmp_path, storage):
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
-    done = run(
-        'tum_to_bag', sequence.folder, tmp_path / 'bag', '--storage', storage, preexec_fn=limit
-    )
+    done = run('tum_to_bag', sequence.folder, tmp_path / 'bag', '--storage', storage,
+               preexec_fn=limit)
     assert done.returncode == 1
     assert_one_line(done.stderr, 'cannot be written', 'no partial file remains')
     assert_nothing_at(tmp_path / 'bag')

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 
-from cliploc_ros.evaluation.figures import precision_recall
+from cliploc_ros.evaluation.figures import new_axes, precision_recall, save_figure
 from cliploc_ros.evaluation.paper_table import (
     as_csv,
     as_json,
@@ -135,6 +135,16 @@ def test_csv_and_json_say_the_same():
     assert 0.0 < bounds[0] < bounds[1] == 0.5 < bounds[2] < 1.0
     assert [row['error_m'] for row in json.loads(as_json(results))] == [0.1, 0.4, 3.0, None]
     assert len(as_json(results).splitlines()) == 6
+
+
+def test_figures_of_the_same_results_are_the_same_files(tmp_path):
+    contents = []
+    for _ in range(2):
+        figure, axes = new_axes('x', 'y')
+        axes.plot([1, 2], [3, 4], marker='o')
+        path = save_figure(figure, tmp_path / 'figure.png')
+        contents.append([one.read_bytes() for one in (path, path.with_suffix('.svg'))])
+    assert contents[0] == contents[1]
 
 
 def test_precision_falls_as_recall_rises():

@@ -53,6 +53,14 @@ def moved(table: LandmarkMap, row: int, offset) -> LandmarkMap:
     return replace(table, centers=centers)
 
 
+def only(detections, kept):
+    """Return the detections with some of the boxes."""
+    counts = np.bincount(detections.frames[kept], minlength=len(detections))
+    return replace(detections, frame_offsets=np.cumsum([0, *counts]),
+                   bboxes_xyxy=detections.bboxes_xyxy[kept], classes=detections.classes[kept],
+                   scores=detections.scores[kept])
+
+
 def witness_of(table, detections):
     views = make_views(detections, MAPPING)
     return views, hear_witness(views, table, detections.class_names, MAPPING)
@@ -66,6 +74,13 @@ def detections():
 @pytest.fixture(scope='module')
 def report(detections):
     return check_map(TABLE, detections, options=QUICK)
+
+
+@pytest.fixture(scope='module')
+def rooms_report():
+    """Of two identical rooms, 10 m apart."""
+    other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
+    return check_map(joined(TABLE, other), options=QUICK)
 
 
 def test_a_true_map_has_no_fault(report):
@@ -141,8 +156,7 @@ def test_neighbours_that_frames_show_apart_are_no_duplicates():
     assert not recorded.is_duplicate
 
 
-def test_a_symmetric_place_is_one_place(detections):
-    report = check_map(TABLE, detections, options=QUICK)
+def test_a_symmetric_place_is_one_place(report):
     pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
     advice = give_advice(replace(report, look_alikes=(pair,)))
     assert any(text.startswith('the place around x 5.7, y 3.5 looks the same when turned by 180 '
@@ -167,26 +181,23 @@ def test_rooms_of_other_objects_do_not_look_alike():
     assert find_look_alikes(joined(TABLE, other)) == []
 
 
-def test_identical_rooms_fail_the_check():
-    other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
-    rooms = joined(TABLE, other)
-    report = check_map(rooms, options=QUICK)
-    assert not report.passed
-    assert any('look alike' in text for text in report.failures)
-    assert 'nothing tells them apart' in report.advice[0]
-    assert not any('map more objects' in text for text in report.advice)  # that would not help
-    assert sum(one.verdict == 'accepted' for one in report.grid.trials) == 0
+def test_identical_rooms_fail_the_check(rooms_report):
+    assert not rooms_report.passed
+    assert any('look alike' in text for text in rooms_report.failures)
+    assert 'nothing tells them apart' in rooms_report.advice[0]
+    # more objects would not help
+    assert not any('map more objects' in text for text in rooms_report.advice)
+    assert sum(one.verdict == 'accepted' for one in rooms_report.grid.trials) == 0
 
 
-def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double():
-    other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
-    report = check_map(joined(TABLE, other), options=QUICK)
-    seen = next(one for one in report.grid.trials if one.landmarks > 3)
+def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_report):
+    grid = rooms_report.grid
+    seen = next(one for one in grid.trials if one.landmarks > 3)
 
     def misled_to(estimate):
         trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
-        grid = replace(report.grid, trials=(*report.grid.trials, trial))
-        return give_advice(replace(report, grid=grid))
+        return give_advice(replace(
+            rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))
 
     side = np.sign(5.0 - seen.position[0])  # to the other room
     into_double = misled_to(seen.position + np.array([10.0 * side, 0.2, 0.0]))
@@ -255,11 +266,7 @@ def test_a_landmark_of_one_block_is_missing_from_its_fold():
     detections = see(TABLE, walk_around(frames=120))
     # thing_0 is a book: its boxes outside of the first four seconds go
     _, witness = witness_of(TABLE, detections)
-    kept = (witness.shown != 0) | (detections.frames < 20)
-    counts = np.bincount(detections.frames[kept], minlength=120)
-    rest = replace(detections, frame_offsets=np.cumsum([0, *counts]),
-                   bboxes_xyxy=detections.bboxes_xyxy[kept], classes=detections.classes[kept],
-                   scores=detections.scores[kept])
+    rest = only(detections, (witness.shown != 0) | (detections.frames < 20))
     views, witness = witness_of(TABLE, rest)
     folds = list(make_folds(views, witness, QUICK))
     assert sorted(np.concatenate([one.frames for one in folds])) == list(range(120))
@@ -283,11 +290,7 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
 
 def test_stretches_without_landmarks_become_advice(detections):
     # from 4 to 8 s nothing is detected
-    kept = ~np.isin(detections.frames, np.arange(20, 41))
-    counts = np.bincount(detections.frames[kept], minlength=120)
-    gap = replace(detections, frame_offsets=np.cumsum([0, *counts]),
-                  bboxes_xyxy=detections.bboxes_xyxy[kept], classes=detections.classes[kept],
-                  scores=detections.scores[kept])
+    gap = only(detections, ~np.isin(detections.frames, np.arange(20, 41)))
     report = check_map(TABLE, gap, options=QUICK)
     assert any(re.match(r'record this side: \d frames at [45] s.* see no landmarks', text)
                for text in report.advice), report.advice

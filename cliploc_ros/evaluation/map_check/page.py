@@ -115,18 +115,14 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              ('grid positions near the recording with an accepted heading'
               if report.recording else 'grid positions with an accepted heading',
               f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
-    return rows + _keyframe_figures(report)
-
-
-def _keyframe_figures(report: CheckReport) -> list[tuple[str, str]]:
-    if (one := report.keyframes) is None:
-        return []
-    rows = [('keyframes', f'{one.keyframes} with {one.points} points')]
-    if len(one.recorded):
-        rows.append(('recorded frames within reach of a keyframe',
-                     f'{one.recorded.mean():.0%} of {len(one.recorded)}'))
-    return [*rows, ('grid positions within reach of a keyframe',
-                    f'{one.reached_positions:.0%} of {int(one.is_near.sum())}')]
+    if (layer := report.keyframes) is not None:
+        rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
+        if len(layer.recorded):
+            rows.append(('recorded frames within reach of a keyframe',
+                         f'{layer.recorded.mean():.0%} of {len(layer.recorded)}'))
+        rows.append(('grid positions within reach of a keyframe',
+                     f'{layer.reached_positions:.0%} of {int(layer.is_near.sum())}'))
+    return rows
 
 
 def _verdicts(trials: Sequence[Trial]) -> str:

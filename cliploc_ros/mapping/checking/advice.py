@@ -126,17 +126,14 @@ def _on_look_alikes(report: CheckReport) -> Iterator[str]:
             if one.same_labels == matched else (
             f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
         mistaken = sum(_takes_for(trial, one) for trial in _misled(report))
-        yield (f'{_alike(one)} ({matched} of {one.landmarks} landmarks)'
+        distance_m = np.hypot(one.first[0] - one.second[0], one.first[1] - one.second[1])
+        alike = (f'the place around {_place(one.first)} looks the same when turned by '
+                 f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
+            f'the places around {_place(one.first)} and {_place(one.second)} look alike')
+        yield (f'{alike} ({matched} of {one.landmarks} landmarks)'
                + (f', and {mistaken} of the checked views are accepted in the wrong one'
                   if mistaken else '') + f': {told_apart}')
     yield from _more(len(report.look_alikes), 'pairs of places that look alike')
-
-
-def _alike(pair: LookAlike) -> str:
-    if np.hypot(pair.first[0] - pair.second[0], pair.first[1] - pair.second[1]) < _SAME_POSE_M:
-        return (f'the place around {_place(pair.first)} looks the same when turned by '
-                f'{abs(pair.turn_deg):.0f} degrees')
-    return f'the places around {_place(pair.first)} and {_place(pair.second)} look alike'
 
 
 def _on_spans(report: CheckReport) -> Iterator[str]:

@@ -95,6 +95,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     notes = [*_NOTES]
     witness: Witness | None = None
     recording: RecordingCheck | None = None
+    recorded: NDArray[np.float64] | None = None
     if detections is not None:
         tell('judging landmarks', 0.0)
         views = make_views(detections, options.mapping)
@@ -106,12 +107,15 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         recording = _check_recording(landmark_map, detections, views, witness, model, options,
                                      tell)
         overlaps = find_map_overlaps(landmark_map, witness, views)
-        grid = _check_grid(landmark_map, model, detections.map_from_camera, options, tell)
+        recorded = detections.map_from_camera
     else:
         notes.append(_NO_RECORDING)
         model = guess_detector(landmark_map, options.mapping)
         overlaps = find_map_overlaps(landmark_map, None, None)
-        grid = _check_grid(landmark_map, model, None, options, tell)
+    places = make_grid(landmark_map, recorded, options)
+    grid = judge_grid(places, model, try_poses(
+        model, landmark_map, places.poses, options,
+        lambda share: tell('relocalizing on the grid', share)), options.headings)
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
@@ -119,34 +123,17 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         queries=tuple(try_observations(landmark_map, queries, options,
                                        lambda share: tell('relocalizing queries', share))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
-        keyframes=None if layer is None else check_keyframes(
-            layer, grid, None if detections is None else detections.map_from_camera))
+        keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
     tell('done', 1.0)
     return replace(report, advice=tuple(give_advice(report)),
                    failures=tuple(find_failures(report, thresholds or Thresholds())))
-
-
-def _check_grid(landmark_map: LandmarkMap, model: DetectorModel,
-                recorded: NDArray[np.float64] | None, options: CheckOptions, tell: Progress
-                ) -> GridCheck:
-    grid = make_grid(landmark_map, recorded, options)
-    trials = try_poses(model, landmark_map, grid.poses, options,
-                       lambda share: tell('relocalizing on the grid', share))
-    return judge_grid(grid, model, trials, options.headings)
 
 
 def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
                ) -> GridCheck:
     """Return what trials say of a grid, or of its first positions.
 
-    Parameters
-    ----------
-    grid : Grid
-    model : DetectorModel
-        That the trials were made with.
-    trials : sequence of Trial
-        Heading by heading of each position.
-    headings : int
+    The trials were made with the model, heading by heading of each position.
     """
     count = len(trials) // headings
     trials = trials[:count * headings]

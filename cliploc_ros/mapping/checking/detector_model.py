@@ -19,6 +19,7 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.mapping.checking.landmark_faults import Witness
+from cliploc_ros.mapping.checking.systematic import linearize_boxes
 from cliploc_ros.mapping.evidence import best_ious
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
@@ -204,24 +205,9 @@ def _edge_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) ->
     rows = np.nonzero(shown >= 0)[0]
     if len(rows) == 0:
         return 1.0
-    residuals = _edge_residuals(views, rows, shown[rows], landmarks.centers, landmarks.bases)
-    return float(np.clip(1.4826 * np.nanmedian(np.abs(residuals)), 0.3, 5.0))
-
-
-@compiled
-def _edge_residuals(views, rows, landmarks, centers, bases):
-    """Return how far the projected edges (m, 4) are off; NaN for open edges."""
-    residuals, box = np.full((len(rows), 4), np.nan), np.empty(4)
-    for place in range(len(rows)):
-        row, landmark = rows[place], landmarks[place]
-        frame = views.frames[row]
-        if project_box(views.rotations[frame], views.translations[frame], centers[landmark],
-                       bases[landmark], box):
-            for edge in range(4):
-                if not views.is_open[row, edge]:
-                    residuals[place, edge] = (box[edge] - views.edges[row, edge]) \
-                        * views.stiffness[row, edge]
-    return residuals
+    linear = linearize_boxes(views, rows, shown[rows], landmarks)
+    residuals = np.abs(linear.residuals[linear.weights > 0.0])  # those of closed edges
+    return float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
 
 
 def _clutter(detections: PosedDetections, ious: NDArray[np.float64], frames: NDArray[np.int64]

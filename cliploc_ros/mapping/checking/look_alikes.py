@@ -13,7 +13,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 #: Places are so far apart: each is the surroundings of a landmark [m].
 RADIUS_M = 2.0
-# Places that repeat fewer of each other's landmarks do so by chance; labels tell them apart.
+# Places that repeat fewer of each other's landmarks do so by chance; labels tell them apart. The
+# share of find_alike, which only proposes rivals of a pose, would report most offices and shops.
 _LEAST_SHARE = 0.6
 
 
@@ -51,8 +52,12 @@ def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
 
     A place that a turn by more than 45 degrees lays on itself counts, too.
     """
-    found = [one for position in _places(landmark_map)
-             for one in _look_alikes(landmark_map, position)]
+    found: list[LookAlike] = []
+    left = np.ones(len(landmark_map), dtype=np.bool_)
+    for row, position in enumerate(landmark_map.centers):
+        if left[row]:
+            left[landmark_map.tree.query_ball_point(position, RADIUS_M)] = False
+            found += _look_alikes(landmark_map, position)
     kept: list[LookAlike] = []
     for one in sorted(found, key=lambda one: (-len(one.matched) * one.share, -one.share)):
         if not any((_near(one.first, other.first) and _near(one.second, other.second))
@@ -60,15 +65,6 @@ def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
                    for other in kept):
             kept.append(one)
     return kept
-
-
-def _places(landmark_map: LandmarkMap) -> Iterator[NDArray[np.float64]]:
-    """Yield the centres of landmarks, none within a place yielded before."""
-    left = np.ones(len(landmark_map), dtype=np.bool_)
-    for row, center in enumerate(landmark_map.centers):
-        if left[row]:
-            left[landmark_map.tree.query_ball_point(center, RADIUS_M)] = False
-            yield center
 
 
 def _look_alikes(landmark_map: LandmarkMap, position: NDArray[np.float64]

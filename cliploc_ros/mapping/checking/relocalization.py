@@ -131,15 +131,8 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
               options: CheckOptions) -> Iterator[Trial]:
     """Relocalize simulated frames, one at each step.
 
-    Parameters
-    ----------
-    model : DetectorModel
-        What there is to see.
-    landmark_map : LandmarkMap
-        What the relocalizer knows.
-    poses : ndarray (k, 4, 4)
-        True poses map_from_camera.
-    options : CheckOptions
+    The model has what there is to see, the map what the relocalizer knows; poses (k, 4, 4) are
+    the true map_from_camera.
     """
     labels, relocalizer = LabelModel.of(landmark_map), _relocalizer(landmark_map, options)
     for number, pose in enumerate(poses):

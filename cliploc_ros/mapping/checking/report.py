@@ -190,6 +190,8 @@ class CheckReport:
         What the figures rest on.
     keyframes : KeyframeCheck, optional
         What the keyframes next to the map reach; None without any.
+    map_ids : tuple of str
+        Ids in the map's order, which overlaps refer to.
     """
 
     landmarks: tuple[LandmarkCheck, ...]
@@ -202,6 +204,7 @@ class CheckReport:
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     keyframes: KeyframeCheck | None = None
+    map_ids: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -225,20 +228,15 @@ class CheckReport:
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
             'landmarks': [asdict(one) for one in self.landmarks],
-            'overlaps': [{'first': self._id(one.first), 'second': self._id(one.second),
-                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
+            'overlaps': [{'first': self.map_ids[one.first],
+                          'second': self.map_ids[one.second], 'distance': one.distance,
+                          'is_duplicate': one.is_duplicate}
                          for one in self.overlaps],
             'look_alikes': [asdict(one) for one in self.look_alikes],
             'grid': _grid_dict(self.grid),
             'recording': None if self.recording is None else _recording_dict(self.recording),
             'queries': [_trial_dict(one) for one in self.queries],
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
-
-    def _id(self, row: int) -> str:
-        return self.map_ids[row]
-
-    #: Ids in the map's order, which overlaps refer to.
-    map_ids: tuple[str, ...] = ()
 
 
 def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:

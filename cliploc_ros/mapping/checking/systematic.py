@@ -80,28 +80,16 @@ class Linear(NamedTuple):
 
 
 class _Cause(NamedTuple):
-    """A cause of residuals: G numbers.
-
-    Parameters
-    ----------
-    cause : str
-    names, units : tuple of str
-    factors : tuple of float
-        From the numbers' own units to those shown.
-    effects_px : tuple of float
-        Of one shown unit.
-    differentiate : callable
-        Returns the derivatives (m, 4, G) of the residuals of some rows.
-    apply : callable
-        Returns views with the numbers (G,) applied.
-    """
+    """A cause of residuals: G numbers."""
 
     cause: str
     names: tuple[str, ...]
     units: tuple[str, ...]
-    factors: tuple[float, ...]
-    effects_px: tuple[float, ...]
+    factors: tuple[float, ...]  # from the numbers' own units to those shown
+    effects_px: tuple[float, ...]  # of one shown unit
+    # returns the derivatives (m, 4, G) of the residuals of some rows
     differentiate: Callable[[Views, NDArray[np.int64], Linear], NDArray[np.float64]]
+    # returns views with the numbers (G,) applied
     apply: Callable[[Views, NDArray[np.float64]], Views]
 
 
@@ -170,7 +158,17 @@ def _mount(camera: Camera) -> _Cause:
 
 
 def _stamps(camera: Camera, views: Views) -> _Cause:
-    twists = _twists(views)
+    # how the map moves in the camera (F, 6) [m/s] [rad/s], by central differences
+    rotations, translations = views.rotations, views.translations
+    later = np.minimum(np.arange(len(rotations)) + 1, len(rotations) - 1)
+    earlier = np.maximum(np.arange(len(rotations)) - 1, 0)
+    seconds = (views.stamps_s[later] - views.stamps_s[earlier])[:, None]
+    turns = np.einsum('fij,fkj->fik', rotations[later], rotations[earlier])
+    # x_later = turn x_earlier + shift, linearized about the frame
+    shifts = translations[later] - np.einsum('fij,fj->fi', turns, translations[earlier])
+    twists = np.concatenate([shifts, Rotation.from_matrix(turns).as_rotvec()], axis=1)
+    smooth = (seconds > 0.0) & (seconds < 0.5)
+    twists = np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
     speeds = np.abs(twists[:, 3:]).max(axis=1) + np.abs(twists[:, :3]).max(axis=1) / 2.0
     pixels_per_ms = 0.5 * (camera.fx + camera.fy) * float(np.quantile(speeds, 0.9)) / 1000.0
     return _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,), (pixels_per_ms,),
@@ -261,20 +259,6 @@ def _linearize_all(views, rows, numbers, centers, bases, residuals, weights, by_
             weights[place, edge] = robust_weight(residuals[place, edge])
             by_landmark[place, edge] *= views.stiffness[row, edge]
             by_pose[place, edge] *= views.stiffness[row, edge]
-
-
-def _twists(views: Views) -> NDArray[np.float64]:
-    """Return how the map moves in the camera (F, 6) [m/s] [rad/s], by central differences."""
-    rotations, translations = views.rotations, views.translations
-    later = np.minimum(np.arange(len(rotations)) + 1, len(rotations) - 1)
-    earlier = np.maximum(np.arange(len(rotations)) - 1, 0)
-    seconds = (views.stamps_s[later] - views.stamps_s[earlier])[:, None]
-    turns = np.einsum('fij,fkj->fik', rotations[later], rotations[earlier])
-    # x_later = turn x_earlier + shift, linearized about the frame
-    shifts = translations[later] - np.einsum('fij,fj->fi', turns, translations[earlier])
-    twists = np.concatenate([shifts, Rotation.from_matrix(turns).as_rotvec()], axis=1)
-    smooth = (seconds > 0.0) & (seconds < 0.5)
-    return np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
 
 
 def _solve(derivatives: NDArray[np.float64], linear: Linear, numbers: NDArray[np.int64],
