@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Self
 
 from cliploc_ros.errors import CliplocError, OptionsError
 
@@ -167,6 +168,27 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
         if arg == '--' and target is ros_args:
             target = plain_args
     return plain_args, ros_args
+
+
+class StageBar:
+    """A progress bar that names the stage; nothing where there is no terminal."""
+
+    def __enter__(self) -> Self:
+        """Show the bar."""
+        from tqdm import tqdm  # late, so that --help is fast
+
+        self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bar."""
+        self._bar.close()
+
+    def show(self, stage: str, share: float) -> None:
+        """Show a stage and how much of it is done, 0 to 1."""
+        self._bar.set_description_str(stage, refresh=False)
+        self._bar.n = round(100 * share)
+        self._bar.refresh()
 
 
 class Interruption:

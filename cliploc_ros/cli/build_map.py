@@ -17,7 +17,7 @@ from cliploc_ros.cli.map_layer import (
     write_layer,
 )
 from cliploc_ros.cli.sources import add_source_options, clip_options, read_source, source_of
-from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command, split_ros_args
+from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -42,10 +42,7 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Build a map; return the exit code."""
-    plain_args, _ = split_ros_args(sys.argv[1:] if args is None else args)
-    options = make_parser().parse_args(plain_args)
-    interrupt_on_sigterm()
-    return run_command(lambda: build(options))
+    return run_main(make_parser(), build, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -73,12 +70,12 @@ def make_parser() -> argparse.ArgumentParser:
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
                        '--pose-noise or --update is given, or estimated from the boxes)')
-    poses.add_argument('--pose-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
+    poses.add_argument('--pose-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
-    poses.add_argument('--pose-correlation', type=_seconds, default=3.0, metavar='SECONDS',
+    poses.add_argument('--pose-correlation', type=not_negative, default=3.0, metavar='SECONDS',
                        help='time after which a pose error is another one (%(default)s)')
-    poses.add_argument('--odometry-noise', type=_deviation, nargs=2, metavar=('METRES', 'DEGREES'),
+    poses.add_argument('--odometry-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of odometry on each axis after a metre of the '
                        'way (0.03 1.5)')
     poses.add_argument('--refine-mount', action='store_true',
@@ -122,7 +119,7 @@ def build(options: argparse.Namespace) -> int:
                              options.vocabulary)
     name = source_of(options).name
     if update is None:
-        with _ProgressBar() as bar:
+        with StageBar() as bar:
             made = make_map(detections, labeller, mapping, *layer_input(options), bar.show)
         lines = made.report.lines()
         head = [f'built by build_map from {name}', *lines[:2]]
@@ -190,39 +187,6 @@ def _write_report(path: Path, report: dict[str, Any]) -> None:
             partial.write_text(json.dumps(report, indent=1))
     except OSError as error:
         raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
-
-
-class _ProgressBar:
-    """A bar on the terminal that names the stage; nothing where there is no terminal."""
-
-    def __enter__(self) -> '_ProgressBar':
-        from tqdm import tqdm
-
-        self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def show(self, stage: str, share: float) -> None:
-        """Show a stage and how much of it is done."""
-        self._bar.set_description_str(stage)
-        self._bar.n = round(100 * share)
-        self._bar.refresh()
-
-
-def _deviation(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
-    return value
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
-    return value
 
 
 if __name__ == '__main__':

@@ -8,11 +8,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.command import (
+    StageBar,
     positive,
     positive_int,
     printable,
@@ -36,28 +36,6 @@ examples:
 
 exit code: 0 the map reaches all thresholds, 1 it misses one or the input is invalid
 """
-
-
-class StageBar:
-    """A bar that names the stage; nothing where there is no terminal."""
-
-    def __enter__(self) -> 'StageBar':
-        """Show the bar."""
-        from tqdm import tqdm  # late, so that --help is fast
-
-        self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Close the bar."""
-        self._bar.close()
-
-    def show(self, stage: str, share: float) -> None:
-        """Show a stage and how much of it is done, 0 to 1."""
-        self._bar.set_description_str(stage, refresh=False)
-        self._bar.n = round(100 * share)
-        self._bar.refresh()
 
 
 def main(args: Sequence[str] | None = None) -> int:
