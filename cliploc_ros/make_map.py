@@ -35,46 +35,25 @@ _USUAL_NOISE = PoseErrors(0.05, 1.0)
 
 @dataclass(frozen=True)
 class MadeMap:
-    """A map and what belongs next to it.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    report : MappingReport or UpdateReport
-        What was found and left out, and why.
-    embeddings : LandmarkEmbeddings, optional
-        What CLIP saw of each landmark.
-    layer : KeyframeLayer, optional
-    mount : MountCorrection, optional
-        Where a correction was asked for.
-    """
+    """A map and what belongs next to it."""
 
     landmark_map: LandmarkMap
-    report: MappingReport | UpdateReport
-    embeddings: LandmarkEmbeddings | None = None
+    report: MappingReport | UpdateReport  #: What was found and left out, and why
+    embeddings: LandmarkEmbeddings | None = None  #: What CLIP saw of each landmark
     layer: KeyframeLayer | None = None
-    mount: MountCorrection | None = None
+    mount: MountCorrection | None = None  #: Where a correction was asked for
 
 
 @dataclass(frozen=True)
 class Labeller:
-    """Describes landmarks: by the words of a vocabulary, or by their class where CLIP is missing.
-
-    Parameters
-    ----------
-    vocabulary : Vocabulary
-    clip : ClipOptions, optional
-        The CLIP that made the embeddings of the recording, with its weights; None: labels are
-        class names.
-    weights : ClipWeights, optional
-    note : str
-        Why labels are class names; '' where they are not.
-    """
+    """Describes landmarks by phrases, or by their class where CLIP is missing."""
 
     vocabulary: Vocabulary
+    #: The CLIP that made the embeddings of the recording, with its weights; None: labels are class
+    #: names
     clip: ClipOptions | None = None
     weights: ClipWeights | None = None
-    note: str = ''
+    note: str = ''  #: Why labels are class names; '' where they are not
 
     def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
@@ -82,8 +61,6 @@ class Labeller:
 
         Parameters
         ----------
-        landmark_map : LandmarkMap
-        detections : PosedDetections
         shown : ndarray (n,) of int
             Row of the landmark that each box shows, -1 for none.
 
@@ -112,7 +89,6 @@ def find_labeller(detections: PosedDetections, clip: ClipOptions | None,
 
     Parameters
     ----------
-    detections : PosedDetections
     clip : ClipOptions, optional
         The CLIP of the recording; None: labels are class names.
     vocabulary : Path, optional
@@ -173,7 +149,6 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         Boxes and poses of the recording: ``load_observations``, or ``record_once`` for images.
     labeller : Labeller
         See find_labeller.
-    options : MappingOptions, optional
     frames : Frames, optional
         The images, for the layer of keyframes.
     layer : LayerOptions, optional

@@ -58,10 +58,6 @@ class CameraInfoMessage(Protocol):
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
     """Return an image (h, w, 3) uint8, red first.
 
-    Parameters
-    ----------
-    msg : sensor_msgs/Image or sensor_msgs/CompressedImage
-
     Raises
     ------
     ImageError
@@ -132,7 +128,6 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
 
     Parameters
     ----------
-    msg : sensor_msgs/CameraInfo
     image_size : tuple of int
         Width and height of the image [px].
     rectified : bool

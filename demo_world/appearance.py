@@ -44,30 +44,14 @@ SIZES = {'small': 0.8, 'medium': 1.0, 'large': 1.2}
 
 @dataclass(frozen=True)
 class Appearance:
-    """What distinguishes an object.
+    """What distinguishes an object."""
 
-    Parameters
-    ----------
-    class_id : str
-        One of `CLASSES`.
-    color : str
-        Name of the main colour.
-    pattern : str
-        A key of `PATTERNS`.
-    second_color : str
-        Colour of the pattern.
-    word : str
-        The printed word, '' for none.
-    size : str
-        A key of `SIZES`.
-    """
-
-    class_id: str
-    color: str
-    pattern: str = 'plain'
-    second_color: str = 'white'
-    word: str = ''
-    size: str = 'medium'
+    class_id: str  #: One of `CLASSES`
+    color: str  #: Name of the main colour
+    pattern: str = 'plain'  #: A key of `PATTERNS`
+    second_color: str = 'white'  #: Colour of the pattern
+    word: str = ''  #: The printed word, '' for none
+    size: str = 'medium'  #: A key of `SIZES`
 
     @property
     def label(self) -> str:

@@ -12,21 +12,11 @@ from demo_world.appearance import SIZES, Appearance
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with texture coordinates; they stand on z = 0 with x to the front.
+    """Triangles with texture coordinates; they stand on z = 0 with x to the front."""
 
-    Parameters
-    ----------
-    vertices : (n, 3) array
-        Corners [m].
-    uv : (n, 2) array
-        Texture coordinates, v upwards.
-    triangles : (m, 3) array of int
-        Rows of `vertices`.
-    """
-
-    vertices: npt.NDArray[np.float64]
-    uv: npt.NDArray[np.float64]
-    triangles: npt.NDArray[np.int64]
+    vertices: npt.NDArray[np.float64]  #: Corners [m]
+    uv: npt.NDArray[np.float64]  #: Texture coordinates, v upwards
+    triangles: npt.NDArray[np.int64]  #: Rows of `vertices`
 
     @property
     def half_extents(self) -> npt.NDArray[np.float64]:

@@ -29,27 +29,13 @@ class Slot:
 
 @dataclass(frozen=True)
 class WorldObject:
-    """An object at a place.
+    """An object at a place."""
 
-    Parameters
-    ----------
-    name : str
-        Landmark id.
-    look : Appearance
-        Its look.
-    slot : Slot
-        Its place.
-    in_map : bool
-        Whether the map contains it.
-    moved : bool
-        Whether it was moved after mapping.
-    """
-
-    name: str
-    look: Appearance
-    slot: Slot
-    in_map: bool = True
-    moved: bool = False
+    name: str  #: Landmark id
+    look: Appearance  #: Its look
+    slot: Slot  #: Its place
+    in_map: bool = True  #: Whether the map contains it
+    moved: bool = False  #: Whether it was moved after mapping
 
     @property
     def map_from_object(self) -> npt.NDArray[np.float64]:
@@ -75,21 +61,11 @@ class WorldObject:
 
 @dataclass(frozen=True)
 class Room:
-    """A room with its furniture and objects.
+    """A room with its furniture and objects."""
 
-    Parameters
-    ----------
-    seed : int
-        Seed of its surfaces.
-    furniture : tuple of (Mesh, str)
-        Each piece in map coordinates [m], and its surface.
-    objects : tuple of WorldObject
-        The objects.
-    """
-
-    seed: int
-    furniture: tuple[tuple[Mesh, str], ...]
-    objects: tuple[WorldObject, ...]
+    seed: int  #: Seed of its surfaces
+    furniture: tuple[tuple[Mesh, str], ...]  #: Each piece in map coordinates [m], and its surface
+    objects: tuple[WorldObject, ...]  #: The objects
 
 
 def make_room(seed: int, counts: Mapping[str, int] | None = None, unknown: int = 4) -> Room:

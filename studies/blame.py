@@ -49,17 +49,10 @@ _MANY = 5
 
 
 class Blame(NamedTuple):
-    """What makes a query fail.
+    """What makes a query fail."""
 
-    Parameters
-    ----------
-    cause : str
-        One of CAUSES; empty if the query does not fail.
-    candidates : int
-        Number of landmarks that are correspondence candidates of a box that shows them.
-    """
-
-    cause: str
+    cause: str  #: One of CAUSES; empty if the query does not fail
+    #: Number of landmarks that are correspondence candidates of a box that shows them
     candidates: int
 
 
@@ -77,10 +70,8 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, lim
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     relocalizer : Relocalizer
         Of this map.
-    query : Query
     limit_m : float
         A pose within this distance of the truth is right [m].
     """
@@ -155,8 +146,6 @@ def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool,
 
     Parameters
     ----------
-    queries : Queries
-    landmark_map : LandmarkMap
     every_frame : bool
         Whether the neighbouring frames are queries, too.
     matching : str

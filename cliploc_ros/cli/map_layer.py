@@ -93,8 +93,6 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
 
     Parameters
     ----------
-    map_file : Path
-    landmark_map : LandmarkMap
     wanted : bool, optional
         None: a bad layer is left out with a note, as the relocalizer does.
 

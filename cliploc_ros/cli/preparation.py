@@ -42,22 +42,13 @@ _FILES = ('model', 'map_file', 'clip_model', 'clip_pretrained', 'clip_checkpoint
 
 @dataclass(frozen=True)
 class Request:
-    """What one request cost.
+    """What one request cost."""
 
-    Parameters
-    ----------
-    stage_ms : dict
-        Stage to its time [ms].
-    detected, boxes : int
-        How many boxes the detector found, and how many the search had.
-    reason : str
-        The verdict in words.
-    """
-
-    stage_ms: dict[str, float]
+    stage_ms: dict[str, float]  #: Stage to its time [ms]
+    #: How many boxes the detector found, and how many the search had
     detected: int
     boxes: int
-    reason: str
+    reason: str  #: The verdict in words
 
 
 def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bool) -> None:

@@ -33,21 +33,13 @@ _NO_LOOKS = Looks()
 
 @dataclass(frozen=True)
 class Crops:
-    """The crops of one frame, which a search compares with the labels as it needs them.
+    """The crops of one frame, which a search compares with the labels as it needs them."""
 
-    Parameters
-    ----------
-    compare : callable
-        Takes the rows of m detections; returns their similarities (m, L).
-    known : ndarray (m,) of int
-        Detections whose similarities cost nothing; the first search has them.
-    room : callable
-        Returns how many crops to compare next; 0 ends.
-    """
-
+    #: Takes the rows of m detections; returns their similarities (m, L)
     compare: Callable[[NDArray[np.int64]], Similarities]
+    #: (m,): detections whose similarities cost nothing; the first search has them
     known: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    room: Callable[[], int] = lambda: BATCH
+    room: Callable[[], int] = lambda: BATCH  #: Returns how many crops to compare next; 0 ends
 
 
 def can_do_without_crops(options: RelocalizerOptions) -> bool:
@@ -87,10 +79,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
 
     Parameters
     ----------
-    relocalizer : Relocalizer
     earlier : sequence of SearchedFrame
         Frames before it, linked by odometry.
-    observation : Observation
     crops : Crops, optional
         They take the place of its similarities; without them it is localized once, as it is.
     looks : Looks, optional

@@ -19,73 +19,52 @@ CROPS = ('all', 'on_demand')
 class RelocalizerOptions:
     """Options of the method; the defaults are the paper's where the paper has one.
 
-    Parameters
-    ----------
-    matching : str
-        'class', 'clip' or 'hybrid': which pairs are correspondence candidates.
-    algorithm : str
-        Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's.
-        'auto' tries all samples that boxes and map allow, in the order of b-prosac and without
-        repetition, until `iterations` or `time_budget_s` end it. In hybrid matching it goes on
-        to candidates of equal class after those of CLIP.
-    k : int
-        Number of landmarks retrieved for each crop, at least 1.
-    iterations : int
-        Number of minimal samples drawn; for auto the most samples tried; bf ignores it. The
-        paper's 500 find the best pose less often, and its rivals less often, too.
-    iou_threshold : float
-        A detection is an inlier of a landmark if their IoU exceeds this, 0 to 1.
-    random_seed : int
-        Equal seed and input give equal output. Below 0 every search differs.
-    time_budget_s : float
-        Limit of association, search and refinement [s], kept to within 10 %. A search that it
-        cuts is refused, except for auto. Such results depend on the machine, so iterations
-        should end a search first: 10,000 took at most 32 ms on the 258 recorded frames (40
-        landmarks, one idle core). Crowded maps take longer.
-    height_range_m : tuple of float
-        Least and greatest height of the camera in the map [m]; other poses are dropped.
-    max_tilt_deg : float
-        The most that the camera may be tilted against upright [deg]; 180 allows any pose. Where
-        the vertical is known, the limit for poses from three points against that vertical.
-    tilt_deviation_deg : float
-        Standard deviation of the camera's tilt against upright [deg], see
-        cliploc_ros.core.acceptance.confidence. It counts in the confidence where no vertical is
-        known. 0: every attitude is as likely, as in a map whose z axis is not up.
-    vertical_deviation_deg : float
-        Standard deviation of a known vertical [deg]. With one, auto samples two candidates
-        instead of three.
-    refine : bool
-        Refine the best hypotheses on all their inliers, then choose the likeliest one. The paper
-        does not refine, and chooses the one with the greatest score.
-    min_inliers : int
-        A pose with fewer matched objects is refused.
-    min_confidence : float
-        A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
-        cliploc_ros.core.acceptance.confidence.
-    crops : str
-        'all' or 'on_demand': which crops are compared with labels, see
-        cliploc_ros.core.on_demand. hybrid_auto alone uses this.
-
     Raises
     ------
     OptionsError
         Names the option and what it allows.
     """
 
+    #: 'class', 'clip' or 'hybrid': which pairs are correspondence candidates
     matching: str = 'hybrid'
+    #: Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's.
+    #: 'auto' tries all samples that boxes and map allow, in the order of b-prosac and without
+    #: repetition, until `iterations` or `time_budget_s` end it. In hybrid matching it goes on to
+    #: candidates of equal class after those of CLIP.
     algorithm: str = 'auto'
-    k: int = 3
+    k: int = 3  #: Number of landmarks retrieved for each crop, at least 1
+    #: Number of minimal samples drawn; for auto the most samples tried; bf ignores it. The paper's
+    #: 500 find the best pose less often, and its rivals less often, too.
     iterations: int = 10_000
+    #: A detection is an inlier of a landmark if their IoU exceeds this, 0 to 1
     iou_threshold: float = 0.2
-    random_seed: int = 0
+    random_seed: int = 0  #: Equal seed and input give equal output. Below 0 every search differs.
+    #: Limit of association, search and refinement [s], kept to within 10 %. A search that it cuts
+    #: is refused, except for auto. Such results depend on the machine, so iterations should end a
+    #: search first: 10,000 took at most 32 ms on the 258 recorded frames (40 landmarks, one idle
+    #: core). Crowded maps take longer.
     time_budget_s: float = math.inf
+    #: Least and greatest height of the camera in the map [m]; other poses are dropped
     height_range_m: tuple[float, float] = (-math.inf, math.inf)
+    #: The most that the camera may be tilted against upright [deg]; 180 allows any pose. Where the
+    #: vertical is known, the limit for poses from three points against that vertical.
     max_tilt_deg: float = 180.0
+    #: Standard deviation of the camera's tilt against upright [deg], see
+    #: cliploc_ros.core.acceptance.confidence. It counts in the confidence where no vertical is
+    #: known. 0: every attitude is as likely, as in a map whose z axis is not up.
     tilt_deviation_deg: float = 40.0
+    #: Standard deviation of a known vertical [deg]. With one, auto samples two candidates instead
+    #: of three.
     vertical_deviation_deg: float = 1.0
+    #: Refine the best hypotheses on all their inliers, then choose the likeliest one. The paper
+    #: does not refine, and chooses the one with the greatest score.
     refine: bool = True
-    min_inliers: int = 3
+    min_inliers: int = 3  #: A pose with fewer matched objects is refused
+    #: A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
+    #: cliploc_ros.core.acceptance.confidence
     min_confidence: float = 0.9
+    #: 'all' or 'on_demand': which crops are compared with labels, see cliploc_ros.core.on_demand.
+    #: hybrid_auto alone uses this.
     crops: str = 'on_demand'
 
     def __post_init__(self) -> None:

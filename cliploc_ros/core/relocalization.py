@@ -17,26 +17,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible pose of the camera.
+    """A possible pose of the camera."""
 
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    score : float
-        Sum of the IoUs of its inliers.
-    confidence : float
-        Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
-        uncertain as that of the best hypothesis.
-    support : Support
-        Basis of the confidence.
-    handicap : float
-        Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence.
-    """
-
-    map_from_camera: NDArray[np.float64]
-    score: float
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    score: float  #: Sum of the IoUs of its inliers
+    #: Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
+    #: uncertain as that of the best hypothesis.
     confidence: float
-    support: Support
+    support: Support  #: Basis of the confidence
+    #: Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence
     handicap: float = 0.0
 
 

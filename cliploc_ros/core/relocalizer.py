@@ -42,20 +42,11 @@ _NO_LOOKS = Looks()
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """A time budget that runs from `start`. All times are those of time.perf_counter [s].
-
-    Parameters
-    ----------
-    start : float
-    total_s : float
-        Infinite for no limit.
-    frames : int
-        Number of frames that are localized together.
-    """
+    """A time budget that runs from `start`. All times are those of time.perf_counter [s]."""
 
     start: float
-    total_s: float
-    frames: int
+    total_s: float  #: Infinite for no limit
+    frames: int  #: Number of frames that are localized together
 
     @staticmethod
     def begin(total_s: float, frames: int) -> 'TimeBudget':

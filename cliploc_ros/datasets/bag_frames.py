@@ -115,22 +115,14 @@ def _checked(encoding: str) -> str:
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Which topics of a recording hold what.
+    """Which topics of a recording hold what."""
 
-    Parameters
-    ----------
-    image, camera_info : str
-        sensor_msgs/Image or CompressedImage, and CameraInfo.
-    rectified : bool
-        Whether images are rectified, so that P holds, without distortion.
-    depth : str
-        sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
-        none.
-    """
-
+    #: sensor_msgs/Image or CompressedImage, and CameraInfo
     image: str = '/image'
     camera_info: str = '/camera_info'
-    rectified: bool = False
+    rectified: bool = False  #: Whether images are rectified, so that P holds, without distortion
+    #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
+    #: none
     depth: str = ''
 
 
@@ -157,7 +149,6 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     ----------
     bag : Path
         A rosbag2 folder or file.
-    topics : BagTopics
     read_poses : callable
         Makes the poses of the open recording.
     depth : DepthFormat, optional
@@ -233,21 +224,13 @@ def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
 
 @dataclass(frozen=True)
 class BagImages:
-    """The images of a recording, read one at a time through its index of time.
-
-    Parameters
-    ----------
-    bag : Path
-    topic : str
-    times_ns : ndarray (F, 2) of int
-        When each image was taken, and when it was recorded [ns].
-    decode : callable
-        Makes an image and its camera of a message.
-    """
+    """The images of a recording, read one at a time through its index of time."""
 
     bag: Path
     topic: str
+    #: (F, 2): when each image was taken, and when it was recorded [ns]
     times_ns: NDArray[np.int64]
+    #: Makes an image and its camera of a message
     decode: Callable[[bytes], tuple[NDArray[np.uint8], Camera]]
 
     def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:

@@ -20,44 +20,24 @@ from cliploc_ros.errors import DatasetError
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a recording.
+    """One topic of a recording."""
 
-    Parameters
-    ----------
-    name, msgtype : str
-        As ``/image`` and ``sensor_msgs/msg/Image``.
-    message_count : int
-        Number of messages that the recording lists.
-    offered_qos : tuple of Qos
-        What its publishers offered during the recording; empty if unknown.
-    type_hash : str
-        RIHS01 hash of the type; empty if not recorded.
-    """
-
+    #: As ``/image`` and ``sensor_msgs/msg/Image``
     name: str
     msgtype: str
-    message_count: int
+    message_count: int  #: Number of messages that the recording lists
+    #: What its publishers offered during the recording; empty if unknown
     offered_qos: tuple[Qos, ...] = ()
-    type_hash: str = ''
+    type_hash: str = ''  #: RIHS01 hash of the type; empty if not recorded
 
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One recorded message, still serialized.
+    """One recorded message, still serialized."""
 
-    Parameters
-    ----------
-    topic : str
-        Name of its topic.
-    stamp_ns : int
-        When it was recorded [ns].
-    data : bytes
-        CDR, with its four-byte header.
-    """
-
-    topic: str
-    stamp_ns: int
-    data: bytes
+    topic: str  #: Name of its topic
+    stamp_ns: int  #: When it was recorded [ns]
+    data: bytes  #: CDR, with its four-byte header
 
 
 class BagReader:

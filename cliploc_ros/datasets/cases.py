@@ -35,28 +35,15 @@ _CAMERA, _UP = '/camera_in_odom', '/up_in_camera'
 
 @dataclass(frozen=True)
 class CaseFrame:
-    """One frame of a request, its messages as bytes.
+    """One frame of a request, its messages as bytes."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Of all three messages [ns].
-    image_type : str
-        sensor_msgs/msg/Image or CompressedImage.
-    image, camera_info, detections : bytes
-    up_in_camera : ndarray (3,) or None
-        The vertical, where it was known.
-    odom_from_camera : ndarray (4, 4) or None
-        Where odometry placed the frame.
-    """
-
-    stamp_ns: int
-    image_type: str
+    stamp_ns: int  #: Of all three messages [ns]
+    image_type: str  #: sensor_msgs/msg/Image or CompressedImage
     image: bytes
     camera_info: bytes
     detections: bytes
-    up_in_camera: NDArray[np.float64] | None = None
-    odom_from_camera: NDArray[np.float64] | None = None
+    up_in_camera: NDArray[np.float64] | None = None  #: (3,): the vertical, where it was known
+    odom_from_camera: NDArray[np.float64] | None = None  #: (4, 4): where odometry placed the frame
 
     def message(self, name: str) -> Any:
         """Return one of the three messages.

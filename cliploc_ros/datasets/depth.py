@@ -32,21 +32,15 @@ PLAUSIBLE_DEPTH_M = (0.15, 40.0)
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A depth camera whose images are not registered to the colour images.
+    """A depth camera whose images are not registered to the colour images."""
 
-    Parameters
-    ----------
-    fx, fy, cx, cy : float
-        Of the depth image [px].
-    color_from_depth : tuple of float
-        x, y, z of the depth camera's origin, seen from the colour camera [m]; the axes of both
-        are parallel.
-    """
-
+    #: Of the depth image [px]
     fx: float
     fy: float
     cx: float
     cy: float
+    #: x, y, z of the depth camera's origin, seen from the colour camera [m]; the axes of both are
+    #: parallel
     color_from_depth: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -99,7 +93,6 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
 
     Parameters
     ----------
-    depth : DepthImage
     camera : Camera
         Of the colour image.
     bboxes_xyxy : ndarray (n, 4)
@@ -135,7 +128,6 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
 
     Parameters
     ----------
-    depth : DepthImage
     camera : Camera
         Of the colour image.
     pixels : ndarray (n, 2)

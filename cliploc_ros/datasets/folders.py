@@ -32,27 +32,14 @@ _NO_CHANGE = DepthFormat()
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """What a folder does not say itself.
+    """What a folder does not say itself."""
 
-    Parameters
-    ----------
-    intrinsics : str, optional
-        Name of a preset, or a camera.json; None: the folder's own.
-    trajectory : Trajectory, optional
-        Poses instead of the folder's own.
-    max_gap_ns : int
-        Greatest gap between two poses to interpolate over [ns].
-    body_from_camera : ndarray (4, 4), optional
-        How the camera is mounted on what the poses are of.
-    depth : DepthFormat
-        What differs from the folder's usual format.
-    """
-
-    intrinsics: str | None = None
-    trajectory: Trajectory | None = None
-    max_gap_ns: int = 0
+    intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
+    trajectory: Trajectory | None = None  #: Poses instead of the folder's own
+    max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
+    #: (4, 4): how the camera is mounted on what the poses are of
     body_from_camera: NDArray[np.float64] | None = None
-    depth: DepthFormat = _NO_CHANGE
+    depth: DepthFormat = _NO_CHANGE  #: What differs from the folder's usual format
 
 
 def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions | None = None

@@ -38,26 +38,13 @@ class Frame:
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A frame that is not decoded yet; small, and fit for another process.
+    """A frame that is not decoded yet; small, and fit for another process."""
 
-    Parameters
-    ----------
-    place : int
-        Number of the image in its source.
-    stamp_ns : int
-        [ns].
-    map_from_camera : ndarray (4, 4) or None
-    color : callable
-        Returns the image and its camera.
-    depth : callable, optional
-        Returns the depth image.
-    """
-
-    place: int
-    stamp_ns: int
-    map_from_camera: NDArray[np.float64] | None
-    color: Callable[[], tuple[NDArray[np.uint8], Camera]]
-    depth: Callable[[], DepthImage] | None = None
+    place: int  #: Number of the image in its source
+    stamp_ns: int  #: [ns]
+    map_from_camera: NDArray[np.float64] | None  #: (4, 4)
+    color: Callable[[], tuple[NDArray[np.uint8], Camera]]  #: Returns the image and its camera
+    depth: Callable[[], DepthImage] | None = None  #: Returns the depth image
 
     def __str__(self) -> str:
         """Name the frame in messages."""
@@ -82,20 +69,11 @@ Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a source that is read anew each time, one image in memory at a time.
+    """Frames of a source that is read anew each time, one image in memory at a time."""
 
-    Parameters
-    ----------
-    source : Path
-        Folder or file.
-    count : int
-        How many images there are.
-    read_raw : callable
-        Returns an iterator over the wanted frames, asked once for each image in order.
-    """
-
-    source: Path
-    count: int
+    source: Path  #: Folder or file
+    count: int  #: How many images there are
+    #: Returns an iterator over the wanted frames, asked once for each image in order
     read_raw: Callable[[Wanted], Iterator[RawFrame]]
 
     def read(self) -> Iterator[Frame]:
@@ -124,18 +102,11 @@ class ImageFile:
 
 @dataclass(frozen=True)
 class DepthFormat:
-    """How depth images are to be read.
+    """How depth images are to be read."""
 
-    Parameters
-    ----------
-    unit_m : float, optional
-        Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
-    camera : DepthCamera, optional
-        None: registered to the colour image.
-    """
-
+    #: Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
     unit_m: float | None = None
-    camera: DepthCamera | None = None
+    camera: DepthCamera | None = None  #: None: registered to the colour image
 
 
 def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Camera,

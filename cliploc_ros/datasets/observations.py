@@ -52,28 +52,17 @@ _SCHEMA = Schema('observation file', {
 
 @dataclass(frozen=True)
 class Recorded:
-    """Observations and how they came about: F frames.
-
-    Parameters
-    ----------
-    detections : PosedDetections
-    stamps_ns : ndarray (F,) of int
-        Exact stamps [ns].
-    detector_ms, clip_ms : ndarray (F,)
-        Time that the networks took [ms]; NaN where unknown.
-    images, without_pose : int
-        Images of the source, and those of them without a pose.
-    described : str
-        All that the observations depend on; '' where unknown.
-    """
+    """Observations and how they came about: F frames."""
 
     detections: PosedDetections
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]  #: (F,): exact stamps [ns]
+    #: (F,): time that the networks took [ms]; NaN where unknown
     detector_ms: NDArray[np.float64]
     clip_ms: NDArray[np.float64]
+    #: Images of the source, and those of them without a pose
     images: int
     without_pose: int
-    described: str
+    described: str  #: All that the observations depend on; '' where unknown
 
 
 def load_observations(path: str | Path) -> PosedDetections:

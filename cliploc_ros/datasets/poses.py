@@ -40,20 +40,13 @@ class Poses(Protocol):
 
 @dataclass(frozen=True)
 class TrajectoryPoses:
-    """Poses of a body on which the camera is mounted.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    max_gap_ns : int
-        Greatest gap between two samples to interpolate over [ns]. One sample within 20 ms is
-        always enough.
-    body_from_camera : ndarray (4, 4), optional
-        The mount of the camera; None: the trajectory is the camera's own.
-    """
+    """Poses of a body on which the camera is mounted."""
 
     trajectory: Trajectory
+    #: Greatest gap between two samples to interpolate over [ns]. One sample within 20 ms is always
+    #: enough.
     max_gap_ns: int = 0
+    #: (4, 4): the mount of the camera; None: the trajectory is the camera's own
     body_from_camera: NDArray[np.float64] | None = None
 
     @property

@@ -80,41 +80,20 @@ _SCHEMA = Schema('query file', {
 
 @dataclass(frozen=True)
 class QueryFrame:
-    """One frame of a query file: n boxes, L landmarks.
+    """One frame of a query file: n boxes, L landmarks."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Time of the image [ns].
-    bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px], undistorted.
-    class_ids : tuple of str
-        Detector classes.
-    scores : ndarray (n,)
-        Detector confidences.
-    similarities : ndarray (n, L)
-        Cosine similarity of each crop and each landmark's label.
-    true_landmark : ndarray (n,) of int
-        Index into the landmarks, -1 where unknown. For evaluation only.
-    map_from_camera : ndarray (4, 4)
-        Ground truth.
-    group : int
-        The query to which the frame belongs.
-    is_main : bool
-        Whether the frame is the query itself and not one of its neighbours.
-    detector_ms, clip_ms : float
-        Processing time of the image [ms]; NaN if not recorded.
-    """
-
-    stamp_ns: int
-    bboxes_xyxy: NDArray[np.float64]
-    class_ids: tuple[str, ...]
-    scores: NDArray[np.float64]
+    stamp_ns: int  #: Time of the image [ns]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom [px], undistorted
+    class_ids: tuple[str, ...]  #: Detector classes
+    scores: NDArray[np.float64]  #: (n,): detector confidences
+    #: (n, L): cosine similarity of each crop and each landmark's label
     similarities: NDArray[np.float64]
+    #: (n,): index into the landmarks, -1 where unknown. For evaluation only.
     true_landmark: NDArray[np.int64]
-    map_from_camera: NDArray[np.float64]
-    group: int
-    is_main: bool
+    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
+    group: int  #: The query to which the frame belongs
+    is_main: bool  #: Whether the frame is the query itself and not one of its neighbours
+    #: Processing time of the image [ms]; NaN if not recorded
     detector_ms: float = math.nan
     clip_ms: float = math.nan
 
@@ -125,21 +104,11 @@ class QueryFrame:
 
 @dataclass(frozen=True)
 class Queries:
-    """The content of a query file.
+    """The content of a query file."""
 
-    Parameters
-    ----------
-    landmark_ids : tuple of str
-        The landmarks of the columns of the similarities.
-    intrinsics_fx_fy_cx_cy : tuple of float
-        Of the undistorted camera [px].
-    frames : tuple of QueryFrame
-        In the file's order.
-    """
-
-    landmark_ids: tuple[str, ...]
-    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]
-    frames: tuple[QueryFrame, ...]
+    landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted camera [px]
+    frames: tuple[QueryFrame, ...]  #: In the file's order
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -15,21 +15,12 @@ MAX_SAMPLE_DISTANCE_NS = 20_000_000
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Camera poses in a map, in order of time.
+    """Camera poses in a map, in order of time."""
 
-    Parameters
-    ----------
-    stamps_ns : ndarray (t,) of int64
-        Time of each sample [ns], strictly increasing. May be empty.
-    positions_xyz : ndarray (t, 3)
-        Camera centre in the map [m].
-    quats_xyzw : ndarray (t, 4)
-        Rotation of camera axes into map axes, unit norm.
-    """
-
+    #: (t,) of int64: time of each sample [ns], strictly increasing. May be empty.
     stamps_ns: NDArray[np.int64]
-    positions_xyz: NDArray[np.float64]
-    quats_xyzw: NDArray[np.float64]
+    positions_xyz: NDArray[np.float64]  #: (t, 3): camera centre in the map [m]
+    quats_xyzw: NDArray[np.float64]  #: (t, 4): rotation of camera axes into map axes, unit norm
 
     def __len__(self) -> int:
         """Return the number of samples."""

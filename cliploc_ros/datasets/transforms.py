@@ -33,19 +33,12 @@ class Edge(NamedTuple):
 
 @dataclass(frozen=True)
 class TransformChain:
-    """The way between two coordinate frames through their common ancestor.
+    """The way between two coordinate frames through their common ancestor."""
 
-    Parameters
-    ----------
-    up, down : tuple of Edge
-        From the map up to the common ancestor, and from the camera up to it.
-    max_gap_ns : int
-        Greatest gap between two samples to interpolate over [ns].
-    """
-
+    #: From the map up to the common ancestor, and from the camera up to it
     up: tuple[Edge, ...]
     down: tuple[Edge, ...]
-    max_gap_ns: int
+    max_gap_ns: int  #: Greatest gap between two samples to interpolate over [ns]
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
@@ -81,7 +74,6 @@ def read_transforms(reader: BagReader, map_frame: str, camera_frame: str, max_ga
 
     Parameters
     ----------
-    reader : BagReader
     map_frame, camera_frame : str
         Coordinate frames; the camera's is the optical one (z forward).
     max_gap_ns : int

@@ -20,23 +20,13 @@ MAX_STAMP_S = 2**31 - 1
 
 @dataclass(frozen=True)
 class TumSequence:
-    """A TUM RGB-D folder: colour images with stamps, and the camera's trajectory.
+    """A TUM RGB-D folder: colour images with stamps, and the camera's trajectory."""
 
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    stamps_ns : tuple of int
-        Stamp of each image [ns], exact to the last decimal, strictly increasing.
-    image_paths : tuple of Path
-        The existing image file of each stamp.
-    trajectory : Trajectory
-        Ground truth, map from camera; empty if the folder has no groundtruth.txt.
-    """
-
-    folder: Path
+    folder: Path  #: The folder
+    #: Stamp of each image [ns], exact to the last decimal, strictly increasing
     stamps_ns: tuple[int, ...]
-    image_paths: tuple[Path, ...]
+    image_paths: tuple[Path, ...]  #: The existing image file of each stamp
+    #: Ground truth, map from camera; empty if the folder has no groundtruth.txt
     trajectory: Trajectory
 
     def __len__(self) -> int:

@@ -27,28 +27,16 @@ _CODECS = {b'\x89PNG': 'png', b'\xff\xd8\xff': 'jpeg'}
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """Format, topics and coordinate frames of the recording.
+    """Format, topics and coordinate frames of the recording."""
 
-    Parameters
-    ----------
-    storage : str
-        ``sqlite3`` or ``mcap``.
-    image_format : str
-        ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage with
-        the files' own bytes.
-    prefix : str
-        Namespace of all topics: ``camera`` gives ``/camera/image``.
-    camera_frame : str
-        Coordinate frame of images, camera_info and detections (optical axes).
-    world_frame : str
-        Coordinate frame of the ground-truth poses: the map's.
-    """
-
-    storage: str = 'sqlite3'
+    storage: str = 'sqlite3'  #: ``sqlite3`` or ``mcap``
+    #: ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage with the
+    #: files' own bytes
     image_format: str = 'raw'
-    prefix: str = ''
+    prefix: str = ''  #: Namespace of all topics: ``camera`` gives ``/camera/image``
+    #: Coordinate frame of images, camera_info and detections (optical axes)
     camera_frame: str = 'camera_optical_frame'
-    world_frame: str = 'world'
+    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses: the map's
 
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic.
@@ -65,21 +53,11 @@ class ConversionOptions:
 
 @dataclass(frozen=True)
 class ConversionResult:
-    """Counts of what was written.
+    """Counts of what was written."""
 
-    Parameters
-    ----------
-    images : int
-        Images, each with a camera_info.
-    poses : int
-        Images with ground truth.
-    detections : int
-        Images with an entry of recorded detections, which may be empty.
-    """
-
-    images: int
-    poses: int
-    detections: int
+    images: int  #: Images, each with a camera_info
+    poses: int  #: Images with ground truth
+    detections: int  #: Images with an entry of recorded detections, which may be empty
 
 
 def convert_tum(

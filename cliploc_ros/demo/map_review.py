@@ -46,43 +46,23 @@ _AXIS_NAMES = 'xyz'
 
 @dataclass(frozen=True)
 class Found:
-    """An object with a landmark of its class.
-
-    Parameters
-    ----------
-    object_row, landmark : int
-    offset_m : float
-        Of the landmark's centre [m].
-    size_ratio : float
-        Mean radius of the landmark over that of the object.
-    """
+    """An object with a landmark of its class."""
 
     object_row: int
     landmark: int
-    offset_m: float
-    size_ratio: float
+    offset_m: float  #: Of the landmark's centre [m]
+    size_ratio: float  #: Mean radius of the landmark over that of the object
 
 
 @dataclass(frozen=True)
 class MapReview:
-    """A map compared with the objects of a room.
-
-    Parameters
-    ----------
-    objects : tuple of TrueObject
-    landmark_map : LandmarkMap
-    found : tuple of Found
-    missed : dict of int to str
-        Reason by row of the object.
-    false : dict of int to str
-        What is there instead, by row of the landmark.
-    """
+    """A map compared with the objects of a room."""
 
     objects: tuple[TrueObject, ...]
     landmark_map: LandmarkMap
     found: tuple[Found, ...]
-    missed: Mapping[int, str]
-    false: Mapping[int, str]
+    missed: Mapping[int, str]  #: Reason by row of the object
+    false: Mapping[int, str]  #: What is there instead, by row of the landmark
 
     @property
     def landmark_of(self) -> dict[str, str]:
@@ -104,18 +84,10 @@ class MapReview:
 
 @dataclass(frozen=True)
 class Sightings:
-    """How the images show an object.
+    """How the images show an object."""
 
-    Parameters
-    ----------
-    shown : int
-        Images that show enough of it.
-    detected : Counter of str
-        Images with a detection of it, by the detection's class.
-    """
-
-    shown: int
-    detected: 'Counter[str]'
+    shown: int  #: Images that show enough of it
+    detected: 'Counter[str]'  #: Images with a detection of it, by the detection's class
 
 
 def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
@@ -125,8 +97,6 @@ def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    objects : sequence of TrueObject
     sightings : dict of str to Sightings
         By id of the object.
     left_out : sequence of dict
@@ -285,7 +255,6 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
 
     Parameters
     ----------
-    review : MapReview
     map_from_camera : ndarray (F, 4, 4)
         Of the images of the mapping walk.
     path : Path

@@ -83,9 +83,6 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
 
     Parameters
     ----------
-    folder : Path
-    reviews : sequence of Review
-    method : str
     section : str
         What to say before the wake-ups, as HTML.
     """

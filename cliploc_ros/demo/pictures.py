@@ -40,8 +40,6 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
 
     Parameters
     ----------
-    review : Review
-    landmark_map : LandmarkMap
     path : Path
         The PNG to write.
     """
@@ -183,7 +181,6 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     ----------
     judged : sequence of Judged
         The wake-ups.
-    landmark_map : LandmarkMap
     path_xyz : ndarray (t, 3)
         Path of the camera [m].
     path : Path

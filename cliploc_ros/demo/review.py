@@ -33,22 +33,12 @@ ACCEPTED, REFUSED = '#0072B2', '#D55E00'
 
 @dataclass(frozen=True)
 class Judged:
-    """A wake-up and its ground truth.
+    """A wake-up and its ground truth."""
 
-    Parameters
-    ----------
-    number : int
-        Counted from 1.
-    wake_up : WakeUp
-    time_s : float
-        Stamp of the image since the start of the recording [s].
-    truth : ndarray (4, 4) or None
-        ``map_from_camera``; None if the recording lacks it.
-    """
-
-    number: int
+    number: int  #: Counted from 1
     wake_up: WakeUp
-    time_s: float
+    time_s: float  #: Stamp of the image since the start of the recording [s]
+    #: (4, 4): ``map_from_camera``; None if the recording lacks it
     truth: NDArray[np.float64] | None
 
     @property
@@ -71,34 +61,19 @@ class Judged:
 
 @dataclass(frozen=True)
 class Review:
-    """The content of a wake-up's picture.
-
-    Parameters
-    ----------
-    judged : Judged
-    image_rgb : ndarray (h, w, 3) uint8
-    camera : Camera
-    detections : Detections
-        The n detections that the relocalizer used.
-    matches : tuple of Match
-        Inliers of the best hypothesis.
-    similarities : ndarray (n, L) or None
-        Similarity of each crop and each label; None if the method matches classes only.
-    true_landmarks : tuple of str, or None
-        The landmark of the object that each detection shows, '' if none; None if the recording
-        does not say it.
-    repeated : bool
-        Whether the repeated search found the pose that the node sent. If not, there are no
-        matches.
-    """
+    """The content of a wake-up's picture."""
 
     judged: Judged
-    image_rgb: NDArray[np.uint8]
+    image_rgb: NDArray[np.uint8]  #: (h, w, 3)
     camera: Camera
-    detections: Detections
-    matches: tuple[Match, ...]
+    detections: Detections  #: The n detections that the relocalizer used
+    matches: tuple[Match, ...]  #: Inliers of the best hypothesis
+    #: (n, L): similarity of each crop and each label; None if the method matches classes only
     similarities: NDArray[np.float32] | None
+    #: The landmark of the object that each detection shows, '' if none; None if the recording does
+    #: not say it
     true_landmarks: tuple[str, ...] | None
+    #: Whether the repeated search found the pose that the node sent. If not, there are no matches.
     repeated: bool
 
 
@@ -119,9 +94,6 @@ class Reviewer:
 
     Parameters
     ----------
-    sequence : TumSequence
-    camera : Camera
-    observe : Observe
     relocalize : callable
         Searches the pose of an observation with all similarities.
     max_detections : int

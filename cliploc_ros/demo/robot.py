@@ -35,30 +35,16 @@ _SPIN_S = 0.02
 
 @dataclass(frozen=True)
 class WakeUp:
-    """A request and its answer, as received over ROS.
+    """A request and its answer, as received over ROS."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Stamp of the answer's image [ns].
-    accepted : bool
-        Whether the relocalizer published a pose.
-    message : str
-        The answer's message.
-    hypotheses : tuple of ndarray (4, 4)
-        ``map_from_camera`` of the distinct best, best first; an accepted pose is the first.
-    detections : Detections
-        The detector's.
-    answer_s : float
-        From the request to the answer, including detection [s].
-    """
-
-    stamp_ns: int
-    accepted: bool
-    message: str
+    stamp_ns: int  #: Stamp of the answer's image [ns]
+    accepted: bool  #: Whether the relocalizer published a pose
+    message: str  #: The answer's message
+    #: tuple of (4, 4): ``map_from_camera`` of the distinct best, best first; an accepted pose is
+    #: the first
     hypotheses: tuple[NDArray[np.float64], ...]
-    detections: Detections
-    answer_s: float
+    detections: Detections  #: The detector's
+    answer_s: float  #: From the request to the answer, including detection [s]
 
     @property
     def score(self) -> float:

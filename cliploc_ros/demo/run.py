@@ -46,52 +46,27 @@ _PATIENCE_S = 180.0
 
 @dataclass(frozen=True)
 class WakeUpMap:
-    """Another map than the assets' to wake up in.
-
-    Parameters
-    ----------
-    file : Path
-    landmark_of : callable
-        Returns the id of an object's landmark, '' if the map lacks it.
-    section : str
-        What the page says of the map, as HTML.
-    """
+    """Another map than the assets' to wake up in."""
 
     file: Path
+    #: Returns the id of an object's landmark, '' if the map lacks it
     landmark_of: Callable[[str], str]
-    section: str
+    section: str  #: What the page says of the map, as HTML
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Options of the demo.
+    """Options of the demo."""
 
-    Parameters
-    ----------
-    assets : Path
-        Folder with sequence/ (a TUM folder), map.yaml, yolo.pt and, unless the method matches
-        classes only, clip.json and clip.safetensors.
-    out : Path
-        Folder for the pictures.
-    wake_ups : int
-        Number of wake-ups.
-    rate : float
-        Speed between wake-ups; 1 is as recorded.
-    method : str
-        Matching and algorithm, joined as in the paper: ``hybrid_auto``.
-    rviz : bool
-        Whether to open RViz if it is installed.
-    wake_up_map : WakeUpMap, optional
-        The map to wake up in; None: the assets' map.yaml.
-    """
-
+    #: Folder with sequence/ (a TUM folder), map.yaml, yolo.pt and, unless the method matches
+    #: classes only, clip.json and clip.safetensors
     assets: Path
-    out: Path
-    wake_ups: int = 10
-    rate: float = 4.0
-    method: str = 'hybrid_auto'
-    rviz: bool = False
-    wake_up_map: WakeUpMap | None = None
+    out: Path  #: Folder for the pictures
+    wake_ups: int = 10  #: Number of wake-ups
+    rate: float = 4.0  #: Speed between wake-ups; 1 is as recorded
+    method: str = 'hybrid_auto'  #: Matching and algorithm, joined as in the paper: ``hybrid_auto``
+    rviz: bool = False  #: Whether to open RViz if it is installed
+    wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
 
     @property
     def map_file(self) -> Path:

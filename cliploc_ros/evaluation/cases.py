@@ -32,17 +32,11 @@ Observe = Callable[[NDArray[np.uint8], Observation], Observation]
 
 
 class Replayed(NamedTuple):
-    """A recorded answer and the one that was found again.
-
-    Parameters
-    ----------
-    accepted, again : bool
-    reason, reason_again : str
-        Empty where accepted.
-    """
+    """A recorded answer and the one that was found again."""
 
     accepted: bool
     again: bool
+    #: Empty where accepted
     reason: str
     reason_again: str
 
@@ -87,9 +81,6 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
 
     Parameters
     ----------
-    case : Case
-    landmark_map : LandmarkMap
-    observe : callable
     layer : KeyframeLayer, optional
         Keyframes of the map.
 

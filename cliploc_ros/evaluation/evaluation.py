@@ -44,8 +44,6 @@ class Evaluation:
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    queries : sequence of Query
     out : Path
         An existing folder.
     trials, workers, scheduler, layer, noisy
@@ -68,7 +66,6 @@ class Evaluation:
 
         Parameters
         ----------
-        methods : sequence of Method
         sweep : sequence of int
             Further numbers of iterations for each sampling method, for a figure.
         resume : bool

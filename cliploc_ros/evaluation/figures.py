@@ -48,7 +48,6 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
     ----------
     axes : Axes
         x and y of the map [m], with equal scales.
-    landmark_map : LandmarkMap
 
     Returns
     -------
@@ -93,9 +92,6 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
     ----------
     folder : Path
         Folder of the figures.
-    landmark_map : LandmarkMap
-    queries : sequence of Query
-    results : sequence of Result
     summaries : sequence of Summary
         Of the results.
     sweep : mapping of str to mapping of int to Summary
@@ -248,7 +244,6 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
 
     Parameters
     ----------
-    one : Summary
     limit_m : float
         Limit of success.
 

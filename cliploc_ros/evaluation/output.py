@@ -51,7 +51,6 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
     Parameters
     ----------
-    path : Path
     write : callable
         Takes the path to write to, which has the suffix of the file.
 
@@ -68,14 +67,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:
-    """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial.
-
-    Parameters
-    ----------
-    folder : Path
-    queries : sequence of Query
-    results : sequence of Result
-    """
+    """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial."""
     make_folder(folder)
     write_text(folder / GROUND_TRUTH, _text(
         (query.observation.stamp_ns / NS_PER_S, query.map_from_camera) for query in queries))

@@ -33,8 +33,6 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
 
     Parameters
     ----------
-    frames : Frames
-    landmark_map : LandmarkMap
     options : RecordingOptions
         With CLIP.
     map_files, compare
@@ -87,7 +85,6 @@ def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]
     ----------
     queries : sequence of Query
         Recorded from these frames.
-    frames : Frames
     """
     waiting: dict[int, deque[int]] = defaultdict(deque)
     for row, query in enumerate(queries):

@@ -36,10 +36,8 @@ def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int
     ----------
     make_search : MakeWork
         Makes the function that returns the outcomes of a task, a sequence.
-    tasks : sequence of hashable
     what : str
         Name of the tasks in the plural.
-    workers : int
 
     Raises
     ------
@@ -78,11 +76,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     methods : sequence of Method
         A method that draws no samples runs one trial, unless the trials have noise of their own.
-    queries : sequence of Query
-    trials : int
     workers, scheduler : int, str
         See cliploc_ros.files.parallel.run_tasks. Results do not depend on them.
     done : sequence of Result

@@ -23,7 +23,6 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
 
     Parameters
     ----------
-    queries : sequence of Query
     noise_deg : float
         Standard deviation of the error of each vertical [deg], a rotation about a random level
         axis.
@@ -46,7 +45,6 @@ def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg:
 
     Parameters
     ----------
-    queries : sequence of Query
     groups : sequence of int
         The group of each.
     noise_deg : float

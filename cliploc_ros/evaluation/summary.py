@@ -20,50 +20,32 @@ _RESAMPLES = 10_000
 
 @dataclass(frozen=True)
 class Summary:
-    """Results of one method on q queries in t trials.
-
-    Parameters
-    ----------
-    method : str
-    queries : tuple of int
-        Their numbers.
-    errors_m : ndarray (t, q)
-        Position error of the best pose; infinite where none was found.
-    accepted : ndarray (t, q) of bool
-    confidence : ndarray (t, q)
-    search_ms : ndarray (t, q)
-    coverage : ndarray (t, q)
-    best_iterations, hypotheses : ndarray (t, q) of int
-    boxes : ndarray (q,) of int
-    nees : ndarray (t, q)
-        Infinite where no pose was found; empty where it was not recorded.
-    crops_share : float
-        Share of a query's crops that were compared with labels, on average.
-    refusals : dict of str to int
-        How many were refused, by kind, the most frequent first.
-    sources : ndarray (t, q) of str
-        What each pose comes from, see Result.
-    keyframe_inliers : ndarray (t, q) of int
-    keyframes_ms : ndarray (t, q)
-        The three are empty where no query was compared with keyframes.
-    """
+    """Results of one method on q queries in t trials."""
 
     method: str
-    queries: tuple[int, ...]
+    queries: tuple[int, ...]  #: Their numbers
+    #: (t, q): position error of the best pose; infinite where none was found
     errors_m: NDArray[np.float64]
-    accepted: NDArray[np.bool_]
-    confidence: NDArray[np.float64]
-    search_ms: NDArray[np.float64]
-    coverage: NDArray[np.float64]
+    accepted: NDArray[np.bool_]  #: (t, q)
+    confidence: NDArray[np.float64]  #: (t, q)
+    search_ms: NDArray[np.float64]  #: (t, q)
+    coverage: NDArray[np.float64]  #: (t, q)
+    #: (t, q)
     best_iterations: NDArray[np.int64]
     hypotheses: NDArray[np.int64]
-    boxes: NDArray[np.int64]
+    boxes: NDArray[np.int64]  #: (q,)
+    #: (t, q): infinite where no pose was found; empty where it was not recorded
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    #: Share of a query's crops that were compared with labels, on average
     crops_share: float = 1.0
+    #: How many were refused, by kind, the most frequent first
     refusals: dict[str, int] = field(default_factory=dict)
+    #: (t, q) of str: what each pose comes from, see Result
     sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
+    #: (t, q)
     keyframe_inliers: NDArray[np.int64] = field(
         default_factory=lambda: np.empty((0, 0), dtype=np.int64))
+    #: (t, q): the three are empty where no query was compared with keyframes
     keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
@@ -185,7 +167,6 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
         Of the same queries; the success of the other is subtracted.
     limit_m : float
         Limit of success.
-    seed : int
     """
     assert one.queries == other.queries
     gains = ((one.errors_m < limit_m).mean(axis=0) - (other.errors_m < limit_m).mean(axis=0))

@@ -42,106 +42,50 @@ class ImageFeatures(NamedTuple):
 
 @dataclass(frozen=True)
 class Query:
-    """An observation to localize, and the true pose.
+    """An observation to localize, and the true pose."""
 
-    Parameters
-    ----------
-    number : int
-        Number of the frame in its query file, from 0.
-    observation : Observation
-    map_from_camera : ndarray (4, 4)
-        Ground truth.
-    neighbours : tuple of Observation
-        Other frames, which odometry links to it.
-    image : ImageFeatures, optional
-        Its local features, for keyframes.
-    """
-
-    number: int
+    number: int  #: Number of the frame in its query file, from 0
     observation: Observation
-    map_from_camera: NDArray[np.float64]
-    neighbours: tuple[Observation, ...] = ()
-    image: ImageFeatures | None = None
+    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
+    neighbours: tuple[Observation, ...] = ()  #: Other frames, which odometry links to it
+    image: ImageFeatures | None = None  #: Its local features, for keyframes
 
 
 @dataclass(frozen=True)
 class Result:
-    """The result of one search.
-
-    Parameters
-    ----------
-    method : str
-    trial : int
-        From 0; added to the seed of the run.
-    query : int
-        Number of the frame in its query file.
-    timestamp : float
-        Of the image [s].
-    boxes : int
-        Number of detections.
-    solved, accepted : bool
-        Whether a pose was found, and whether it was accepted.
-    map_from_camera : list of list of float or None
-        The best pose; None where none was found.
-    error_m, error_deg : float or None
-        Error of the best pose; None where none was found.
-    score : float
-        Sum of the IoUs of its inliers.
-    confidence : float
-        Probability that it is within 1 m, according to the relocalizer.
-    nees : float or None
-        Squared error in its own covariance, see normalized_square.
-    inliers : int
-    hypotheses : int
-        Number of hypotheses tried.
-    best_iteration : int
-        Iteration that found the best pose, from 1.
-    coverage : float
-        Share of its samples that the search tried.
-    reason : str
-        Reason of the refusal; empty when accepted.
-    search_ms : float
-        Of the objects. The times are the only fields that differ from run to run.
-    crops_share : float
-        Share of the crops of its frames that were compared with labels.
-    map : str
-        Of several maps, the one of the pose, which is in the coordinates of the first map: on
-        another map, it is far away. Empty for a single map.
-    refusal_kind : str
-        See cliploc_ros.core.acceptance.verdict; empty when accepted.
-    source : str
-        What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found.
-    keyframe_inliers : int
-        Points of keyframes that agree on their pose, whatever the pose comes from.
-    keyframes_ms : float
-        Time of features, matching and the pose from them [ms].
-    """
+    """The result of one search."""
 
     method: str
-    trial: int
-    query: int
-    timestamp: float
-    boxes: int
+    trial: int  #: From 0; added to the seed of the run
+    query: int  #: Number of the frame in its query file
+    timestamp: float  #: Of the image [s]
+    boxes: int  #: Number of detections
+    #: Whether a pose was found, and whether it was accepted
     solved: bool
     accepted: bool
-    map_from_camera: list[list[float]] | None
+    map_from_camera: list[list[float]] | None  #: The best pose; None where none was found
+    #: Error of the best pose; None where none was found
     error_m: float | None
     error_deg: float | None
-    score: float
-    confidence: float
-    nees: float | None
+    score: float  #: Sum of the IoUs of its inliers
+    confidence: float  #: Probability that it is within 1 m, according to the relocalizer
+    nees: float | None  #: Squared error in its own covariance, see normalized_square
     inliers: int
-    hypotheses: int
-    best_iteration: int
-    coverage: float
-    reason: str
-    search_ms: float
-    crops_share: float = 1.0
+    hypotheses: int  #: Number of hypotheses tried
+    best_iteration: int  #: Iteration that found the best pose, from 1
+    coverage: float  #: Share of its samples that the search tried
+    reason: str  #: Reason of the refusal; empty when accepted
+    search_ms: float  #: Of the objects. The times are the only fields that differ from run to run.
+    crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
+    #: Of several maps, the one of the pose, which is in the coordinates of the first map: on
+    #: another map, it is far away. Empty for a single map.
     map: str = ''
-    refusal_kind: str = ''
+    refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
+    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found
     source: str = ''
+    #: Points of keyframes that agree on their pose, whatever the pose comes from
     keyframe_inliers: int = 0
-    keyframes_ms: float = 0.0
+    keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -154,8 +98,6 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
 
     Parameters
     ----------
-    queries : Queries
-    landmark_map : LandmarkMap
     every_frame : bool
         Use the neighbouring frames as queries, too.
 
@@ -190,11 +132,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    method : Method
     trial : int
         From 0.
-    queries : sequence of Query
     keyframes : KeyframeLocalizer, optional
         Of the map's layer, for methods that use keyframes and queries with features.
     """

@@ -24,7 +24,6 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
 
     Parameters
     ----------
-    axes : Axes
     judged : mapping of str to (ndarray (n,), ndarray (n,) of bool)
         Confidences, and whether each pose is right, by name.
     """
@@ -48,7 +47,6 @@ def draw_consistency(axes: Axes, nees: Mapping[str, NDArray[np.float64]]) -> Non
 
     Parameters
     ----------
-    axes : Axes
     nees : mapping of str to ndarray (n,)
         Of accepted poses, by name, see normalized_square.
     """

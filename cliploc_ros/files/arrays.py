@@ -37,17 +37,10 @@ class ArrayError(Exception):
 
 @dataclass(frozen=True)
 class Check:
-    """A condition that each row of an array meets.
+    """A condition that each row of an array meets."""
 
-    Parameters
-    ----------
-    what : str
-        What is wrong with a row that fails, such as 'is not finite'.
-    is_wrong : callable
-        Takes the array (n, ...), returns whether each row (n,) fails.
-    """
-
-    what: str
+    what: str  #: What is wrong with a row that fails, such as 'is not finite'
+    #: Takes the array (n, ...), returns whether each row (n,) fails
     is_wrong: Callable[[NDArray[Any]], NDArray[np.bool_]]
 
     def __call__(self, name: str, arrays: Arrays) -> None:
@@ -94,65 +87,38 @@ SHARE = Check('is outside 0 to 1', lambda shares: (shares < 0) | (shares > 1))
 
 @dataclass(frozen=True)
 class Field:
-    """One array of a file.
+    """One array of a file."""
 
-    Parameters
-    ----------
-    type : str
-        'text', 'numbers', 'floats', 'integers', 'booleans', or the name of one type, as 'uint8'.
-    shape : tuple of int or str
-        Lengths, or their names, such as 'n'. The first field with a name determines its length;
-        'n+1' is one more.
-    checks : callables
-        Each takes the name and all arrays, and raises ArrayError.
-    is_optional : bool
-    stays : bool
-        Whether it stays in the file, so that memory holds only the rows in use. A compressed
-        array is read nevertheless.
-    """
-
+    #: 'text', 'numbers', 'floats', 'integers', 'booleans', or the name of one type, as 'uint8'
     type: str
+    #: Lengths, or their names, such as 'n'. The first field with a name determines its length;
+    #: 'n+1' is one more.
     shape: tuple[int | str, ...] = ()
+    #: Each takes the name and all arrays, and raises ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
+    #: Whether it stays in the file, so that memory holds only the rows in use. A compressed array
+    #: is read nevertheless.
     stays: bool = False
 
 
 @dataclass(frozen=True)
 class Schema:
-    """The arrays of a kind of npz file.
+    """The arrays of a kind of npz file."""
 
-    Parameters
-    ----------
-    kind : str
-        Names the file, as in 'no such query file'.
-    fields : mapping of str to Field
-        Other arrays of a file are not read.
-    error : type of CliplocError
-        What is raised.
-    advice : str
-        What to do about an invalid file.
-    not_empty : mapping of str to str
-        Lengths that must be above 0, and what they count.
-    others : mapping of str to str
-        Arrays of other kinds of files, and what a file is that has one where a field is missing.
-    is_stored : bool
-        Whether compressed arrays are refused.
-    checks_sums : bool
-        Whether to compare the check sums of arrays that stay in the file, which reads it once.
-    largest_read : int
-        In files up to this size all arrays are read [bytes]: a program that writes over a mapped
-        file in place would kill this process.
-    """
-
-    kind: str
-    fields: Mapping[str, Field]
-    error: type[CliplocError]
-    advice: str = ''
+    kind: str  #: Names the file, as in 'no such query file'
+    fields: Mapping[str, Field]  #: Other arrays of a file are not read
+    error: type[CliplocError]  #: What is raised
+    advice: str = ''  #: What to do about an invalid file
+    #: Lengths that must be above 0, and what they count
     not_empty: Mapping[str, str] = field(default_factory=dict)
+    #: Arrays of other kinds of files, and what a file is that has one where a field is missing
     others: Mapping[str, str] = field(default_factory=dict)
-    is_stored: bool = False
+    is_stored: bool = False  #: Whether compressed arrays are refused
+    #: Whether to compare the check sums of arrays that stay in the file, which reads it once
     checks_sums: bool = True
+    #: In files up to this size all arrays are read [bytes]: a program that writes over a mapped
+    #: file in place would kill this process
     largest_read: int = 0
 
     def read(self, path: Path) -> dict[str, NDArray[Any]]:

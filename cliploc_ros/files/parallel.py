@@ -62,7 +62,6 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
 
     Parameters
     ----------
-    make_work : MakeWork
     tasks : iterable
         What can be sent to another process.
     workers : int
@@ -139,14 +138,7 @@ class _Workers(Protocol):
 
 
 class _Stream:
-    """Tasks on their way through workers, a bounded number at once.
-
-    Parameters
-    ----------
-    workers : _Workers
-    tasks : iterator
-    most : int
-    """
+    """Tasks on their way through workers, a bounded number at once."""
 
     def __init__(self, workers: _Workers, tasks: Iterator[Any], most: int) -> None:
         self._workers, self._tasks, self._most = workers, tasks, most

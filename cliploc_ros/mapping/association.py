@@ -20,18 +20,12 @@ _SLACK = 1e-6
 
 
 class Overlaps(NamedTuple):
-    """Pairs of a box and a landmark of its class that overlap, in the order of the boxes.
+    """Pairs of a box and a landmark of its class that overlap, in the order of the boxes."""
 
-    Parameters
-    ----------
-    boxes, landmarks : ndarray (p,) of int
-    ious : ndarray (p,)
-        Of box and projected box, clipped to the image.
-    """
-
+    #: (p,)
     boxes: NDArray[np.int64]
     landmarks: NDArray[np.int64]
-    ious: NDArray[np.float64]
+    ious: NDArray[np.float64]  #: (p,): of box and projected box, clipped to the image
 
 
 def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
@@ -149,8 +143,6 @@ def associate(views: Views, landmarks: Landmarks, min_iou: float) -> NDArray[np.
 
     Parameters
     ----------
-    views : Views
-    landmarks : Landmarks
     min_iou : float
         Pairs that overlap less are no candidates.
     """

@@ -51,25 +51,13 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The result of mapping: F frames, n boxes.
-
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-    report : MappingReport
-    shown : ndarray (n,) of int
-        Row of the landmark that each box shows, -1 for none.
-    map_from_camera : ndarray (F, 4, 4)
-        The poses, refined where that was asked for.
-    mount : MountCorrection, optional
-        Where a correction was asked for.
-    """
+    """The result of mapping: F frames, n boxes."""
 
     landmark_map: LandmarkMap
     report: MappingReport
-    shown: NDArray[np.int64]
-    map_from_camera: NDArray[np.float64]
-    mount: MountCorrection | None = None
+    shown: NDArray[np.int64]  #: (n,): row of the landmark that each box shows, -1 for none
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses, refined where that was asked for
+    mount: MountCorrection | None = None  #: Where a correction was asked for
 
 
 def build_map(detections: PosedDetections, options: MappingOptions | None = None,
@@ -78,8 +66,6 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
 
     Parameters
     ----------
-    detections : PosedDetections
-    options : MappingOptions, optional
     progress : callable, optional
         Called with the name of a stage and the share of it that is done, 0 to 1.
 

@@ -22,29 +22,18 @@ _REACH = 1.2
 
 
 class Evidence(NamedTuple):
-    """What is known of each of L landmarks.
+    """What is known of each of L landmarks."""
 
-    Parameters
-    ----------
-    support, viewpoints, expected : ndarray (L,) of int
-        Frames that show it, their viewpoints, and frames that should show it.
-    baseline_deg : ndarray (L,)
-        Greatest angle between two directions from which it was seen [deg].
-    position_sigma : ndarray (L,)
-        Standard deviation of the centre on its worst axis [m].
-    median_iou : ndarray (L,)
-        Of its boxes; 0 without any.
-    last_seen : ndarray (L,)
-        [s]; NaN where nothing shows it.
-    """
-
+    #: (L,): frames that show it, their viewpoints, and frames that should show it
     support: NDArray[np.int64]
     viewpoints: NDArray[np.int64]
     expected: NDArray[np.int64]
+    #: (L,): greatest angle between two directions from which it was seen [deg]
     baseline_deg: NDArray[np.float64]
+    #: (L,): standard deviation of the centre on its worst axis [m]
     position_sigma: NDArray[np.float64]
-    median_iou: NDArray[np.float64]
-    last_seen: NDArray[np.float64]
+    median_iou: NDArray[np.float64]  #: (L,): of its boxes; 0 without any
+    last_seen: NDArray[np.float64]  #: (L,): [s]; NaN where nothing shows it
 
     @property
     def seen_ratio(self) -> NDArray[np.float64]:
@@ -63,8 +52,6 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
     Parameters
     ----------
-    views : Views
-    landmarks : Landmarks
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
     """

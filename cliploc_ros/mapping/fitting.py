@@ -39,21 +39,13 @@ _MAX_STEP = 1.0
 
 
 class Fit(NamedTuple):
-    """A fitted ellipsoid.
+    """A fitted ellipsoid."""
 
-    Parameters
-    ----------
-    center, basis : ndarray (3,), (3, 3)
-        In the map; the basis' columns are the semi-axes [m].
-    cost : float
-        Robust cost, the prior included.
-    information : ndarray (9, 9)
-        Of centre and shape, see cliploc_ros.mapping.projection.
-    """
-
+    #: (3,), (3, 3): in the map; the basis' columns are the semi-axes [m]
     center: NDArray[np.float64]
     basis: NDArray[np.float64]
-    cost: float
+    cost: float  #: Robust cost, the prior included
+    #: (9, 9): of centre and shape, see cliploc_ros.mapping.projection
     information: NDArray[np.float64]
 
 
@@ -63,7 +55,6 @@ def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np
 
     Parameters
     ----------
-    views : Views
     landmarks : Landmarks
         L of them.
     boxes : sequence of ndarray of int
@@ -83,7 +74,6 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
 
     Parameters
     ----------
-    views : Views
     rows : ndarray (m,) of int
         Boxes of the landmark.
     center, basis : ndarray (3,), (3, 3)

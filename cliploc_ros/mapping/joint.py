@@ -93,7 +93,6 @@ def pose_bands(of_poses: NDArray[np.float64], prior: Prior,
     ----------
     of_poses : ndarray (F, 6, 6)
         A block for each pose.
-    prior : Prior
     of_steps : ndarray (F, 6, 6), optional
         The block below each of these: the rows of the next pose, the columns of this one.
 
@@ -143,10 +142,8 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
         With the given poses, which the prior holds on to.
     views : Views
         With the poses to start from.
-    landmarks : Landmarks
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
-    errors : PoseErrors
     iterations : int
         The most steps of Levenberg and Marquardt.
     anchors : Anchors, optional

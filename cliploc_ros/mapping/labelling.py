@@ -47,7 +47,6 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
 
     Parameters
     ----------
-    landmark_ids : sequence of L str
     detections : PosedDetections
         With embeddings. Rows of the length 0 are no crops.
     shown : ndarray (n,) of int
@@ -80,7 +79,6 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     embeddings : LandmarkEmbeddings
         In any order. A landmark without one keeps its label.
     phrases : mapping of str to sequence of Phrases

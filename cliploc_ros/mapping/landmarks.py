@@ -13,21 +13,12 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 
 class Landmarks(NamedTuple):
-    """L ellipsoids of known classes.
+    """L ellipsoids of known classes."""
 
-    Parameters
-    ----------
-    centers : ndarray (L, 3)
-        [m].
-    bases : ndarray (L, 3, 3)
-        Their columns are the semi-axes [m], see cliploc_ros.mapping.projection.
-    classes : ndarray (L,) of int
-        Detector classes.
-    """
-
-    centers: NDArray[np.float64]
+    centers: NDArray[np.float64]  #: (L, 3): [m]
+    #: (L, 3, 3): their columns are the semi-axes [m], see cliploc_ros.mapping.projection
     bases: NDArray[np.float64]
-    classes: NDArray[np.int64]
+    classes: NDArray[np.int64]  #: (L,): detector classes
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
         """Return some of the landmarks."""

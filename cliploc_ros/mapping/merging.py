@@ -24,20 +24,12 @@ _ONE_BOX_IOU = 0.6
 
 
 class Merged(NamedTuple):
-    """Landmarks after merging: K of L are left.
+    """Landmarks after merging: K of L are left."""
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        The K that are left, in their order.
-    shown : ndarray (n,) of int
-        The landmark, of those that are left, that each box shows, -1 for none.
-    into : ndarray (L,) of int
-        The landmark, of those before merging, that each one is part of now.
-    """
-
-    landmarks: Landmarks
+    landmarks: Landmarks  #: The K that are left, in their order
+    #: (n,): the landmark, of those that are left, that each box shows, -1 for none
     shown: NDArray[np.int64]
+    #: (L,): the landmark, of those before merging, that each one is part of now
     into: NDArray[np.int64]
 
 
@@ -47,11 +39,8 @@ def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64
 
     Parameters
     ----------
-    views : Views
-    landmarks : Landmarks
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
-    options : MappingOptions
     """
     merged = merge_pairs(views, landmarks, shown,
                          pairs_of_one_class(landmarks, options.merge_distance), options)

@@ -37,20 +37,12 @@ _NAMES = ('x (right)', 'y (down)', 'z (forward)', 'rotation about x', 'rotation 
 
 
 class MountCorrection(NamedTuple):
-    """A correction of the mount.
+    """A correction of the mount."""
 
-    Parameters
-    ----------
-    views : Views
-        With the correction applied.
-    given_from_corrected : ndarray (4, 4)
-        Pose of the corrected camera in the camera that the given poses describe.
-    deviations : ndarray (6,)
-        Standard deviations of x, y, z [m] and of the rotations about them [rad].
-    """
-
-    views: Views
+    views: Views  #: With the correction applied
+    #: (4, 4): pose of the corrected camera in the camera that the given poses describe
     given_from_corrected: NDArray[np.float64]
+    #: (6,): standard deviations of x, y, z [m] and of the rotations about them [rad]
     deviations: NDArray[np.float64]
 
     def lines(self) -> list[str]:

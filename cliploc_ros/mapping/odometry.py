@@ -39,38 +39,23 @@ _MAX_SCALE_ERROR = 0.15
 
 
 class StepEquations(NamedTuple):
-    """What odometry adds to the normal equations of F poses.
-
-    Parameters
-    ----------
-    cost : float
-    of_poses, of_steps : ndarray (F, 6, 6)
-        A block for each pose, and the block below it: the rows of the next pose.
-    gradient : ndarray (F, 6)
-    """
+    """What odometry adds to the normal equations of F poses."""
 
     cost: float
+    #: (F, 6, 6): a block for each pose, and the block below it: the rows of the next pose
     of_poses: NDArray[np.float64]
     of_steps: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    gradient: NDArray[np.float64]  #: (F, 6)
 
 
 class Steps(NamedTuple):
-    """How the camera moved between m pairs of successive frames, by odometry.
+    """How the camera moved between m pairs of successive frames, by odometry."""
 
-    Parameters
-    ----------
-    frames : ndarray (m,) of int
-        The first frame of each pair.
-    shifts, turns : ndarray (m, 3), (m, 3, 3)
-        Origin [m] and axes of the second camera in the first.
-    stiffness : ndarray (m, 2)
-        Inverse standard deviations on each axis of shift [1/m] and turn [1/rad].
-    """
-
-    frames: NDArray[np.int64]
+    frames: NDArray[np.int64]  #: (m,): the first frame of each pair
+    #: (m, 3), (m, 3, 3): origin [m] and axes of the second camera in the first
     shifts: NDArray[np.float64]
     turns: NDArray[np.float64]
+    #: (m, 2): inverse standard deviations on each axis of shift [1/m] and turn [1/rad]
     stiffness: NDArray[np.float64]
 
     def linearize(self, views: Views) -> StepEquations:
@@ -117,12 +102,10 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
 
     Parameters
     ----------
-    given : Views
     odom_from_camera : ndarray (F, 4, 4)
         NaN where unknown.
     errors : PoseErrors
         Of the given poses.
-    noise : OdometryErrors
 
     Returns
     -------
@@ -175,28 +158,18 @@ def _contradiction(known: '_Known', errors: PoseErrors, noise: OdometryErrors) -
 
 
 class _Compared(NamedTuple):
-    """Odometry against poses for m pairs of frames.
+    """Odometry against poses for m pairs of frames."""
 
-    Parameters
-    ----------
-    shifts, turns, sigmas : ndarray (m, 3), (m, 3, 3), (m, 2)
-        Of odometry, as in Steps; standard deviations [m] [rad].
-    excess : ndarray (m,)
-        How far the two differ, in standard deviations of both.
-    is_motion : ndarray (m, 2) of bool
-        These deviations alone do not explain that the camera shifts, or turns.
-    motions_m : ndarray (2, m)
-        How far the camera moves by odometry and by the poses [m].
-    along_m : ndarray (m,)
-        How far it moves by the poses in the direction of odometry [m].
-    """
-
+    #: (m, 3), (m, 3, 3), (m, 2): of odometry, as in Steps; standard deviations [m] [rad]
     shifts: NDArray[np.float64]
     turns: NDArray[np.float64]
     sigmas: NDArray[np.float64]
-    excess: NDArray[np.float64]
+    excess: NDArray[np.float64]  #: (m,): how far the two differ, in standard deviations of both
+    #: (m, 2): these deviations alone do not explain that the camera shifts, or turns
     is_motion: NDArray[np.bool_]
+    #: (2, m): how far the camera moves by odometry and by the poses [m]
     motions_m: NDArray[np.float64]
+    #: (m,): how far it moves by the poses in the direction of odometry [m]
     along_m: NDArray[np.float64]
 
     def scale(self, pairs: NDArray[np.bool_]) -> float:
@@ -206,23 +179,14 @@ class _Compared(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """The frames with odometry: m of F.
+    """The frames with odometry: m of F."""
 
-    Parameters
-    ----------
-    given : Views
-        Of all F frames.
-    frames, stamps_s : ndarray (m,)
-    poses : ndarray (m, 4, 4)
-        odom_from_camera.
-    distances_m, angles : ndarray (m,)
-        By odometry since the first frame, along the way [m] [rad].
-    """
-
-    given: Views
+    given: Views  #: Of all F frames
+    #: (m,)
     frames: NDArray[np.int64]
     stamps_s: NDArray[np.float64]
-    poses: NDArray[np.float64]
+    poses: NDArray[np.float64]  #: (m, 4, 4): odom_from_camera
+    #: (m,): by odometry since the first frame, along the way [m] [rad]
     distances_m: NDArray[np.float64]
     angles: NDArray[np.float64]
 

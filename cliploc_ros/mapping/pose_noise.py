@@ -71,8 +71,6 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
 
     Parameters
     ----------
-    given : Views
-    landmarks : Landmarks
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
     start : Views
@@ -99,23 +97,13 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
 
 
 class _Linearized(NamedTuple):
-    """The boxes about the best poses and landmarks.
+    """The boxes about the best poses and landmarks."""
 
-    Parameters
-    ----------
-    stamps_s : ndarray (F,)
-    errors : ndarray (F, 6)
-    equations : Equations
-        Of the boxes alone.
-    coupling : ndarray (6 F, 9 L)
-    squares, weight : float
-        Sum of the weighted squares of the residuals, and of their weights.
-    """
-
-    stamps_s: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    equations: Equations
-    coupling: NDArray[np.float64]
+    stamps_s: NDArray[np.float64]  #: (F,)
+    errors: NDArray[np.float64]  #: (F, 6)
+    equations: Equations  #: Of the boxes alone
+    coupling: NDArray[np.float64]  #: (6 F, 9 L)
+    #: Sum of the weighted squares of the residuals, and of their weights
     squares: float
     weight: float
 

@@ -18,54 +18,28 @@ _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embe
 
 @dataclass(frozen=True)
 class PosedDetections:
-    """Detections of F frames with their poses: n boxes of C classes, in the order of time.
+    """Detections of F frames with their poses: n boxes of C classes, in the order of time."""
 
-    Parameters
-    ----------
-    camera : Camera
-        Of the undistorted images.
-    map_from_camera : ndarray (F, 4, 4)
-        The poses to map with.
-    stamps_s : ndarray (F,)
-        Times of the images [s], ascending.
-    frame_offsets : ndarray (F + 1,) of int
-        Frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1].
-    bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px], undistorted.
-    class_names : tuple of str
-        The C detector classes.
-    classes : ndarray (n,) of int
-        Index of each box's class.
-    scores : ndarray (n,)
-        Detector confidences, 0 to 1.
-    depths, depth_spreads : ndarray (n,), optional
-        Depth of what each box shows, along z of the camera, and half the distance between its
-        16th and 84th percentile [m]; NaN where unknown.
-    embeddings : ndarray (n, d) float16, optional
-        Of the crops, unit rows.
-    encoder_key : str
-        Identifies the encoder of the embeddings.
-    odom_from_camera : ndarray (F, 4, 4), optional
-        The same cameras by odometry, which drifts but does not jump; NaN where unknown.
-    open_edges : ndarray (n, 4) of bool, optional
-        The edge lay at the border of the image, so the object may extend beyond it. For a lens
-        with distortion, whose border is no straight line of the undistorted image; None: an edge
-        is open at the border of that.
-    """
-
-    camera: Camera
-    map_from_camera: NDArray[np.float64]
-    stamps_s: NDArray[np.float64]
+    camera: Camera  #: Of the undistorted images
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses to map with
+    stamps_s: NDArray[np.float64]  #: (F,): times of the images [s], ascending
+    #: (F + 1,): frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1]
     frame_offsets: NDArray[np.int64]
-    bboxes_xyxy: NDArray[np.float64]
-    class_names: tuple[str, ...]
-    classes: NDArray[np.int64]
-    scores: NDArray[np.float64]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom [px], undistorted
+    class_names: tuple[str, ...]  #: The C detector classes
+    classes: NDArray[np.int64]  #: (n,): index of each box's class
+    scores: NDArray[np.float64]  #: (n,): detector confidences, 0 to 1
+    #: (n,): depth of what each box shows, along z of the camera, and half the distance between its
+    #: 16th and 84th percentile [m]; NaN where unknown
     depths: NDArray[np.float32] | None = None
     depth_spreads: NDArray[np.float32] | None = None
-    embeddings: NDArray[np.float16] | None = None
-    encoder_key: str = ''
+    embeddings: NDArray[np.float16] | None = None  #: (n, d): of the crops, unit rows
+    encoder_key: str = ''  #: Identifies the encoder of the embeddings
+    #: (F, 4, 4): the same cameras by odometry, which drifts but does not jump; NaN where unknown
     odom_from_camera: NDArray[np.float64] | None = None
+    #: (n, 4): the edge lay at the border of the image, so the object may extend beyond it. For a
+    #: lens with distortion, whose border is no straight line of the undistorted image; None: an
+    #: edge is open at the border of that.
     open_edges: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:

@@ -41,30 +41,18 @@ _MAX_MOVE_M = 0.5
 
 @dataclass(frozen=True)
 class RefitMap:
-    """A map fitted to a recording: L landmarks in the order of the given map.
+    """A map fitted to a recording: L landmarks in the order of the given map."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        All L landmarks. Those with a reason are as they were given.
-    reasons : tuple of (str or None)
-        Why a landmark could not be fitted; None where it was fitted, or was not chosen.
-    part_of : ndarray (L,) of int
-        The landmark that a duplicate shares its object with; else its own row.
-    notes : tuple of str
-        What is wrong with the recording.
-    explained_before, explained : float
-        Share of the boxes of the map's classes that a landmark explains.
-    iou_before, iou : float
-        Median IoU of these boxes. All four are measured on the frames used for fitting.
-    """
-
-    landmark_map: LandmarkMap
+    landmark_map: LandmarkMap  #: All L landmarks. Those with a reason are as they were given.
+    #: Why a landmark could not be fitted; None where it was fitted, or was not chosen
     reasons: tuple[str | None, ...]
+    #: (L,): the landmark that a duplicate shares its object with; else its own row
     part_of: NDArray[np.int64]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  #: What is wrong with the recording
+    #: Share of the boxes of the map's classes that a landmark explains
     explained_before: float
     explained: float
+    #: Median IoU of these boxes. All four are measured on the frames used for fitting.
     iou_before: float
     iou: float
 
@@ -88,10 +76,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     ----------
     detections : PosedDetections
         In the coordinate frame of the map.
-    landmark_map : LandmarkMap
     chosen : ndarray (L,) of bool, optional
         Landmarks to fit; all without it.
-    options : MappingOptions, optional
 
     Raises
     ------

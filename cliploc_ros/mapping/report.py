@@ -21,20 +21,11 @@ _REASONS_SHOWN = 10
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A landmark that is not good enough for the map.
-
-    Parameters
-    ----------
-    class_id : str
-    center : tuple of float
-        [m].
-    support, viewpoints : int
-        Frames that show it, and their viewpoints.
-    reason : str
-    """
+    """A landmark that is not good enough for the map."""
 
     class_id: str
-    center: tuple[float, float, float]
+    center: tuple[float, float, float]  #: [m]
+    #: Frames that show it, and their viewpoints
     support: int
     viewpoints: int
     reason: str
@@ -42,32 +33,21 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class MappingReport:
-    """The result of mapping in numbers and words.
-
-    Parameters
-    ----------
-    frames, viewpoints, boxes, landmarks : int
-    explained : float
-        Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3.
-    median_iou : float
-        Of these boxes. Both are measured on the frames that the map was fitted to.
-    pose_change_m, pose_change_deg : float
-        Root mean square by which joint refinement moved the poses.
-    left_out : tuple of LeftOut
-    notes : tuple of str
-        What is wrong with the input, and what to do about it.
-    """
+    """The result of mapping in numbers and words."""
 
     frames: int
     viewpoints: int
     boxes: int
     landmarks: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
     explained: float
+    #: Of these boxes. Both are measured on the frames that the map was fitted to.
     median_iou: float
+    #: Root mean square by which joint refinement moved the poses
     pose_change_m: float
     pose_change_deg: float
     left_out: tuple[LeftOut, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
@@ -99,8 +79,6 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
     Parameters
     ----------
-    views : Views
-    landmarks : Landmarks
     shown : ndarray (n,) of int, optional
         The landmark that each box shows, -1 for none: explains a box although the landmark's
         class is another one.

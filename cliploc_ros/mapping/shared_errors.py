@@ -38,7 +38,6 @@ def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.
 
     Parameters
     ----------
-    views : Views
     changes : ndarray (F, 6)
         Squares of what refinement changed; 0 where the poses were taken as they are.
     shown : ndarray (n,) of int
@@ -63,7 +62,6 @@ def shared_by_neighbours(views: Views, shown: NDArray[np.int64], count: int, err
 
     Parameters
     ----------
-    views : Views
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
     count : int

@@ -65,7 +65,6 @@ def add_depths(views: Views, detections: PosedDetections, scale: float = 1.0) ->
 
     Parameters
     ----------
-    views : Views
     detections : PosedDetections
         The same boxes. Without depth the views stay as they are.
     scale : float
@@ -111,7 +110,6 @@ def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
 
     Parameters
     ----------
-    views : Views
     landmarks : Landmarks
         Fitted to boxes only.
     shown : ndarray (n,) of int
@@ -163,11 +161,8 @@ def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
 
     Parameters
     ----------
-    views : Views
     rows : ndarray (m,) of int
         Boxes of one class, in the order of time. A box belongs to at most one landmark.
-    options : MappingOptions
-    rng : numpy.random.Generator
     """
     if len(rows) < options.min_viewpoints:
         return no_landmarks()

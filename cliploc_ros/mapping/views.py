@@ -16,48 +16,28 @@ _VIEWPOINT_ANGLE_DEG = 5.0
 
 
 class Views(NamedTuple):
-    """F frames with n boxes. Everything in the image is on the plane z = 1.
+    """F frames with n boxes. Everything in the image is on the plane z = 1."""
 
-    Parameters
-    ----------
-    rotations, translations : ndarray (F, 3, 3), (F, 3)
-        Of camera_from_map.
-    stamps_s : ndarray (F,)
-        [s].
-    viewpoints : ndarray (F,) of int
-        Number of the viewpoint of each frame, ascending: frames that the camera took without
-        moving share one.
-    weights : ndarray (F,)
-        One over the number of frames of the same viewpoint: their boxes err alike.
-    offsets : ndarray (F + 1,) of int
-        First box of each frame.
-    frames, classes : ndarray (n,) of int
-        Of each box.
-    edges : ndarray (n, 4)
-        Left, top, right, bottom, clipped to the image.
-    stiffness : ndarray (n, 4)
-        Inverse standard deviation of each edge.
-    is_open : ndarray (n, 4) of bool
-        The edge lies at the image border: the object may extend beyond it.
-    bounds : ndarray (4,)
-        Left, top, right, bottom of the image.
-    depths, depth_stiffness : ndarray (n,)
-        Measured depth of the object's centre [m], and its inverse standard deviation; 0 where
-        unknown.
-    """
-
+    #: (F, 3, 3), (F, 3): of camera_from_map
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
-    stamps_s: NDArray[np.float64]
+    stamps_s: NDArray[np.float64]  #: (F,): [s]
+    #: (F,): number of the viewpoint of each frame, ascending: frames that the camera took without
+    #: moving share one
     viewpoints: NDArray[np.int64]
+    #: (F,): one over the number of frames of the same viewpoint: their boxes err alike
     weights: NDArray[np.float64]
-    offsets: NDArray[np.int64]
+    offsets: NDArray[np.int64]  #: (F + 1,): first box of each frame
+    #: (n,): of each box
     frames: NDArray[np.int64]
     classes: NDArray[np.int64]
-    edges: NDArray[np.float64]
-    stiffness: NDArray[np.float64]
+    edges: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom, clipped to the image
+    stiffness: NDArray[np.float64]  #: (n, 4): inverse standard deviation of each edge
+    #: (n, 4): the edge lies at the image border: the object may extend beyond it
     is_open: NDArray[np.bool_]
-    bounds: NDArray[np.float64]
+    bounds: NDArray[np.float64]  #: (4,): Left, top, right, bottom of the image
+    #: (n,): measured depth of the object's centre [m], and its inverse standard deviation; 0 where
+    #: unknown
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
 

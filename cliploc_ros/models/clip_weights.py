@@ -24,43 +24,29 @@ _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 class ClipOptions:
     """Which CLIP to load, and how to run it.
 
-    Parameters
-    ----------
-    model : str
-        Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
-        config (.json), whose name is then the file's.
-    pretrained : str
-        A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also
-        determines activation and colour normalization; with a path the architecture's own
-        values hold.
-    checkpoint_path : str
-        Local file with the weights of the tag, instead of a download; '' downloads.
-    device : str
-        'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
-    precision : str
-        'auto' (fp16 on a GPU; fp32 on a CPU, or bf16 where OpenVINO finds it in the CPU), 'fp16'
-        or 'fp32'; of the image tower.
-    max_batch : int
-        Greatest number of crops in one forward pass; bounds the memory.
-    cache_dir : str
-        Folder for downloads, label embeddings and converted networks; '' is the user's cache.
-    inference : str
-        'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'; of the image
-        tower.
-
     Raises
     ------
     OptionsError
         For values out of range.
     """
 
+    #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
+    #: config (.json), whose name is then the file's
     model: str = 'ViT-L-14'
+    #: A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also determines
+    #: activation and colour normalization; with a path the architecture's own values hold.
     pretrained: str = 'openai'
+    #: Local file with the weights of the tag, instead of a download; '' downloads
     checkpoint_path: str = ''
-    device: str = 'auto'
+    device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
+    #: 'auto' (fp16 on a GPU; fp32 on a CPU, or bf16 where OpenVINO finds it in the CPU), 'fp16' or
+    #: 'fp32'; of the image tower
     precision: str = 'auto'
-    max_batch: int = 64
+    max_batch: int = 64  #: Greatest number of crops in one forward pass; bounds the memory
+    #: Folder for downloads, label embeddings and converted networks; '' is the user's cache
     cache_dir: str = ''
+    #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'; of the image
+    #: tower
     inference: str = 'auto'
 
     def __post_init__(self) -> None:
@@ -73,31 +59,16 @@ class ClipOptions:
 
 @dataclass(frozen=True)
 class ClipWeights:
-    """A file of CLIP weights and what is needed to use it.
+    """A file of CLIP weights and what is needed to use it."""
 
-    Parameters
-    ----------
-    model : str
-        Architecture, a name of ``open_clip.list_models()``.
-    file : Path
-        The weights.
-    quick_gelu : bool
-        Whether the weights were trained with OpenAI's approximate GELU.
-    preprocess : dict
-        ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
-        ``open_clip.create_model_and_transforms`` takes them; empty for its defaults.
-    embed_dim : int
-        Length of an embedding.
-    key : str
-        Identifies model and weights.
-    """
-
-    model: str
-    file: Path
-    quick_gelu: bool
+    model: str  #: Architecture, a name of ``open_clip.list_models()``
+    file: Path  #: The weights
+    quick_gelu: bool  #: Whether the weights were trained with OpenAI's approximate GELU
+    #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
+    #: ``open_clip.create_model_and_transforms`` takes them; empty for its defaults
     preprocess: dict[str, Any]
-    embed_dim: int
-    key: str
+    embed_dim: int  #: Length of an embedding
+    key: str  #: Identifies model and weights
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:

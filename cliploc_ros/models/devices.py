@@ -77,7 +77,6 @@ def resolve_inference(inference: str, device: 'torch.device', precision: str) ->
     ----------
     inference : str
         One of INFERENCES.
-    device : torch.device
     precision : str
         'fp16' or 'fp32'.
 

@@ -34,8 +34,6 @@ class TorchTower:
 
     Parameters
     ----------
-    weights : ClipWeights
-    device : torch.device
     precision : str
         'fp16' or 'fp32'.
     """
@@ -61,7 +59,6 @@ class OpenVinoTower:
 
     Parameters
     ----------
-    network : Network
     preprocess : callable
         Prepares a crop.
     """

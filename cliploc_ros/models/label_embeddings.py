@@ -135,11 +135,9 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
 
     Parameters
     ----------
-    descriptions : sequence of R WeightedLabels
     encode : callable
         Returns the embeddings (m, embed_dim) of m labels, unit rows. It is called with sorted
         labels, at most PART at once.
-    embed_dim : int
     """
     labels = sorted({label for one in descriptions for label, _ in one})
     weights = _weights(descriptions, labels)

@@ -28,8 +28,6 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
 
     Parameters
     ----------
-    options : ClipOptions
-    landmark_map : LandmarkMap
     map_files : sequence of str
         The file of each map, which has its image embeddings next to it; empty for none.
     compare : str

@@ -103,7 +103,6 @@ class Observer:
 
     Parameters
     ----------
-    encoder : ImageTextEncoder
     label_embeddings : LabelEmbeddings or ndarray (L, d)
         Unit rows, one for each landmark of the map.
     """
@@ -141,7 +140,6 @@ class Observer:
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
-        camera : Camera
         detections : Detections
             See `Detections.usable`.
         stamp_ns : int
@@ -183,7 +181,6 @@ class ObservedCrops:
 
     Parameters
     ----------
-    observer : Observer
     image_rgb : ndarray (h, w, 3) uint8
     bboxes_xyxy : ndarray (n, 4)
         [px]

@@ -49,23 +49,13 @@ class ConversionError(ModelError):
 
 
 class Conversion(NamedTuple):
-    """A network that was converted.
-
-    Parameters
-    ----------
-    network : openvino.Model
-    probe : ndarray float32
-        An input of another shape than the one that the network was traced with.
-    expected : ndarray float32
-        What PyTorch makes of the probe.
-    about : dict
-        What else the user of the network needs, as JSON.
-    """
+    """A network that was converted."""
 
     network: Any
+    #: float32: an input of another shape than the one that the network was traced with
     probe: NDArray[np.float32]
-    expected: NDArray[np.float32]
-    about: dict[str, Any]
+    expected: NDArray[np.float32]  #: float32: what PyTorch makes of the probe
+    about: dict[str, Any]  #: What else the user of the network needs, as JSON
 
 
 class Network:
@@ -73,7 +63,6 @@ class Network:
 
     Parameters
     ----------
-    network : openvino.Model
     about : dict
         See Conversion.
     precision : str, optional

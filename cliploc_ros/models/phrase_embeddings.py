@@ -48,8 +48,6 @@ def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
 
     Parameters
     ----------
-    weights : ClipWeights
-    options : ClipOptions
     parts : sequence of mapping of str to sequence of str
         Phrases by class. Those that change together belong into one part: the cache then keeps
         the others.

@@ -12,17 +12,10 @@ from cliploc_ros.models.yolo_weights import YoloOptions
 
 @dataclass(frozen=True)
 class Profile:
-    """A detector and an encoder.
+    """A detector and an encoder."""
 
-    Parameters
-    ----------
-    detector : str
-        A published YOLO model.
-    clip_model, clip_pretrained : str
-        See ClipOptions.
-    """
-
-    detector: str
+    detector: str  #: A published YOLO model
+    #: See ClipOptions
     clip_model: str
     clip_pretrained: str
 

@@ -37,7 +37,6 @@ class TorchYolo:
     ----------
     file : Path
         A ``.pt`` file.
-    device : torch.device
     precision : str
         'fp16' or 'fp32'.
     """

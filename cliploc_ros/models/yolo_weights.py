@@ -33,42 +33,23 @@ logger = logging.getLogger(__name__)
 class YoloOptions:
     """Which YOLO to load, and how to run it. The names are ultralytics' own.
 
-    Parameters
-    ----------
-    model : str
-        Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
-        ``.pt`` file, which is then downloaded once.
-    conf : float
-        Least confidence of a detection, 0 to 1.
-    iou : float
-        IoU from which the weaker of two boxes of a class is dropped, 0 to 1.
-    imgsz : int
-        The network sees the image with its longer side scaled to this [px].
-    max_det : int
-        Greatest number of detections in an image; the most confident are kept.
-    device : str
-        'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
-    precision : str
-        'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'.
-    cache_dir : str
-        Folder for downloads and converted networks; '' is the user's cache.
-    inference : str
-        'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'.
-
     Raises
     ------
     OptionsError
         For values out of range.
     """
 
+    #: Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
+    #: ``.pt`` file, which is then downloaded once
     model: str = 'yolov8x.pt'
-    conf: float = 0.1
-    iou: float = 0.7
-    imgsz: int = 640
-    max_det: int = 300
-    device: str = 'auto'
-    precision: str = 'auto'
-    cache_dir: str = ''
+    conf: float = 0.1  #: Least confidence of a detection, 0 to 1
+    iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1
+    imgsz: int = 640  #: The network sees the image with its longer side scaled to this [px]
+    max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
+    device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
+    precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
+    cache_dir: str = ''  #: Folder for downloads and converted networks; '' is the user's cache
+    #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
     inference: str = 'auto'
 
     def __post_init__(self) -> None:

@@ -26,7 +26,6 @@ class Journal:
 
     Parameters
     ----------
-    path : Path
     run : bytes
         Says what run it is.
 

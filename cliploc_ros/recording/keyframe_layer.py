@@ -37,21 +37,14 @@ _IMAGE_PX, _JPEG_QUALITY = 256, 60
 
 @dataclass(frozen=True)
 class LayerOptions:
-    """Which images become keyframes, and how many points each keeps.
+    """Which images become keyframes, and how many points each keeps."""
 
-    Parameters
-    ----------
-    distance_m, angle_deg : float
-        An image becomes a keyframe unless one of them is nearer than both. 0: every image.
-    most_points : int
-        Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
-    images : bool
-        Whether to store small images of the keyframes, too, for people to look at.
-    """
-
+    #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
     distance_m: float = 0.1
     angle_deg: float = 5.0
+    #: Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
     most_points: int = 600
+    #: Whether to store small images of the keyframes, too, for people to look at
     images: bool = False
 
     def __post_init__(self) -> None:
@@ -85,7 +78,6 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         With depth, or posed images that overlap, which triangulate the points.
     landmark_map : LandmarkMap
         The map that the layer belongs to.
-    options : LayerOptions, optional
 
     Raises
     ------

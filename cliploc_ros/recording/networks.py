@@ -28,40 +28,26 @@ MAX_DETECTIONS = 50
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """What detector and CLIP said about a frame: n boxes.
+    """What detector and CLIP said about a frame: n boxes."""
 
-    Parameters
-    ----------
-    place, stamp_ns : int
-        Number of the image in its source, and its stamp [ns].
-    map_from_camera : ndarray (4, 4)
-    image_size, intrinsics : ndarray (2,), (4,)
-        Width and height, and fx, fy, cx, cy of the undistorted image [px].
-    bboxes_xyxy : ndarray (n, 4)
-        Undistorted [px].
-    open_edges : ndarray (n, 4) or (0, 4) of bool
-        See PosedDetections; without rows for a lens without distortion.
-    class_ids, scores : ndarray (n,)
-    embeddings : ndarray (n, d) float16
-        Of the crops; d is 0 without CLIP.
-    depths, depth_spreads : ndarray (n,) float32
-        [m]; NaN where unknown.
-    detector_ms, clip_ms : float
-        Time taken [ms].
-    """
-
+    #: Number of the image in its source, and its stamp [ns]
     place: int
     stamp_ns: int
-    map_from_camera: NDArray[np.float64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    #: (2,), (4,): width and height, and fx, fy, cx, cy of the undistorted image [px]
     image_size: NDArray[np.int64]
     intrinsics: NDArray[np.float64]
-    bboxes_xyxy: NDArray[np.float64]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
+    #: (n, 4) or (0, 4): see PosedDetections; without rows for a lens without distortion
     open_edges: NDArray[np.bool_]
+    #: (n,)
     class_ids: NDArray[np.str_]
     scores: NDArray[np.float64]
-    embeddings: NDArray[np.float16]
+    embeddings: NDArray[np.float16]  #: (n, d): of the crops; d is 0 without CLIP
+    #: (n,): [m]; NaN where unknown
     depths: NDArray[np.float32]
     depth_spreads: NDArray[np.float32]
+    #: Time taken [ms]
     detector_ms: float
     clip_ms: float
 
@@ -82,20 +68,11 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class LoadNetworks:
-    """Loads detector and CLIP in the process that uses them.
-
-    Parameters
-    ----------
-    yolo : YoloOptions
-    clip : ClipOptions, optional
-        None: classes and boxes only.
-    threads : int
-        Of PyTorch on a CPU; 0 leaves its own choice.
-    """
+    """Loads detector and CLIP in the process that uses them."""
 
     yolo: YoloOptions
-    clip: ClipOptions | None
-    threads: int = 0
+    clip: ClipOptions | None  #: None: classes and boxes only
+    threads: int = 0  #: Of PyTorch on a CPU; 0 leaves its own choice
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame]:
         """Return the function that looks at a frame.

@@ -43,14 +43,9 @@ _UNKNOWN = np.full((4, 4), np.nan)
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """How far apart keyframes are: either is enough.
+    """How far apart keyframes are: either is enough."""
 
-    Parameters
-    ----------
-    distance_m, angle_deg : float
-        [m] [deg]. 0 takes every frame with a pose.
-    """
-
+    #: [m] [deg]. 0 takes every frame with a pose.
     distance_m: float = 0.1
     angle_deg: float = 5.0
 
@@ -93,28 +88,15 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How to look at a recording.
-
-    Parameters
-    ----------
-    yolo : YoloOptions
-    clip : ClipOptions, optional
-        None: no embeddings.
-    keyframes : KeyframeOptions
-    reading : str
-        Says all else that the frames depend on, such as topics, mount and depth format.
-    workers : int
-        Local processes. The result does not depend on it.
-    scheduler : str
-        Address of a Dask scheduler; '' for none.
-    """
+    """How to look at a recording."""
 
     yolo: YoloOptions
-    clip: ClipOptions | None
+    clip: ClipOptions | None  #: None: no embeddings
     keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
+    #: Says all else that the frames depend on, such as topics, mount and depth format
     reading: str = ''
-    workers: int = 1
-    scheduler: str = ''
+    workers: int = 1  #: Local processes. The result does not depend on it.
+    scheduler: str = ''  #: Address of a Dask scheduler; '' for none
 
     @property
     def networks(self) -> LoadNetworks:
@@ -156,8 +138,6 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
 
     Parameters
     ----------
-    frames : Frames
-    options : RecordingOptions
     file : Path, optional
         The observation file; None: see observation_file.
     odometry : Poses, optional

@@ -30,38 +30,21 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Answer:
-    """A verdict, its reason and, where it is accepted, the pose.
-
-    Parameters
-    ----------
-    verdict : Verdict
-    detail : str
-        The pose in words, or the reason for having none, in one line.
-    pose : PoseWithCovarianceStamped or None
-        None unless accepted.
-    received_at : float
-        When the image arrived (monotonic clock) [s]; -inf without one.
-    state : RobotState or None
-        What the robot knew at the stamp of the image; None without an image.
-    is_cut : bool
-        Whether time was too short for all crops, which could have changed the verdict.
-    stages_ms : mapping of str to float
-        How long each stage took [ms].
-    map_hash : str
-        Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one.
-    kind : RefusalKind or None
-        Of a refusal; None for other verdicts.
-    """
+    """A verdict, its reason and, where it is accepted, the pose."""
 
     verdict: Verdict
-    detail: str
-    pose: PoseWithCovarianceStamped | None = None
+    detail: str  #: The pose in words, or the reason for having none, in one line
+    pose: PoseWithCovarianceStamped | None = None  #: None unless accepted
+    #: When the image arrived (monotonic clock) [s]; -inf without one
     received_at: float = -math.inf
+    #: What the robot knew at the stamp of the image; None without an image
     state: RobotState | None = None
+    #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
-    stages_ms: Mapping[str, float] = field(default_factory=dict)
+    stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
+    #: Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one
     map_hash: str = ''
-    kind: RefusalKind | None = None
+    kind: RefusalKind | None = None  #: Of a refusal; None for other verdicts
 
     @property
     def is_linked(self) -> bool:

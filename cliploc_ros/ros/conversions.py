@@ -41,7 +41,6 @@ def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | No
 
     Parameters
     ----------
-    msg : vision_msgs/Detection2DArray
     class_map : mapping, optional
         The map's names for some of the detector's classes.
     """

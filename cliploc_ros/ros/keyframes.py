@@ -38,7 +38,6 @@ class Keyframes:
 
     Parameters
     ----------
-    localizer : KeyframeLocalizer
     file, file_hash : str
         Where the layer is from, for the diagnostics.
     """
@@ -64,7 +63,6 @@ class Keyframes:
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
-        camera : Camera
         deadline : float
             When the request ends (monotonic clock) [s].
         times : StageTimes

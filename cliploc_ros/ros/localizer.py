@@ -67,11 +67,8 @@ class Localizer:
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    observer : Observer or None
     relocalizer : Relocalizer
         Of the map, with these options.
-    options : RelocalizerOptions
     device : str
         Where the observer's network runs.
     map_hash : str

@@ -23,8 +23,6 @@ class MapServices:
 
     Parameters
     ----------
-    node : ManagedNode
-    pipeline : Pipeline
     group : CallbackGroup
         Of the services.
     """

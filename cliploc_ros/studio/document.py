@@ -35,7 +35,6 @@ class Document:
     ----------
     landmarks : mapping of str to Landmark
         By id. An edit makes a new mapping and leaves this one alone.
-    selection : tuple of str
     revision : int
         Counts the changes of map, selection and file.
     notes : tuple of str

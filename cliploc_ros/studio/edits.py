@@ -40,17 +40,10 @@ class EditError(CliplocError):
 
 @dataclass(frozen=True)
 class Change:
-    """What an edit does.
+    """What an edit does."""
 
-    Parameters
-    ----------
-    what : str
-        For the person who edits.
-    before, after : mapping of str to Landmark
-        By id; None where there is none.
-    """
-
-    what: str
+    what: str  #: For the person who edits
+    #: By id; None where there is none
     before: Mapping[str, Landmark | None]
     after: Mapping[str, Landmark | None]
 
@@ -216,7 +209,6 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
 
     Parameters
     ----------
-    landmarks : mapping
     landmark_ids : sequence of str
         Two or more.
     fit : tuple of ndarray (3,), (3, 3), optional

@@ -36,18 +36,10 @@ LEAST_SEMI_AXIS_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What an image encoder saw of one landmark.
+    """What an image encoder saw of one landmark."""
 
-    Parameters
-    ----------
-    mean : ndarray (d,) float16
-        The mean direction of its crops, of unit length.
-    medoids : ndarray (m, d) float16
-        Crops that stand for all of its crops, unit rows; at most five.
-    encoder_key : str
-    """
-
-    mean: NDArray[np.float16]
+    mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
+    #: (m, d): crops that stand for all of its crops, unit rows; at most five
     medoids: NDArray[np.float16]
     encoder_key: str
 
@@ -120,21 +112,11 @@ def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
 
 @dataclass(frozen=True)
 class Landmark:
-    """A landmark of the map that is edited.
+    """A landmark of the map that is edited."""
 
-    Parameters
-    ----------
-    fields : mapping
-        As in the map file, below the landmark's id.
-    is_locked : bool
-        Edits are refused. The map file does not hold it.
-    look : Look, optional
-        From the file next to the map.
-    """
-
-    fields: Mapping[str, Any]
-    is_locked: bool = False
-    look: Look | None = field(default=None, compare=False)
+    fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
+    is_locked: bool = False  #: Edits are refused. The map file does not hold it.
+    look: Look | None = field(default=None, compare=False)  #: From the file next to the map
 
     @cached_property
     def details(self) -> LandmarkDetails:

@@ -44,24 +44,13 @@ class LiveError(CliplocError):
 
 
 class LivePose(NamedTuple):
-    """A pose that the relocalizer accepted.
+    """A pose that the relocalizer accepted."""
 
-    Parameters
-    ----------
-    map_from_body : ndarray (4, 4)
-        Of the camera, or of the robot if the relocalizer has a base_frame.
-    covariance : ndarray (3, 3)
-        Of the position [m^2].
-    frame_id : str
-        The coordinate frame of the pose.
-    stamp_s : float
-        Of the image [s].
-    """
-
+    #: (4, 4): of the camera, or of the robot if the relocalizer has a base_frame
     map_from_body: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    frame_id: str
-    stamp_s: float
+    covariance: NDArray[np.float64]  #: (3, 3): of the position [m^2]
+    frame_id: str  #: The coordinate frame of the pose
+    stamp_s: float  #: Of the image [s]
 
 
 class LiveState(NamedTuple):

@@ -32,14 +32,7 @@ _GIZMO = 0.4
 
 
 class Page:
-    """The studio in the browser.
-
-    Parameters
-    ----------
-    studio : Studio
-    server : viser.ViserServer
-    live : LiveRelocalizer, optional
-    """
+    """The studio in the browser."""
 
     def __init__(self, studio: Studio, server: viser.ViserServer,
                  live: 'LiveRelocalizer | None' = None):

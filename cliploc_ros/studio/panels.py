@@ -35,11 +35,6 @@ _SHORT = 70
 class Actions:
     """Runs the actions of the people at the page, and tells each the outcome.
 
-    Parameters
-    ----------
-    studio : Studio
-    server : viser.ViserServer
-
     Attributes
     ----------
     changed : Event

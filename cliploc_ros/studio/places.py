@@ -40,26 +40,13 @@ _OPTIONS = CheckOptions(max_positions=100, headings=8)
 
 
 class Places(NamedTuple):
-    """The coverage and the look-alikes of a map.
+    """The coverage and the look-alikes of a map."""
 
-    Parameters
-    ----------
-    landmarks : mapping of str to Landmark
-        That were checked.
-    grid : Grid
-        All positions, the tried ones first.
-    check : GridCheck
-        Of the tried positions.
-    look_alikes : tuple of LookAlike
-    detector : str
-        The source of the detector's errors, in words.
-    """
-
-    landmarks: Landmarks
-    grid: Grid
-    check: GridCheck
+    landmarks: Landmarks  #: That were checked
+    grid: Grid  #: All positions, the tried ones first
+    check: GridCheck  #: Of the tried positions
     look_alikes: tuple[LookAlike, ...]
-    detector: str
+    detector: str  #: The source of the detector's errors, in words
 
     @property
     def figures(self) -> dict[str, str]:

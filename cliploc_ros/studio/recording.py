@@ -189,19 +189,12 @@ class DrawnBox(NamedTuple):
 
 
 class BoxFit(NamedTuple):
-    """An ellipsoid that fits drawn boxes.
+    """An ellipsoid that fits drawn boxes."""
 
-    Parameters
-    ----------
-    center, basis : ndarray (3,), (3, 3)
-        The basis' columns are the semi-axes [m].
-    warning : str
-        What is doubtful about it; empty if nothing is.
-    """
-
+    #: (3,), (3, 3): the basis' columns are the semi-axes [m]
     center: NDArray[np.float64]
     basis: NDArray[np.float64]
-    warning: str
+    warning: str  #: What is doubtful about it; empty if nothing is
 
 
 def fit_boxes(camera: Camera, boxes: Sequence[DrawnBox]) -> BoxFit:

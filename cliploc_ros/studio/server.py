@@ -99,7 +99,6 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
 
     Parameters
     ----------
-    studio : Studio
     host : str
         The address to listen at. Beyond the loopback interface, the URL holds a token.
     port : int

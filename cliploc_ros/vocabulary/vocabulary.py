@@ -84,15 +84,9 @@ def _alternatives(name: str, rules: Rules, chosen: dict[str, str]) -> Sequence[s
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Phrases by class.
+    """Phrases by class."""
 
-    Parameters
-    ----------
-    added : mapping of str to tuple of str
-        Phrases of a user besides the shipped ones.
-    """
-
-    added: Mapping[str, tuple[str, ...]]
+    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user besides the shipped ones
 
     def phrases(self, class_name: str) -> tuple[str, ...]:
         """Return the phrases of a class, each once; the user's come first.

@@ -102,7 +102,6 @@ def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
 
     Parameters
     ----------
-    outcomes : sequence of Outcome
     by : sequence of str
         Fields; none for one row of all outcomes.
     thresholds : sequence of float

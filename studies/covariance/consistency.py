@@ -61,7 +61,6 @@ def squares_of(landmark_map: LandmarkMap, queries: Sequence[Query], groups: Sequ
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     queries : sequence of Query
         All images.
     groups : sequence of int

@@ -74,7 +74,6 @@ def walk_squares(kind: str, seed: int) -> NDArray[np.float64]:
     ----------
     kind : str
         One of KINDS.
-    seed : int
     """
     world = make_walk(kind, seed, _IMAGES)
     session = Session(Relocalizer(world.landmark_map, RelocalizerOptions(

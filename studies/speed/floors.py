@@ -41,21 +41,12 @@ _LEAST_EXTENT_PX, _RANGE_M, _HIDDEN_SHARE = 12.0, 8.0, 0.5
 
 @dataclass(frozen=True)
 class Floor:
-    """Objects of R rooms, with the corridor before each room as a place of its own.
+    """Objects of R rooms, with the corridor before each room as a place of its own."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        The true map.
-    places : ndarray (L,) of int
-        The place of each object: 2 r for room r, 2 r + 1 for the corridor before it.
-    room_centers : ndarray (R, 2)
-        [m].
-    """
-
-    landmark_map: LandmarkMap
+    landmark_map: LandmarkMap  #: The true map
+    #: (L,): the place of each object: 2 r for room r, 2 r + 1 for the corridor before it
     places: NDArray[np.int64]
-    room_centers: NDArray[np.float64]
+    room_centers: NDArray[np.float64]  #: (R, 2): [m]
 
 
 @dataclass(frozen=True)
@@ -193,21 +184,15 @@ def _see(true_map: LandmarkMap, pose: NDArray[np.float64], rows: NDArray[np.int6
 
 @dataclass(frozen=True)
 class Comparison:
-    """A built map next to the true one.
+    """A built map next to the true one."""
 
-    Parameters
-    ----------
-    visible, found, missed, false : int
-        True objects that enough frames show, those of them that were found, those that were not,
-        and landmarks that are no object or an object a second time.
-    center_errors_m : ndarray (found,)
-        Distances of the centres of what was found [m].
-    """
-
+    #: True objects that enough frames show, those of them that were found, those that were not,
+    #: and landmarks that are no object or an object a second time
     visible: int
     found: int
     missed: int
     false: int
+    #: (found,): distances of the centres of what was found [m]
     center_errors_m: NDArray[np.float64]
 
 

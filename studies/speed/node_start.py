@@ -25,18 +25,12 @@ MATCHINGS = ('class', 'hybrid')
 
 @dataclass(frozen=True)
 class NodeStart:
-    """Time of one start, from the command line until the node is ready.
+    """Time of one start, from the command line until the node is ready."""
 
-    Parameters
-    ----------
-    matching, kind : str
-        One of MATCHINGS, one of STARTS.
-    wall_s, processor_s : float
-        Elapsed time, and user and system time of the process [s].
-    """
-
+    #: One of MATCHINGS, one of STARTS
     matching: str
     kind: str
+    #: Elapsed time, and user and system time of the process [s]
     wall_s: float
     processor_s: float
 

@@ -72,7 +72,6 @@ def draw_errors(kind: str, stamps_s: NDArray[np.float64], errors: PoseErrors,
     stamps_s : ndarray (F,)
     errors : PoseErrors
         Drifting errors reach these deviations after DRIFT_S.
-    rng : numpy.random.Generator
     """
     drawn = rng.normal(size=(len(stamps_s), 6))
     steps_s = np.diff(stamps_s)[:, None]

@@ -92,7 +92,6 @@ def query_scenes(queries: Path, map_file: Path, matching: str) -> list[Scene]:
 
     Parameters
     ----------
-    queries, map_file : Path
     matching : str
         'hybrid' or 'class'.
     """

@@ -28,31 +28,16 @@ _LABELS = tuple(f'a label of a map, number {number}' for number in range(40))
 
 @dataclass(frozen=True)
 class StartupResult:
-    """Time and memory of one start.
+    """Time and memory of one start."""
 
-    Parameters
-    ----------
-    kind : str
-        One of KINDS.
-    seconds : float
-        From the imports done to labels embedded and crops ready to encode [s].
-    peak_mib : float
-        Greatest resident memory of the process [MiB]. It includes the pages of mapped files,
-        which the system can reclaim.
-    imports_mib : float
-        The same after the imports alone [MiB].
-    weights_mib : float
-        Parameters in memory at the end [MiB].
-    holds_text_tower : bool
-        Whether the table of token embeddings is among them.
-    """
-
-    kind: str
-    seconds: float
+    kind: str  #: One of KINDS
+    seconds: float  #: From the imports done to labels embedded and crops ready to encode [s]
+    #: Greatest resident memory of the process [MiB]. It includes the pages of mapped files, which
+    #: the system can reclaim.
     peak_mib: float
-    imports_mib: float
-    weights_mib: float
-    holds_text_tower: bool
+    imports_mib: float  #: The same after the imports alone [MiB]
+    weights_mib: float  #: Parameters in memory at the end [MiB]
+    holds_text_tower: bool  #: Whether the table of token embeddings is among them
 
 
 def measure_startup(kind: str, options: ClipOptions) -> StartupResult:

@@ -33,31 +33,18 @@ _SHOWN_IOU, _SHOWN_SHARE, _LEAST_SIDE_PX = 0.3, 0.6, 12.0
 
 
 class Look(NamedTuple):
-    """How detections and map agree in one image: n boxes, of which m show a landmark.
+    """How detections and map agree in one image: n boxes, of which m show a landmark."""
 
-    Parameters
-    ----------
-    boxes, in_view, found : int
-        Boxes, landmarks in view (walls and other objects hide some), and those of them shown.
-    sides_px : ndarray (n,)
-        Mean side of each box [px].
-    ious : ndarray (m,)
-        Of box and landmark.
-    edge_errors : ndarray (m, 4)
-        As shares of the landmark's sides; NaN at the image border.
-    same_class : ndarray (m,) of bool
-    ranks : ndarray (m,) of int
-        Number of labels more similar than the landmark's.
-    """
-
+    #: Boxes, landmarks in view (walls and other objects hide some), and those of them shown
     boxes: int
     in_view: int
     found: int
-    sides_px: NDArray[np.float64]
-    ious: NDArray[np.float64]
+    sides_px: NDArray[np.float64]  #: (n,): mean side of each box [px]
+    ious: NDArray[np.float64]  #: (m,): of box and landmark
+    #: (m, 4): as shares of the landmark's sides; NaN at the image border
     edge_errors: NDArray[np.float64]
-    same_class: NDArray[np.bool_]
-    ranks: NDArray[np.int64]
+    same_class: NDArray[np.bool_]  #: (m,)
+    ranks: NDArray[np.int64]  #: (m,): number of labels more similar than the landmark's
 
 
 def look(landmark_map: LandmarkMap, query: Query) -> Look:

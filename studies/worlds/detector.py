@@ -41,35 +41,19 @@ _SPLIT = (0.0, 0.05)
 
 
 class Detector(NamedTuple):
-    """A detector and how it sees n objects.
+    """A detector and how it sees n objects."""
 
-    Parameters
-    ----------
-    chances : ndarray (n,)
-        Probability that an object in view is found.
-    biases : ndarray (n, 2, 4)
-        By how much the edges of an object's box are off, as shares of its sides: amplitudes of
-        the cosine and the sine of the direction from which it is seen.
-    jitter : float
-        By how much each edge is off in each image, as a share of the box's side: the scale of
-        Student's t.
-    confused : tuple of str
-        The class that each object is taken for at times.
-    confusion : ndarray (n,)
-        The share of these times.
-    split : float
-        Probability that an object gives two boxes.
-    false_boxes : float
-        Mean number of boxes of nothing in an image.
-    """
-
-    chances: NDArray[np.float64]
+    chances: NDArray[np.float64]  #: (n,): probability that an object in view is found
+    #: (n, 2, 4): by how much the edges of an object's box are off, as shares of its sides:
+    #: amplitudes of the cosine and the sine of the direction from which it is seen
     biases: NDArray[np.float64]
+    #: By how much each edge is off in each image, as a share of the box's side: the scale of
+    #: Student's t
     jitter: float
-    confused: tuple[str, ...]
-    confusion: NDArray[np.float64]
-    split: float
-    false_boxes: float
+    confused: tuple[str, ...]  #: The class that each object is taken for at times
+    confusion: NDArray[np.float64]  #: (n,): the share of these times
+    split: float  #: Probability that an object gives two boxes
+    false_boxes: float  #: Mean number of boxes of nothing in an image
 
     @staticmethod
     def random(objects: Objects, rng: np.random.Generator) -> 'Detector':
@@ -98,14 +82,11 @@ def detect(detector: Detector, objects: Objects, shapes: NDArray[np.float64], ca
 
     Parameters
     ----------
-    detector : Detector
     objects : Objects
         n of them.
     shapes : ndarray (n, 6)
         Theirs.
-    camera : Camera
     map_from_camera : ndarray (4, 4)
-    rng : numpy.random.Generator
     """
     rows, full = _in_view(objects, shapes, camera, map_from_camera)
     found = rng.random(len(rows)) < detector.chances[rows]

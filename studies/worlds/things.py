@@ -59,24 +59,14 @@ class Thing(NamedTuple):
 
 
 class Objects(NamedTuple):
-    """The objects of a world, n of them.
-
-    Parameters
-    ----------
-    class_ids : tuple of str
-    models : ndarray (n,) of int
-        Objects of one class and model look alike.
-    centers, semi_axes : ndarray (n, 3)
-        [m].
-    yaws : ndarray (n,)
-        About the vertical [rad].
-    """
+    """The objects of a world, n of them."""
 
     class_ids: tuple[str, ...]
-    models: NDArray[np.int64]
+    models: NDArray[np.int64]  #: (n,): objects of one class and model look alike
+    #: (n, 3): [m]
     centers: NDArray[np.float64]
     semi_axes: NDArray[np.float64]
-    yaws: NDArray[np.float64]
+    yaws: NDArray[np.float64]  #: (n,): about the vertical [rad]
 
     @property
     def quats_xyzw(self) -> NDArray[np.float64]:

@@ -31,20 +31,11 @@ _SCORE = 0.8
 
 @dataclass(frozen=True)
 class World:
-    """A simulated world.
+    """A simulated world."""
 
-    Parameters
-    ----------
-    kind : str
-        One of KINDS.
-    landmark_map : LandmarkMap
-        With errors.
-    queries : tuple of Query
-        All images, five of each group in order of time. They know neither vertical nor odometry.
-    """
-
-    kind: str
-    landmark_map: LandmarkMap
+    kind: str  #: One of KINDS
+    landmark_map: LandmarkMap  #: With errors
+    #: All images, five of each group in order of time. They know neither vertical nor odometry.
     queries: tuple[Query, ...]
 
     @property
@@ -72,7 +63,6 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
     ----------
     kind : str
         One of KINDS.
-    seed : int
     groups : int
         Places from which the robot looks, five images each.
     sigma_m : float, optional
@@ -94,7 +84,6 @@ def make_walk(kind: str, seed: int, images: int) -> World:
         One of KINDS.
     seed : int
         Its objects and map are those of make_world.
-    images : int
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, None, rng)

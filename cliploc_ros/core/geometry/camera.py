@@ -165,7 +165,6 @@ def frusta(camera: Camera, map_from_camera: NDArray[np.float64], depth_m: float
 
     Parameters
     ----------
-    camera : Camera
     map_from_camera : ndarray (f, 4, 4)
     depth_m : float
         From the tip to the base [m].

@@ -28,31 +28,19 @@ from cliploc_ros.core.search.scene import Scene
 
 
 class Targets(NamedTuple):
-    """What poses are verified against.
+    """What poses are verified against."""
 
-    Parameters
-    ----------
-    boxes : ndarray (n, 4)
-        Box ellipses of the detections.
-    iou_threshold : float
-        See Scene.
-    landmarks : ndarray (u, 9)
-        Centres and shapes of the landmarks that single detections may show.
-    starts, detections : ndarray (u + 1,), (p,)
-        Detections of each of these landmarks, see cliploc_ros.core.search.scene.Potential.
-    sorted_landmarks : ndarray (L, 9)
-        Centres and shapes of the map's landmarks, see SortedLandmarks.
-    groups : Groups
-        The landmarks that detections may show because of their class.
-    """
-
-    boxes: NDArray[np.float64]
-    iou_threshold: float
+    boxes: NDArray[np.float64]  #: (n, 4): box ellipses of the detections
+    iou_threshold: float  #: See Scene
+    #: (u, 9): centres and shapes of the landmarks that single detections may show
     landmarks: NDArray[np.float64]
+    #: (u + 1,), (p,): detections of each of these landmarks, see
+    #: cliploc_ros.core.search.scene.Potential
     starts: NDArray[np.int64]
     detections: NDArray[np.int64]
+    #: (L, 9): centres and shapes of the map's landmarks, see SortedLandmarks
     sorted_landmarks: NDArray[np.float64]
-    groups: Groups
+    groups: Groups  #: The landmarks that detections may show because of their class
 
 
 class Sample(NamedTuple):

@@ -38,23 +38,14 @@ _LEAST_SHARE = 0.001
 
 
 class GivenLandmark(NamedTuple):
-    """A landmark as its file has it, in the file's coordinate frame and unit of length.
-
-    Parameters
-    ----------
-    landmark_id, label, class_id : str
-    center, semi_axes : sequence of 3 float
-    quat_xyzw : sequence of 4 float
-        Landmark axes into the file's axes.
-    details : LandmarkDetails
-    """
+    """A landmark as its file has it, in the file's coordinate frame and unit of length."""
 
     landmark_id: str
     label: str
     class_id: str
     center: Sequence[float]
     semi_axes: Sequence[float]
-    quat_xyzw: Sequence[float]
+    quat_xyzw: Sequence[float]  #: Landmark axes into the file's axes
     details: LandmarkDetails = LandmarkDetails()
 
 
@@ -75,20 +66,11 @@ class GivenMap(NamedTuple):
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a given map lies: x_map = map_from_given @ (scale * x_given).
+    """Where a given map lies: x_map = map_from_given @ (scale * x_given)."""
 
-    Parameters
-    ----------
-    frame_id : str
-        Coordinate frame of the map.
-    scale : float
-        Metres in one unit of length of the file.
-    map_from_given : ndarray (4, 4)
-    """
-
-    frame_id: str
-    scale: float
-    map_from_given: NDArray[np.float64]
+    frame_id: str  #: Coordinate frame of the map
+    scale: float  #: Metres in one unit of length of the file
+    map_from_given: NDArray[np.float64]  #: (4, 4)
 
 
 class ImportedMap(NamedTuple):
@@ -106,8 +88,6 @@ def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
 
     Parameters
     ----------
-    given : GivenMap
-    placement : Placement
     source : str
         What the landmarks say of where they come from.
 

@@ -25,8 +25,6 @@ def write_report(folder: Path, name: str, landmark_map: LandmarkMap, report: Che
         It exists.
     name : str
         Of the map, for the title.
-    landmark_map : LandmarkMap
-    report : CheckReport
 
     Raises
     ------

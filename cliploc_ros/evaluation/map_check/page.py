@@ -53,7 +53,6 @@ def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str,
     ----------
     name : str
         Of the map.
-    report : CheckReport
     pictures : iterable of (str, str, bytes)
         Name, caption and PNG of each picture.
     """

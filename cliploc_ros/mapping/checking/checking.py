@@ -73,12 +73,10 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     detections : PosedDetections, optional
         A recording of the place. Without one, the report is shorter.
     queries : sequence of PosedObservation
         Observations with recorded similarities to the map's labels.
-    options : CheckOptions, optional
     thresholds : Thresholds, optional
         What the map has to reach.
     progress : callable, optional

@@ -23,39 +23,22 @@ _EXPLAINED_IOU = 0.3
 
 
 class Fold(NamedTuple):
-    """A part of a recording, and the map without it.
+    """A part of a recording, and the map without it."""
 
-    Parameters
-    ----------
-    frames : ndarray (k,) of int
-        The frames to judge.
-    rows : ndarray (l,) of int
-        The landmarks of the whole map that the other frames suffice for.
-    landmarks : Landmarks
-        These landmarks, fitted to the other frames.
-    """
-
-    frames: NDArray[np.int64]
+    frames: NDArray[np.int64]  #: (k,): the frames to judge
+    #: (l,): the landmarks of the whole map that the other frames suffice for
     rows: NDArray[np.int64]
-    landmarks: Landmarks
+    landmarks: Landmarks  #: These landmarks, fitted to the other frames
 
 
 @dataclass(frozen=True)
 class BoxQuality:
-    """How well landmarks explain boxes.
-
-    Parameters
-    ----------
-    boxes : int
-    explained : float
-        Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3.
-    median_iou : float
-        Of these.
-    """
+    """How well landmarks explain boxes."""
 
     boxes: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
     explained: float
-    median_iou: float
+    median_iou: float  #: Of these
 
 
 def split_frames(stamps_s: NDArray[np.float64], options: CheckOptions) -> NDArray[np.int64]:

@@ -54,34 +54,19 @@ class _Sightings(NamedTuple):
 
 @dataclass(frozen=True)
 class DetectorModel:
-    """A detector's misses and errors: L landmarks.
+    """A detector's misses and errors: L landmarks."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        What there is to see.
-    camera : Camera
-    sightings : tuple of _Sightings
-        Of each landmark; empty without a recording.
-    ratios, reach_m : ndarray (L,)
-        Share of the expected frames in which each landmark was detected, and from how far away
-        it can be [m].
-    edge_scale : float
-        Deviation of edges, in units of MappingOptions' one.
-    min_side_px : float
-        Smaller boxes are not detected.
-    clutter : tuple of (ndarray (k, 4), tuple of str)
-        Boxes [px] of no landmark in single frames, and their classes.
-    mapping : MappingOptions
-    """
-
-    landmark_map: LandmarkMap
+    landmark_map: LandmarkMap  #: What there is to see
     camera: Camera
-    sightings: tuple[_Sightings, ...]
+    sightings: tuple[_Sightings, ...]  #: Of each landmark; empty without a recording
+    #: (L,): share of the expected frames in which each landmark was detected, and from how far
+    #: away it can be [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
-    edge_scale: float
-    min_side_px: float
+    edge_scale: float  #: Deviation of edges, in units of MappingOptions' one
+    min_side_px: float  #: Smaller boxes are not detected
+    #: tuple of ((k, 4), tuple of str): boxes [px] of no landmark in single frames, and their
+    #: classes
     clutter: tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]
     mapping: MappingOptions
 

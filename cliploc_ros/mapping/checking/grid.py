@@ -23,21 +23,11 @@ _NEAR_M = 1.0
 
 
 class Grid(NamedTuple):
-    """P positions with H headings each.
+    """P positions with H headings each."""
 
-    Parameters
-    ----------
-    positions : ndarray (P, 3)
-        [m].
-    is_near : ndarray (P,) of bool
-        The recording, if there is one, passed near.
-    poses : ndarray (P * H, 4, 4)
-        map_from_camera, heading by heading of each position.
-    spacing_m : float
-    """
-
-    positions: NDArray[np.float64]
-    is_near: NDArray[np.bool_]
+    positions: NDArray[np.float64]  #: (P, 3): [m]
+    is_near: NDArray[np.bool_]  #: (P,): the recording, if there is one, passed near
+    #: (P * H, 4, 4): map_from_camera, heading by heading of each position
     poses: NDArray[np.float64]
     spacing_m: float
 
@@ -48,10 +38,8 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     recorded : ndarray (F, 4, 4), optional
         Poses map_from_camera of a recording: they give height, pitch and extent.
-    options : CheckOptions
     """
     low, high = np.quantile(landmark_map.centers, [_OUTLYING, 1.0 - _OUTLYING], axis=0)
     if recorded is None:

@@ -30,18 +30,10 @@ _STOP_WORDS = frozenset((
 
 @dataclass(frozen=True)
 class LabelModel:
-    """Labels and classes as vectors: L landmarks.
+    """Labels and classes as vectors: L landmarks."""
 
-    Parameters
-    ----------
-    labels : ndarray (L, D)
-        Unit vectors.
-    biases : ndarray (L, D)
-        How all crops of a landmark differ from its label.
-    """
-
-    labels: NDArray[np.float64]
-    biases: NDArray[np.float64]
+    labels: NDArray[np.float64]  #: (L, D): unit vectors
+    biases: NDArray[np.float64]  #: (L, D): how all crops of a landmark differ from its label
 
     @staticmethod
     def of(landmark_map: LandmarkMap) -> 'LabelModel':
@@ -68,7 +60,6 @@ class LabelModel:
             Detector class of each box.
         bboxes_xyxy : ndarray (n, 4)
             [px].
-        rng : numpy.random.Generator
         """
         count = len(shown)
         sizes = np.sqrt(np.prod(np.maximum(bboxes_xyxy[:, 2:] - bboxes_xyxy[:, :2], 1.0), axis=1))

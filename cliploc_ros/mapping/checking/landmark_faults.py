@@ -34,93 +34,48 @@ _MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
 
 
 class Overlap(NamedTuple):
-    """Two landmarks that lie in one another.
+    """Two landmarks that lie in one another."""
 
-    Parameters
-    ----------
-    first, second : int
-        Rows in the map.
-    distance : float
-        Normalized, about 1 if they touch.
-    is_duplicate : bool
-        They are of one class, and no frames tell them apart.
-    """
-
+    #: Rows in the map
     first: int
     second: int
-    distance: float
-    is_duplicate: bool
+    distance: float  #: Normalized, about 1 if they touch
+    is_duplicate: bool  #: They are of one class, and no frames tell them apart
 
 
 @dataclass(frozen=True)
 class LandmarkCheck:
-    """What is known of one landmark. Values that nothing tells are None.
-
-    Parameters
-    ----------
-    landmark_id, label, class_id : str
-    center : tuple of float
-        [m].
-    support, expected : int
-        Frames that show it, and frames that should.
-    seen_ratio : float
-        Share of the latter in which it was detected.
-    baseline_deg : float
-        Greatest angle between two directions from which it was seen [deg].
-    position_sigma_m : float
-        Standard deviation of its centre on the worst axis [m].
-    offset_m : float
-        From its centre to where its boxes put it [m].
-    median_iou : float
-        Of its boxes.
-    thinness : float
-        Least semi-axis divided by the greatest one.
-    overlaps : tuple of (str, float)
-        Landmarks that lie in it, and their normalized distances.
-    faults : tuple of str
-        What is wrong with it and what to do, the worst first.
-    severity : float
-        0: nothing; 1 and more: a serious fault.
-    """
+    """What is known of one landmark. Values that nothing tells are None."""
 
     landmark_id: str
     label: str
     class_id: str
-    center: tuple[float, float, float]
+    center: tuple[float, float, float]  #: [m]
+    #: Frames that show it, and frames that should
     support: int | None
     expected: int | None
-    seen_ratio: float | None
+    seen_ratio: float | None  #: Share of the latter in which it was detected
+    #: Greatest angle between two directions from which it was seen [deg]
     baseline_deg: float | None
-    position_sigma_m: float | None
-    offset_m: float | None
-    median_iou: float | None
-    thinness: float
+    position_sigma_m: float | None  #: Standard deviation of its centre on the worst axis [m]
+    offset_m: float | None  #: From its centre to where its boxes put it [m]
+    median_iou: float | None  #: Of its boxes
+    thinness: float  #: Least semi-axis divided by the greatest one
+    #: Landmarks that lie in it, and their normalized distances
     overlaps: tuple[tuple[str, float], ...]
-    faults: tuple[str, ...]
-    severity: float
+    faults: tuple[str, ...]  #: What is wrong with it and what to do, the worst first
+    severity: float  #: 0: nothing; 1 and more: a serious fault
 
 
 class Witness(NamedTuple):
-    """What a recording says of a map.
+    """What a recording says of a map."""
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        Of the map, with the recording's classes.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    evidence : Evidence
-    expected : ndarray (L,) of int
-        Frames that should show each landmark, those without a box included.
-    fitted : Landmarks
-        The landmarks fitted to the boxes that show them.
-    """
-
-    landmarks: Landmarks
-    shown: NDArray[np.int64]
+    landmarks: Landmarks  #: Of the map, with the recording's classes
+    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
     evidence: Evidence
+    #: (L,): frames that should show each landmark, those without a box included
     expected: NDArray[np.int64]
-    fitted: Landmarks
+    fitted: Landmarks  #: The landmarks fitted to the boxes that show them
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
@@ -181,10 +136,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
     witness : Witness, optional
         Without a recording, support comes from the map's own fields.
-    overlaps : list of Overlap
     options : MappingOptions
         Its limits for landmarks.
     """

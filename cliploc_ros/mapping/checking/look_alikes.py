@@ -20,31 +20,17 @@ _LEAST_SHARE = 0.6
 
 @dataclass(frozen=True)
 class LookAlike:
-    """A pair of places that look alike.
+    """A pair of places that look alike."""
 
-    Parameters
-    ----------
-    first, second : tuple of float
-        The middles of the places [m].
-    matched : tuple of (str, str)
-        Landmarks of the first place, and those of the second place that they look like.
-    landmarks : int
-        The landmarks of the first place.
-    share : float
-        Share of these that are matched, 0 to 1.
-    same_labels : int
-        Matched landmarks whose labels are equal, so that no crop tells them apart.
-    turn_deg : float
-        About the vertical, from the first place to the second [deg].
-    """
-
+    #: The middles of the places [m]
     first: tuple[float, float, float]
     second: tuple[float, float, float]
+    #: Landmarks of the first place, and those of the second place that they look like
     matched: tuple[tuple[str, str], ...]
-    landmarks: int
-    share: float
-    same_labels: int
-    turn_deg: float
+    landmarks: int  #: The landmarks of the first place
+    share: float  #: Share of these that are matched, 0 to 1
+    same_labels: int  #: Matched landmarks whose labels are equal, so that no crop tells them apart
+    turn_deg: float  #: About the vertical, from the first place to the second [deg]
 
 
 def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:

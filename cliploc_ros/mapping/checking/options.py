@@ -13,51 +13,31 @@ from cliploc_ros.mapping.options import MappingOptions
 class CheckOptions:
     """Options of a check.
 
-    Parameters
-    ----------
-    relocalizer : RelocalizerOptions
-        Of the relocalizer that will use the map.
-    mapping : MappingOptions
-        How boxes belong to landmarks, and how landmarks are fitted.
-    folds : int
-        Cross-validation: each fold is judged with landmarks fitted to the others.
-    block_s, gap_s : float
-        Folds take blocks of this length in turn [s]; a fold is not fitted to frames this near
-        to one that it judges [s].
-    frames : int
-        The most recorded frames that are relocalized.
-    spacing_m : float
-        Of the grid of camera positions [m]; larger where there would be too many positions.
-    max_positions, headings : int
-        The most positions of the grid, and the directions in which the camera looks at each.
-    camera_height_m : float, optional
-        Of the grid [m]; None: as in the recording.
-    use_vertical : bool
-        The relocalizer knows the vertical.
-    wrong_m : float
-        An accepted pose farther off than this misleads a robot [m].
-    random_seed : int
-        Equal seed and input give equal output.
-
     Raises
     ------
     OptionsError
         Names the option and what it allows.
     """
 
+    #: Of the relocalizer that will use the map
     relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
+    #: How boxes belong to landmarks, and how landmarks are fitted
     mapping: MappingOptions = field(default_factory=MappingOptions)
-    folds: int = 5
+    folds: int = 5  #: Cross-validation: each fold is judged with landmarks fitted to the others
+    #: Folds take blocks of this length in turn [s]; a fold is not fitted to frames this near to
+    #: one that it judges [s]
     block_s: float = 4.0
     gap_s: float = 1.0
-    frames: int = 100
+    frames: int = 100  #: The most recorded frames that are relocalized
+    #: Of the grid of camera positions [m]; larger where there would be too many positions
     spacing_m: float = 0.5
+    #: The most positions of the grid, and the directions in which the camera looks at each
     max_positions: int = 150
     headings: int = 12
-    camera_height_m: float | None = None
-    use_vertical: bool = False
-    wrong_m: float = 1.0
-    random_seed: int = 0
+    camera_height_m: float | None = None  #: Of the grid [m]; None: as in the recording
+    use_vertical: bool = False  #: The relocalizer knows the vertical
+    wrong_m: float = 1.0  #: An accepted pose farther off than this misleads a robot [m]
+    random_seed: int = 0  #: Equal seed and input give equal output
 
     def __post_init__(self) -> None:
         """Refuse values that an option does not allow."""
@@ -71,32 +51,16 @@ class CheckOptions:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What a map has to reach. The values are guesses from a few maps of one office.
+    """What a map has to reach. The values are guesses from a few maps of one office."""
 
-    Parameters
-    ----------
-    min_explained, min_iou : float
-        Held-out share of the boxes that a landmark of their class explains, and their median
-        IoU.
-    min_accepted : float
-        Share of the recorded frames that the relocalizer accepts.
-    max_misled : float
-        Share of the recorded frames and grid views in which it accepts a wrong pose.
-    min_positions : float
-        Share of the grid positions near the recording in which it accepts some heading.
-    max_faulty : float
-        Share of the landmarks with a serious fault.
-    max_duplicates : int
-        Pairs of landmarks that are one object.
-    max_look_alikes : int
-        Pairs of places that a detector cannot tell apart.
-    """
-
+    #: Held-out share of the boxes that a landmark of their class explains, and their median IoU
     min_explained: float = 0.6
     min_iou: float = 0.6
-    min_accepted: float = 0.4
+    min_accepted: float = 0.4  #: Share of the recorded frames that the relocalizer accepts
+    #: Share of the recorded frames and grid views in which it accepts a wrong pose
     max_misled: float = 0.01
+    #: Share of the grid positions near the recording in which it accepts some heading
     min_positions: float = 0.4
-    max_faulty: float = 0.15
-    max_duplicates: int = 0
-    max_look_alikes: int = 0
+    max_faulty: float = 0.15  #: Share of the landmarks with a serious fault
+    max_duplicates: int = 0  #: Pairs of landmarks that are one object
+    max_look_alikes: int = 0  #: Pairs of places that a detector cannot tell apart

@@ -34,34 +34,20 @@ class PosedObservation(NamedTuple):
 
 @dataclass(frozen=True)
 class Trial:
-    """One relocalization and its verdict.
+    """One relocalization and its verdict."""
 
-    Parameters
-    ----------
-    verdict : str
-        'accepted' (a right pose), 'refused', or 'misled' (a wrong pose was accepted).
-    position, forward : ndarray (3,)
-        Of the camera in the map [m], and the direction in which it looks.
-    detections, landmarks : int
-        Boxes, and the landmarks of the map among them.
-    estimate : ndarray (3,) or None
-        Position of the best pose [m].
-    error_m : float or None
-    reason : str
-        Of a refusal.
-    stamp_s : float or None
-        Of a recorded frame [s].
-    """
-
+    #: 'accepted' (a right pose), 'refused', or 'misled' (a wrong pose was accepted)
     verdict: Verdict
+    #: (3,): of the camera in the map [m], and the direction in which it looks
     position: NDArray[np.float64]
     forward: NDArray[np.float64]
+    #: Boxes, and the landmarks of the map among them
     detections: int
     landmarks: int
-    estimate: NDArray[np.float64] | None
+    estimate: NDArray[np.float64] | None  #: (3,): position of the best pose [m]
     error_m: float | None
-    reason: str
-    stamp_s: float | None = None
+    reason: str  #: Of a refusal
+    stamp_s: float | None = None  #: Of a recorded frame [s]
 
 
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
@@ -73,12 +59,8 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
 
     Parameters
     ----------
-    landmark_map : LandmarkMap
-    detections : PosedDetections
     shown : ndarray (n,) of int
         The landmark that each box shows, -1 for none.
-    folds : sequence of Fold
-    options : CheckOptions
     tell : callable
         Told the share that is done.
     """

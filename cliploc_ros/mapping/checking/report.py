@@ -26,85 +26,46 @@ LANDMARKS_FOR_A_POSE = 3
 
 @dataclass(frozen=True)
 class BlockQuality:
-    """The boxes of one fold, judged with landmarks fitted to the others.
-
-    Parameters
-    ----------
-    frames : int
-    landmarks : int
-        Landmarks that the other folds suffice for.
-    boxes : BoxQuality
-    """
+    """The boxes of one fold, judged with landmarks fitted to the others."""
 
     frames: int
-    landmarks: int
+    landmarks: int  #: Landmarks that the other folds suffice for
     boxes: BoxQuality
 
 
 @dataclass(frozen=True)
 class RecordingCheck:
-    """The check of a map against a recording.
-
-    Parameters
-    ----------
-    frames, boxes : int
-    duration_s : float
-    path_xyz : ndarray (F, 3)
-        Where the camera went [m].
-    as_given : BoxQuality
-        Of the map as it is. If it was built from this recording, it was fitted to these boxes.
-    held_out : BoxQuality
-        Cross-validated over time.
-    folds : tuple of BlockQuality
-    trials : tuple of Trial
-        Recorded frames in cross-validated maps, in the order of time.
-    simulated : tuple of Trial
-        The same poses in the map as it is, with simulated boxes: as many should be accepted as
-        with recorded ones, else the grid is too optimistic or too pessimistic.
-    corrections : tuple of Correction
-    edge_scale : float
-        Deviation of box edges, in units of build_map's assumption.
-    """
+    """The check of a map against a recording."""
 
     frames: int
     boxes: int
     duration_s: float
-    path_xyz: NDArray[np.float64]
+    path_xyz: NDArray[np.float64]  #: (F, 3): where the camera went [m]
+    #: Of the map as it is. If it was built from this recording, it was fitted to these boxes.
     as_given: BoxQuality
-    held_out: BoxQuality
+    held_out: BoxQuality  #: Cross-validated over time
     folds: tuple[BlockQuality, ...]
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
+    #: The same poses in the map as it is, with simulated boxes: as many should be accepted as with
+    #: recorded ones, else the grid is too optimistic or too pessimistic
     simulated: tuple[Trial, ...]
     corrections: tuple[Correction, ...]
-    edge_scale: float
+    edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
 
 
 @dataclass(frozen=True)
 class GridCheck:
-    """Relocalization over a grid of camera positions.
+    """Relocalization over a grid of camera positions."""
 
-    Parameters
-    ----------
-    positions : ndarray (P, 3)
-        [m].
-    is_near : ndarray (P,) of bool
-        The recording passed near; without a recording, all.
-    accepted, misled : ndarray (P,) of int
-        Headings of each position in which a right, and a wrong pose is accepted.
-    visible : ndarray (P, H)
-        How many landmarks the detector finds on average, by heading.
-    spacing_m : float
-    trials : tuple of Trial
-        Heading by heading of each position.
-    """
-
-    positions: NDArray[np.float64]
-    is_near: NDArray[np.bool_]
+    positions: NDArray[np.float64]  #: (P, 3): [m]
+    is_near: NDArray[np.bool_]  #: (P,): the recording passed near; without a recording, all
+    #: (P,): headings of each position in which a right, and a wrong pose is accepted
     accepted: NDArray[np.int64]
     misled: NDArray[np.int64]
+    #: (P, H): how many landmarks the detector finds on average, by heading
     visible: NDArray[np.float64]
     spacing_m: float
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  #: Heading by heading of each position
 
     @property
     def headings(self) -> int:
@@ -125,27 +86,15 @@ class GridCheck:
 
 @dataclass(frozen=True)
 class KeyframeCheck:
-    """What the keyframes next to a map reach.
-
-    Parameters
-    ----------
-    keyframes, points : int
-    recorded : ndarray (F,) of bool
-        Recorded frames within reach of a keyframe; empty without a recording.
-    headings : ndarray (P,) of int
-        Headings of each grid position within reach.
-    positions : ndarray (P, 3)
-        Of the grid [m].
-    is_near : ndarray (P,) of bool
-        See GridCheck.
-    """
+    """What the keyframes next to a map reach."""
 
     keyframes: int
     points: int
+    #: (F,): recorded frames within reach of a keyframe; empty without a recording
     recorded: NDArray[np.bool_]
-    headings: NDArray[np.int64]
-    positions: NDArray[np.float64]
-    is_near: NDArray[np.bool_]
+    headings: NDArray[np.int64]  #: (P,): headings of each grid position within reach
+    positions: NDArray[np.float64]  #: (P, 3): of the grid [m]
+    is_near: NDArray[np.bool_]  #: (P,): see GridCheck
 
     @property
     def without(self) -> NDArray[np.int64]:
@@ -170,41 +119,21 @@ class KeyframeCheck:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The result of a check.
+    """The result of a check."""
 
-    Parameters
-    ----------
-    landmarks : tuple of LandmarkCheck
-        The worst first.
-    overlaps : tuple of Overlap
-    look_alikes : tuple of LookAlike
-    grid : GridCheck
-    recording : RecordingCheck, optional
-    queries : tuple of Trial
-        Recorded queries with recorded similarities; empty without any.
-    failures : tuple of str
-        Thresholds that the map misses; empty if it is good enough.
-    advice : tuple of str
-        What to do, the most urgent first.
-    notes : tuple of str
-        What the figures rest on.
-    keyframes : KeyframeCheck, optional
-        What the keyframes next to the map reach; None without any.
-    map_ids : tuple of str
-        Ids in the map's order, which overlaps refer to.
-    """
-
-    landmarks: tuple[LandmarkCheck, ...]
+    landmarks: tuple[LandmarkCheck, ...]  #: The worst first
     overlaps: tuple[Overlap, ...]
     look_alikes: tuple[LookAlike, ...]
     grid: GridCheck
     recording: RecordingCheck | None = None
+    #: Recorded queries with recorded similarities; empty without any
     queries: tuple[Trial, ...] = ()
-    failures: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()  #: Thresholds that the map misses; empty if it is good enough
+    advice: tuple[str, ...] = ()  #: What to do, the most urgent first
+    notes: tuple[str, ...] = ()  #: What the figures rest on
+    #: What the keyframes next to the map reach; None without any
     keyframes: KeyframeCheck | None = None
-    map_ids: tuple[str, ...] = ()
+    map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
 
     @property
     def passed(self) -> bool:
@@ -327,8 +256,6 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
 
     Parameters
     ----------
-    layer : KeyframeLayer
-    grid : GridCheck
     recorded : ndarray (F, 4, 4), optional
         Poses map_from_camera of a recording.
     """
@@ -346,7 +273,6 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
 
     Parameters
     ----------
-    layer : KeyframeLayer
     positions, forward : ndarray (n, 3)
         Of the cameras: where they are [m], and the unit vectors along which they look.
     """

@@ -44,30 +44,18 @@ _MAX_STRETCH = 0.5
 
 @dataclass(frozen=True)
 class Correction:
-    """A number that all boxes share.
+    """A number that all boxes share."""
 
-    Parameters
-    ----------
-    cause : str
-        'intrinsics', 'mount' or 'stamps'.
-    name, unit : str
-    value, deviation : float
-        The correction that fits best, and its standard deviation, in the unit.
-    effect_px : float
-        By how much the correction moves a point 300 px off the middle, or at 2 m [px].
-    is_significant : bool
-    explained : float
-        Share of the robust cost of all edges that its cause removes, 0 to 1.
-    """
-
-    cause: str
+    cause: str  #: 'intrinsics', 'mount' or 'stamps'
     name: str
     unit: str
+    #: The correction that fits best, and its standard deviation, in the unit
     value: float
     deviation: float
+    #: By how much the correction moves a point 300 px off the middle, or at 2 m [px]
     effect_px: float
     is_significant: bool
-    explained: float
+    explained: float  #: Share of the robust cost of all edges that its cause removes, 0 to 1
 
 
 class Linear(NamedTuple):
@@ -99,8 +87,6 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
 
     Parameters
     ----------
-    detections : PosedDetections
-    views : Views
     landmarks : Landmarks
         Fitted to these boxes.
     shown : ndarray (n,) of int

@@ -33,20 +33,13 @@ _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 
 
 class Alignment(NamedTuple):
-    """The recording in the coordinate frame of the map.
-
-    Parameters
-    ----------
-    views : Views
-    offset_m, offset_deg : float
-        How far the recording's coordinate frame was off, in the middle of the landmarks.
-    change_m, change_deg : float
-        Root mean square by which the poses were refined after that.
-    """
+    """The recording in the coordinate frame of the map."""
 
     views: Views
+    #: How far the recording's coordinate frame was off, in the middle of the landmarks
     offset_m: float
     offset_deg: float
+    #: Root mean square by which the poses were refined after that
     change_m: float
     change_deg: float
 

@@ -16,40 +16,21 @@ from cliploc_ros.mapping.updating.options import UpdateOptions
 
 
 class Fates(NamedTuple):
-    """Rows of old landmarks by what became of them, and new objects.
+    """Rows of old landmarks by what became of them, and new objects."""
 
-    Parameters
-    ----------
-    confirmed, moved, missing, not_observed : ndarray of int
-    new : ndarray of int
-        Objects that are no old landmark.
-    objects : ndarray (L,) of int
-        The object that each old landmark is, -1 for none.
-    rivals : dict of int to tuple of int
-        Old landmarks that an object could be as well.
-    """
-
+    #: of int
     confirmed: NDArray[np.int64]
     moved: NDArray[np.int64]
     missing: NDArray[np.int64]
     not_observed: NDArray[np.int64]
-    new: NDArray[np.int64]
-    objects: NDArray[np.int64]
-    rivals: dict[int, tuple[int, ...]]
+    new: NDArray[np.int64]  #: of int: objects that are no old landmark
+    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
+    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
 
 
 def decide_fates(known: Known, judged: Judged, objects: Objects, identities: Identities,
                  options: UpdateOptions) -> Fates:
-    """Return what became of each old landmark.
-
-    Parameters
-    ----------
-    known : Known
-    judged : Judged
-    objects : Objects
-    identities : Identities
-    options : UpdateOptions
-    """
+    """Return what became of each old landmark."""
     numbers = identities.objects
     found = numbers >= 0
     elsewhere = found.copy()

@@ -27,22 +27,13 @@ from cliploc_ros.mapping.views import Views, map_from_cameras
 
 
 class Finds(NamedTuple):
-    """New landmarks: m of them.
-
-    Parameters
-    ----------
-    landmarks : Landmarks
-    details : tuple of LandmarkDetails
-    shown : ndarray (n,) of int
-        The new landmark that each box of the recording shows, -1 for none.
-    left_out : tuple of LeftOut
-        What is not good enough for a map.
-    """
+    """New landmarks: m of them."""
 
     landmarks: Landmarks
     details: tuple[LandmarkDetails, ...]
+    #: (n,): the new landmark that each box of the recording shows, -1 for none
     shown: NDArray[np.int64]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[LeftOut, ...]  #: What is not good enough for a map
 
     def select(self, rows: NDArray[np.int64]) -> 'Finds':
         """Return some of the new landmarks."""
@@ -58,7 +49,6 @@ def find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool
 
     Parameters
     ----------
-    detections : PosedDetections
     views : Views
         With the poses to map with.
     is_free : ndarray (n,) of bool
@@ -90,15 +80,12 @@ def without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArra
 
     Parameters
     ----------
-    views : Views
-    finds : Finds
     old : Landmarks
         Those with boxes are in their place.
     old_shown : ndarray (n,) of int
         The old landmark that each box shows, -1 for none.
     majority : float
         An old landmark is in its place if it has a box, and so many for each of the new one's.
-    options : UpdateOptions
     """
     rows_of_old = group_boxes(old_shown, len(old.centers))
     rows_of_new = group_boxes(finds.shown, len(finds.details))

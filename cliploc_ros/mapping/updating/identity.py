@@ -42,18 +42,10 @@ _DOUBT = 1.0
 
 @dataclass(frozen=True)
 class Looks:
-    """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown.
+    """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown."""
 
-    Parameters
-    ----------
-    landmarks : ndarray (L, d)
-        Of the old map.
-    objects : ndarray (m, d)
-        Of the recording.
-    """
-
-    landmarks: NDArray[np.float32]
-    objects: NDArray[np.float32]
+    landmarks: NDArray[np.float32]  #: (L, d): of the old map
+    objects: NDArray[np.float32]  #: (m, d): of the recording
 
     def similarities(self, rows: NDArray[np.int64], objects: NDArray[np.int64]
                      ) -> NDArray[np.float64]:
@@ -84,10 +76,8 @@ def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
 
     Parameters
     ----------
-    old : LandmarkEmbeddings
     landmark_ids : sequence of str
         Of the old map.
-    detections : PosedDetections
     shown : ndarray (n,) of int
         The object that each box shows, -1 for none.
     count : int
@@ -105,10 +95,8 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
 
     Parameters
     ----------
-    old : LandmarkEmbeddings, optional
     landmark_ids : sequence of str
         Of the new map.
-    detections : PosedDetections
     shown : ndarray (n,) of int
         The landmark of the new map that each box shows, -1 for none.
     """
@@ -132,17 +120,10 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
 
 
 class Identities(NamedTuple):
-    """Who is who.
+    """Who is who."""
 
-    Parameters
-    ----------
-    objects : ndarray (L,) of int
-        The object that each old landmark is, -1 for none.
-    rivals : dict of int to tuple of int
-        Old landmarks that an object could be as well, for the objects of which this is so.
-    """
-
-    objects: NDArray[np.int64]
+    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
+    #: Old landmarks that an object could be as well, for the objects of which this is so
     rivals: dict[int, tuple[int, ...]]
 
 
@@ -168,11 +149,8 @@ def identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: 
 
     Parameters
     ----------
-    known : Known
-    objects : Objects
     is_gone : ndarray (L,) of bool
         Landmarks that may be any new object; others only the one in their place or near it.
-    looks : Looks, optional
     """
     held = np.nonzero(objects.owners >= 0)[0]
     result = np.full(len(is_gone), -1, dtype=np.int64)

@@ -43,10 +43,8 @@ def probability_there(sight: Sight, ratios: NDArray[np.float64], options: Update
 
     Parameters
     ----------
-    sight : Sight
     ratios : ndarray (L,)
         Share of the views in which each object is usually detected.
-    options : UpdateOptions
     """
     there = _log_evidence(sight, ratios, _certainty(sight, ratios, options))
     away = _log_evidence(sight, np.full(len(ratios), options.chance_ratio), options.prior_views)
@@ -94,28 +92,15 @@ def usual_ratios(known: Known, sight: Sight, options: UpdateOptions) -> NDArray[
 
 
 class Judged(NamedTuple):
-    """What the recording says: L old landmarks, m finds, n boxes.
+    """What the recording says: L old landmarks, m finds, n boxes."""
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The old landmark that each box shows in its place, L + the find, or -1 for none.
-    refits : Refits
-        The old landmarks where the recording puts them.
-    finds : Finds
-    sight : Sight
-        Of the old places, then of the finds.
-    is_gone : ndarray (L,) of bool
-    is_there : ndarray (L,) of bool
-        Neither: the recording does not tell.
-    """
-
+    #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
     shown: NDArray[np.int64]
-    refits: Refits
+    refits: Refits  #: The old landmarks where the recording puts them
     finds: Finds
-    sight: Sight
-    is_gone: NDArray[np.bool_]
-    is_there: NDArray[np.bool_]
+    sight: Sight  #: Of the old places, then of the finds
+    is_gone: NDArray[np.bool_]  #: (L,)
+    is_there: NDArray[np.bool_]  #: (L,): Neither: the recording does not tell
 
 
 def judge(detections: PosedDetections, views: Views, known: Known, options: UpdateOptions
@@ -124,11 +109,8 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Upda
 
     Parameters
     ----------
-    detections : PosedDetections
     views : Views
         With poses in the coordinate frame of the map.
-    known : Known
-    options : UpdateOptions
     """
     mapping, count = options.mapping, len(known.landmarks.centers)
     shown = find_known(views, known, mapping.association_iou)

@@ -21,26 +21,13 @@ _LEAST_SIGMA_M = 0.01
 
 
 class Known(NamedTuple):
-    """L landmarks of the old map.
+    """L landmarks of the old map."""
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        Class -1: no box of the recording has a class of this landmark.
-    sigmas : ndarray (L,)
-        Deviations of the centres [m].
-    details : tuple of LandmarkDetails
-    named : Landmarks
-        The landmarks once for each of their classes.
-    owners : ndarray
-        The landmark of each of these.
-    """
-
-    landmarks: Landmarks
-    sigmas: NDArray[np.float64]
+    landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
+    sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
     details: tuple[LandmarkDetails, ...]
-    named: Landmarks
-    owners: NDArray[np.int64]
+    named: Landmarks  #: The landmarks once for each of their classes
+    owners: NDArray[np.int64]  #: The landmark of each of these
 
     def select(self, rows: NDArray[np.int64]) -> 'Known':
         """Return some of the landmarks, by their main classes only."""
@@ -83,16 +70,10 @@ def find_known(views: Views, known: Known, min_iou: float) -> NDArray[np.int64]:
 
 
 class Refits(NamedTuple):
-    """L landmarks where the recording puts them; unchanged where it does not tell.
-
-    Parameters
-    ----------
-    landmarks : Landmarks
-    covariances : ndarray (L, 3, 3)
-        Of the centres [m^2]; infinite where the recording does not tell.
-    """
+    """L landmarks where the recording puts them; unchanged where it does not tell."""
 
     landmarks: Landmarks
+    #: (L, 3, 3): of the centres [m^2]; infinite where the recording does not tell
     covariances: NDArray[np.float64]
 
     def select(self, rows: NDArray[np.int64]) -> 'Refits':

@@ -19,31 +19,16 @@ from cliploc_ros.mapping.views import Views
 
 
 class Objects(NamedTuple):
-    """What the recording shows: m objects, n boxes.
+    """What the recording shows: m objects, n boxes."""
 
-    Parameters
-    ----------
-    refits : Refits
-        Where they are.
-    owners : ndarray (m,) of int
-        The old landmark in whose place it was seen, -1 for none.
-    near : tuple of frozenset of int
-        For each, the old landmarks that it may be although it is a little off their place.
-    shown : ndarray (n,) of int
-        The object that each box shows, -1 for none.
-    sight : Sight
-    evidence : Evidence
-    given : tuple of LandmarkDetails
-        Classes and source of the finds.
-    """
-
-    refits: Refits
-    owners: NDArray[np.int64]
+    refits: Refits  #: Where they are
+    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
+    #: For each, the old landmarks that it may be although it is a little off their place
     near: tuple[frozenset[int], ...]
-    shown: NDArray[np.int64]
+    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
     sight: Sight
     evidence: Evidence
-    given: tuple[LandmarkDetails, ...]
+    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
 
     @property
     def landmarks(self) -> Landmarks:
@@ -52,15 +37,7 @@ class Objects(NamedTuple):
 
 
 def gather_objects(views: Views, known: Known, judged: Judged, options: UpdateOptions) -> Objects:
-    """Return the objects that the recording shows.
-
-    Parameters
-    ----------
-    views : Views
-    known : Known
-    judged : Judged
-    options : UpdateOptions
-    """
+    """Return the objects that the recording shows."""
     count, finds = len(known.sigmas), judged.finds
     in_place = np.nonzero(judged.is_there)[0]
     places = np.concatenate([in_place, count + np.arange(len(finds.details))])

@@ -27,13 +27,8 @@ def renew(old: LandmarkMap, known: Known, objects: Objects, fates: Fates,
 
     Parameters
     ----------
-    old : LandmarkMap
-    known : Known
-    objects : Objects
-    fates : Fates
     class_names : tuple of str
         Of the recording.
-    options : UpdateOptions
     """
     centers, details = old.centers.copy(), list(known.details)
     semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()

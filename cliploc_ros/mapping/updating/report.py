@@ -20,31 +20,16 @@ _ROWS_SHOWN = 40
 
 @dataclass(frozen=True)
 class UpdatedLandmark:
-    """What became of one landmark.
-
-    Parameters
-    ----------
-    landmark_id, label, class_id : str
-    center : tuple of float
-        Where it is now; where it was if it is missing [m].
-    distance_m : float
-        By how much its centre changed [m].
-    evidence : str
-        Why.
-    last_seen : float, optional
-        [s]; None where unknown.
-    rivals : tuple of str
-        Landmarks that this object could be as well.
-    """
+    """What became of one landmark."""
 
     landmark_id: str
     label: str
     class_id: str
-    center: tuple[float, float, float]
-    distance_m: float
-    evidence: str
-    last_seen: float | None = None
-    rivals: tuple[str, ...] = ()
+    center: tuple[float, float, float]  #: Where it is now; where it was if it is missing [m]
+    distance_m: float  #: By how much its centre changed [m]
+    evidence: str  #: Why
+    last_seen: float | None = None  #: [s]; None where unknown
+    rivals: tuple[str, ...] = ()  #: Landmarks that this object could be as well
 
     def line(self) -> str:
         """Return it as one line of text."""
@@ -56,26 +41,15 @@ class UpdatedLandmark:
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """The result of an update in numbers and words.
+    """The result of an update in numbers and words."""
 
-    Parameters
-    ----------
-    frames, viewpoints : int
-        Of the recording.
-    offset_m, offset_deg : float
-        How far the recording's coordinate frame was off; it is corrected.
-    pose_change_m, pose_change_deg : float
-        Root mean square by which the poses changed besides.
-    confirmed, moved, missing, new, not_observed : tuple of UpdatedLandmark
-    left_out : tuple of LeftOut
-        New objects that are not good enough for the map.
-    notes : tuple of str
-    """
-
+    #: Of the recording
     frames: int
     viewpoints: int
+    #: How far the recording's coordinate frame was off; it is corrected
     offset_m: float
     offset_deg: float
+    #: Root mean square by which the poses changed besides
     pose_change_m: float
     pose_change_deg: float
     confirmed: tuple[UpdatedLandmark, ...]
@@ -83,7 +57,7 @@ class UpdateReport:
     missing: tuple[UpdatedLandmark, ...]
     new: tuple[UpdatedLandmark, ...]
     not_observed: tuple[UpdatedLandmark, ...]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -106,15 +80,7 @@ class UpdateReport:
 
 def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fates,
              judged: Judged) -> dict[str, tuple[UpdatedLandmark, ...]]:
-    """Return the lists of an UpdateReport.
-
-    Parameters
-    ----------
-    old, updated : LandmarkMap
-    objects : Objects
-    fates : Fates
-    judged : Judged
-    """
+    """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
     seen_of, expected_of = judged.sight.seen_frames, judged.sight.expected_frames
 

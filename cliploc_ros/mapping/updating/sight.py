@@ -31,18 +31,12 @@ _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0
 
 
 class Sight(NamedTuple):
-    """In how many viewpoints each of L places was in view, and its landmark seen.
+    """In how many viewpoints each of L places was in view, and its landmark seen."""
 
-    Parameters
-    ----------
-    expected, seen : ndarray (L,) of int
-        Viewpoints.
-    expected_frames, seen_frames : ndarray (L,) of int
-        Frames.
-    """
-
+    #: (L,): viewpoints
     expected: NDArray[np.int64]
     seen: NDArray[np.int64]
+    #: (L,): frames
     expected_frames: NDArray[np.int64]
     seen_frames: NDArray[np.int64]
 
@@ -63,14 +57,12 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
 
     Parameters
     ----------
-    views : Views
     places : Landmarks
         Class -1: of a class that no box has.
     shown : ndarray (n,) of int
         The place that each box shows, -1 for none.
     is_solid : ndarray (L,) of bool
         Places with an object, which may hide others.
-    options : UpdateOptions
     """
     count = len(places.centers)
     extents = least_extents(views, int(places.classes.max(initial=0)))

@@ -31,29 +31,15 @@ from cliploc_ros.mapping.views import make_views, map_from_cameras
 
 @dataclass(frozen=True)
 class UpdatedMap:
-    """The result of an update: F frames, n boxes.
+    """The result of an update: F frames, n boxes."""
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        Old landmarks in their order, then new ones.
-    report : UpdateReport
-    shown : ndarray (n,) of int
-        Row of the landmark that each box shows, -1 for none.
-    first_new : int
-        Row of the first new landmark.
-    map_from_camera : ndarray (F, 4, 4)
-        The poses in the coordinate frame of the map.
-    embeddings : LandmarkEmbeddings, optional
-        Image embeddings of the new map.
-    """
-
-    landmark_map: LandmarkMap
+    landmark_map: LandmarkMap  #: Old landmarks in their order, then new ones
     report: UpdateReport
-    shown: NDArray[np.int64]
-    first_new: int
+    shown: NDArray[np.int64]  #: (n,): row of the landmark that each box shows, -1 for none
+    first_new: int  #: Row of the first new landmark
+    #: (F, 4, 4): the poses in the coordinate frame of the map
     map_from_camera: NDArray[np.float64]
-    embeddings: LandmarkEmbeddings | None
+    embeddings: LandmarkEmbeddings | None  #: Image embeddings of the new map
 
 
 def update_map(old: LandmarkMap, detections: PosedDetections,
@@ -63,10 +49,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
 
     Parameters
     ----------
-    old : LandmarkMap
     detections : PosedDetections
         Of the new recording, with poses in the coordinate frame of the map or nearly so.
-    options : UpdateOptions, optional
     embeddings : LandmarkEmbeddings, optional
         How the old landmarks look. Ignored if another encoder looked at the recording.
 

@@ -59,7 +59,6 @@ class FrameSource:
 
     Parameters
     ----------
-    node : Node
     transport : str
         'raw' or 'compressed'.
     linger_s : float

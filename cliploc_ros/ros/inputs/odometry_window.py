@@ -102,7 +102,6 @@ class OdometryWindow:
 
         Parameters
         ----------
-        stamp_ns : int
         position : ndarray (3,)
             Of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)

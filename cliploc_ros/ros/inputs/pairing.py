@@ -51,8 +51,6 @@ class ExactPairing:
 
         Parameters
         ----------
-        topic : str
-        stamp_ns : int
         item : object
             Returned in the set.
         size : int

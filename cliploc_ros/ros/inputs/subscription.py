@@ -40,8 +40,6 @@ class AdaptiveSubscription:
     ----------
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
-    message_type : type
-    topic : str
     callback : callable
         Takes each message, one at a time except during such a change.
     profile : QoSProfile

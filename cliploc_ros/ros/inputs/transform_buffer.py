@@ -17,10 +17,6 @@ class TransformBuffer(Buffer):
     between those from before and after a shorter jump. Jazzy's Buffer clears itself only where it
     is given a node, and its first releases raise TypeError there. Besides, transforms from before
     the jump may arrive after the clock's. clear() keeps static transforms.
-
-    Parameters
-    ----------
-    node : Node
     """
 
     def __init__(self, node: Node) -> None:

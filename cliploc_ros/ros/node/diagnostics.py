@@ -29,15 +29,9 @@ _WINDOW = 200
 
 @dataclass
 class Health:
-    """Problems, each with its level, and figures.
+    """Problems, each with its level, and figures."""
 
-    Parameters
-    ----------
-    problems : list of (bytes, str)
-        Levels of diagnostic_msgs/DiagnosticStatus, and one line each.
-    values : dict of str to object
-    """
-
+    #: Levels of diagnostic_msgs/DiagnosticStatus, and one line each
     problems: list[tuple[bytes, str]] = field(default_factory=list)
     values: dict[str, object] = field(default_factory=dict)
 
@@ -142,7 +136,6 @@ class Diagnostics:
 
     Parameters
     ----------
-    node : Node
     health : callable
         Returns the node's health.
     state : callable

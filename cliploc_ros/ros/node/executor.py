@@ -24,12 +24,7 @@ _BEGIN_S = 0.1
 
 
 class BoundedCallbackGroup(CallbackGroup):
-    """Runs up to `limit` callbacks at a time.
-
-    Parameters
-    ----------
-    limit : int
-    """
+    """Runs up to `limit` callbacks at a time."""
 
     def __init__(self, limit: int) -> None:
         super().__init__()

@@ -121,7 +121,6 @@ class NodeParameters:
     ----------
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
-    table : iterable of ParameterRow
     check : callable
         Takes all values by name; raises OptionsError where they do not fit together.
     others : iterable of ParameterRow

@@ -46,7 +46,6 @@ class Worker:
 
         Parameters
         ----------
-        task : callable
         deadline : float
             When to stop waiting (monotonic clock) [s]. A task that has begun goes on; one that
             still waits is dropped, else requests would pile up behind a slow task.
@@ -94,7 +93,6 @@ class LatestOnly[T]:
 
     Parameters
     ----------
-    worker : Worker
     work : callable
         Takes one item, in the worker's thread.
     """

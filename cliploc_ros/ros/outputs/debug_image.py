@@ -113,10 +113,8 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
 
     Parameters
     ----------
-    seen : SeenImage
     found : Relocalization
         Its matches refer to the detections of the image.
-    landmark_map : LandmarkMap
     verdict : str
         Written at the top.
     """

@@ -132,12 +132,7 @@ def _point(position: NDArray[np.float64]) -> Point:
 
 
 class Visualization:
-    """Publishes `~/landmarks`, `~/matches`, `~/hypotheses` and `~/debug_image`.
-
-    Parameters
-    ----------
-    node : Node
-    """
+    """Publishes `~/landmarks`, `~/matches`, `~/hypotheses` and `~/debug_image`."""
 
     def __init__(self, node: Node) -> None:
         # Subscribers match in one thread, a map is loaded in another.

@@ -40,8 +40,6 @@ class Turning:
 
     Parameters
     ----------
-    node : Node
-    wait : callable
     step_rad : float
         Positive: counterclockwise. 0: never turn.
     """

@@ -33,19 +33,10 @@ _ON_ITS_WAY_S = 5.0
 
 @dataclass(frozen=True)
 class Report:
-    """One report of the relocalizer.
+    """One report of the relocalizer."""
 
-    Parameters
-    ----------
-    received_at : float
-        Monotonic clock [s].
-    message : str
-        Its problems in one line, or its state.
-    values : dict of str to str
-    """
-
-    received_at: float = -math.inf
-    message: str = ''
+    received_at: float = -math.inf  #: Monotonic clock [s]
+    message: str = ''  #: Its problems in one line, or its state
     values: dict[str, str] = field(default_factory=dict)
 
 
@@ -108,21 +99,12 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class WakeUpOptions:
-    """Options of a wake-up.
+    """Options of a wake-up."""
 
-    Parameters
-    ----------
-    relocalizer : str
-        Name of the relocalizer, relative to the namespace or absolute.
-    timeout_s : float
-        No turn begins later; a look does only after a turn.
-    turn_deg : float
-        Turn by this much between looks; 0: do not turn.
-    """
-
+    #: Name of the relocalizer, relative to the namespace or absolute
     relocalizer: str = 'relocalizer'
-    timeout_s: float = 60.0
-    turn_deg: float = 45.0
+    timeout_s: float = 60.0  #: No turn begins later; a look does only after a turn
+    turn_deg: float = 45.0  #: Turn by this much between looks; 0: do not turn
 
 
 class WakeUp(Node):
@@ -130,7 +112,6 @@ class WakeUp(Node):
 
     Parameters
     ----------
-    options : WakeUpOptions
     interrupted : Interruption
         Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
         and nothing would cancel it.
