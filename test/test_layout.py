@@ -5,6 +5,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -64,6 +65,11 @@ def imported_modules(path: Path) -> set[str]:
             submodules = {f'{node.module}.{alias.name}' for alias in node.names}
             found |= submodules & MODULES.keys() or {node.module}
     return {name for name in found if name.startswith(f'{ROOT}.')}
+
+
+def test_no_imports_form_a_circle():
+    TopologicalSorter({module: (imported_modules(path) & MODULES.keys()) - {module}
+                       for module, path in MODULES.items()}).prepare()  # raises CycleError
 
 
 def test_imports_point_downwards():
