@@ -184,7 +184,7 @@ TALL = np.zeros((SIZE[1] * 2, SIZE[0], 3), dtype=np.uint8)
      ['100.200000.png', 'cannot be decoded as an image']),
     ('rgb/100.200000.png', b'', ['100.200000.png', 'cannot be decoded as an image']),
     ('rgb/100.200000.png', encoded('.png', TALL), ['100.200000.png', '64x96', '64x48']),
-    ('rgb/100.200000.png', encoded('.bmp', TALL), ['100.200000.png', 'neither PNG nor JPEG']),
+    ('rgb/100.200000.png', encoded('.bmp', TALL[:SIZE[1]]), ['100.200000.png', 'neither PNG nor JPEG']),
     ('rgb.txt', None, ['rgb.txt']),
     ('camera.json', None, ['--intrinsics']),
     ('camera.json', b'{', ['camera.json']),
