@@ -18,10 +18,9 @@ from open_clip.transformer import QuickGELU
 from safetensors.torch import save_file
 
 from cliploc_ros.errors import CliplocError, ImageError
-from cliploc_ros.models import ClipOptions, load_encoder
-from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_towers import read_state_dict
-from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
 
 LABELS = ['a red mug', 'keyboard', 'a red mug', 'a stack of books beside the monitor', '']

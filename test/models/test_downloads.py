@@ -35,7 +35,8 @@ else:
 LOAD_YOLO = """
 import json, sys
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 try:
     YoloDetector(YoloOptions('yolov8n', device='cpu', cache_dir=sys.argv[1]))
 except ModelError as error:

@@ -16,8 +16,8 @@ from cliploc_ros.core.map.landmark_embeddings import (
     save_landmark_embeddings,
 )
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.models import ClipOptions, load_encoder
-from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
 
 ROOM = make_room()

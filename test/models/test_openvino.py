@@ -20,11 +20,11 @@ from clip_reference import SMALL_CONFIG, Reference
 from disks import small_disk
 
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models import ClipOptions, YoloDetector, YoloOptions
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
-from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
-from cliploc_ros.models.yolo_weights import load_yolo
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions, load_yolo
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -170,7 +170,7 @@ def test_other_weights_and_another_architecture_are_converted_again(small_clip, 
 FULL = f"""
 import json, logging, pathlib, subprocess, sys
 import numpy as np
-from cliploc_ros.models import ClipOptions
+from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import resolve_clip_weights
 
@@ -215,7 +215,8 @@ import logging, sys
 sys.modules['openvino'] = None  # as where it is not installed
 logging.basicConfig(level=logging.INFO, format='%(levelname)s %(message)s')
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 for _ in range(2):
     assert YoloDetector(YoloOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
 try:

@@ -6,9 +6,9 @@ import open_clip
 import pytest
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models import ClipOptions, YoloOptions
+from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import PROFILES, resolve_profile, with_detector, with_encoder
-from cliploc_ros.models.yolo_weights import import_ultralytics
+from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics
 
 UNNAMED = ClipOptions(model='', pretrained='', device='cpu')
 

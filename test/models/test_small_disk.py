@@ -14,7 +14,8 @@ PRELUDE = f"""
 import json, logging, pathlib, subprocess, sys
 import numpy as np
 import open_clip
-from cliploc_ros.models import ClipOptions, load_encoder
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
 
 folder = pathlib.Path(sys.argv[1])
 logging.basicConfig(format='%(levelname)s %(message)s')

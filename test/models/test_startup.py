@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of CLIP's first start and of a start with a warm cache."""
 
-from cliploc_ros.models import ClipOptions
+from cliploc_ros.models.clip_weights import ClipOptions
 from studies.speed.startup import KINDS, format_results, measure_startup
 
 

@@ -11,8 +11,11 @@ import pytest
 import torch
 
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models import ClipOptions, YoloDetector, YoloOptions, load_encoder
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.files import fingerprint_file
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 
 
 def options(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:

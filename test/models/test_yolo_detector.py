@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from cliploc_ros.errors import ImageError, ModelError, OptionsError
-from cliploc_ros.models import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -163,7 +164,8 @@ def watch(event, arguments):
 sys.addaudithook(watch)
 
 import numpy as np
-from cliploc_ros.models import YoloDetector, YoloOptions
+from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.yolo_weights import YoloOptions
 detector = YoloDetector(YoloOptions(sys.argv[1], device='cpu', cache_dir=sys.argv[2]))
 assert detector.inference == 'openvino'
 for _ in range(3):
