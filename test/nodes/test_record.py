@@ -13,8 +13,8 @@ from tester import make_frame
 
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.datasets.cases import read_case
-from cliploc_ros.datasets.rosbag import BagWriter
 from cliploc_ros.errors import DatasetError
 
 

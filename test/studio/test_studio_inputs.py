@@ -14,7 +14,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
-from cliploc_ros.datasets.rosbag import BagWriter
+from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.studio.images import open_images
 
