@@ -88,6 +88,11 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
             own = ious_with(views, rows, landmarks.centers[number], landmarks.bases[number])
             ious[rows] = np.maximum(ious[rows], own)
+    return explained(ious)
+
+
+def explained(ious: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the share of boxes that landmarks explain, by their best IoUs, and the median IoU."""
     is_explained = ious > _EXPLAINED_IOU
     if not is_explained.any():
         return 0.0, 0.0

@@ -18,9 +18,6 @@ from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.views import Views
 
-# As in cliploc_ros.mapping.report.
-_EXPLAINED_IOU = 0.3
-
 
 class Fold(NamedTuple):
     """A part of a recording, and the map without it."""
@@ -102,10 +99,7 @@ def judge_boxes(views: Views, landmarks: Landmarks, frames: NDArray[np.int64] | 
 
 def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
     """Return how well landmarks explain boxes with these best IoUs."""
-    is_explained = ious > _EXPLAINED_IOU
-    if not is_explained.any():
-        return BoxQuality(len(ious), 0.0, 0.0)
-    return BoxQuality(len(ious), float(is_explained.mean()), float(np.median(ious[is_explained])))
+    return BoxQuality(len(ious), *explained(ious))
 
 
 def fold_map(landmark_map: LandmarkMap, fold: Fold) -> LandmarkMap:
