@@ -16,6 +16,7 @@ from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.evidence import best_ious
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
+from cliploc_ros.mapping.report import explained
 from cliploc_ros.mapping.views import Views
 
 
