@@ -183,6 +183,7 @@ def _floor(places: Places) -> float:
 def _rgb(color: str) -> tuple[int, int, int]:
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
+
 class KeyframesPanel:
     """A switch for the layer of keyframes, which is drawn when it is first shown."""
 

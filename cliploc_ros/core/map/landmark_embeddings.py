@@ -20,6 +20,7 @@ MOST_MEDOIDS = 5
 # Landmarks whose images stand for crops where spreads are measured.
 _CROPS_SAMPLED = 1024
 
+
 def _check_key(name: str, arrays: Arrays) -> None:
     if not str(arrays[name]):
         raise ArrayError(f'array {name} is empty: it names no encoder')
