@@ -156,8 +156,8 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.recording import with_features
-    from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
     from cliploc_ros.evaluation.trials import make_queries
+    from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],

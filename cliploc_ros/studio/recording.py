@@ -23,7 +23,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.checking.label_model import LabelModel
 from cliploc_ros.mapping.checking.landmark_faults import (
     LandmarkCheck,
     check_landmarks,
@@ -38,6 +37,7 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.refit import RefitMap, refit_map
 from cliploc_ros.mapping.views import Views, camera_centers, make_views
+from cliploc_ros.simulation.labels import LabelModel
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.images import outlines_of
 from cliploc_ros.studio.landmark import Landmark, Look, look_of_boxes, map_of

@@ -19,8 +19,8 @@ from cliploc_ros.core.on_demand import recorded_crops
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.session import Session
-from cliploc_ros.evaluation.sensors import with_mount_error, with_neighbours
 from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.simulation.sensors import with_mount_error, with_neighbours
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,

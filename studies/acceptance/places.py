@@ -13,8 +13,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.evaluation import sensors
 from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.simulation import sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE
 
 _BOX_SIDE_PX = (20.0, 200.0)

@@ -3,8 +3,7 @@
 """Similarities of crops and labels in a simulated world, from a weak or a strong encoder.
 
 Objects are vectors: a part of their class, and a part of their model, which is how they look. A
-crop is the vector of its object and noise, more for small boxes, part of which all crops of the
-object share. The form is that of cliploc_ros.mapping.checking.label_model.
+crop is the vector of its object and noise, see cliploc_ros.simulation.labels.
 """
 
 from typing import NamedTuple
@@ -12,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.simulation.labels import CLASS_SHARE, shared_noise, similarities_of
 from studies.worlds.things import CLASS_NAMES
 
 _SIZE = 128
-# Shares of a vector's square: its class, and its object apart from other ones of its model.
-_CLASS_SHARE, _OWN_SHARE = 0.3, 0.1
-_SHARED_NOISE = 0.3
+# Of a vector's square: what tells an object from other ones of its model.
+_OWN_SHARE = 0.1
 # Top-1 rates of .85 to .4. The demo's CLIP, which knows its room, has .91. The simulated
 # similarities of TUM fr3 have .52 to .54, those of a weak encoder.
 _NOISE = (0.15, 0.6)
@@ -41,15 +40,15 @@ class Encoder(NamedTuple):
                  for kind in dict.fromkeys(zip(class_ids, models.tolist(), strict=True))}
         rows = [CLASS_NAMES.index(name) for name in class_ids]
         shared = np.array([looks[kind] for kind in zip(class_ids, models.tolist(), strict=True)])
-        found = (np.sqrt(_CLASS_SHARE) * self.classes[rows]
-                 + np.sqrt(1.0 - _CLASS_SHARE - _OWN_SHARE) * shared
+        found = (np.sqrt(CLASS_SHARE) * self.classes[rows]
+                 + np.sqrt(1.0 - CLASS_SHARE - _OWN_SHARE) * shared
                  + np.sqrt(_OWN_SHARE) * _directions(len(rows), rng))
         return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
     def unknown(self, class_ids: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the vectors (n, D) of crops that show nothing but look like some class."""
         rows = [CLASS_NAMES.index(name) for name in class_ids]
-        return np.asarray(np.sqrt(_CLASS_SHARE) * self.classes[rows])
+        return np.asarray(np.sqrt(CLASS_SHARE) * self.classes[rows])
 
     def biases(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """Return how all crops of each object differ from its vector (n, D)."""
@@ -59,13 +58,8 @@ class Encoder(NamedTuple):
                      bboxes_xyxy: NDArray[np.float64], labels: NDArray[np.float64],
                      rng: np.random.Generator) -> NDArray[np.float32]:
         """Return the similarities (n, L) of n crops and L labels."""
-        levels = 0.5 * np.log2(np.prod(bboxes_xyxy[:, 2:] - bboxes_xyxy[:, :2], axis=1)
-                               / 64.0 ** 2)[:, None]
-        noise = (np.sqrt(_SHARED_NOISE) * biases
-                 + np.sqrt(1.0 - _SHARED_NOISE) * rng.normal(size=crops.shape))
-        seen = crops + self.noise * np.clip(1.0 - 0.45 * levels, 0.4, 2.2) * noise
-        raised = (seen @ labels.T - 0.35) * 1.1 + 0.55 * levels
-        return np.asarray(0.15 + 0.17 / (1.0 + np.exp(-raised)), dtype=np.float32)
+        noise = shared_noise(biases, rng.normal(size=crops.shape))
+        return similarities_of(crops, self.noise, noise, bboxes_xyxy, labels)
 
 
 def _directions(count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
-from cliploc_ros.evaluation import sensors
 from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.simulation import sensors
 from studies.acceptance import troubles
 from studies.acceptance.__main__ import run
 from studies.acceptance.places import Simulated

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 _SIZE = 256
-_CLASS_SHARE = 0.3
+#: Of a vector's square: what all objects of a class share.
+CLASS_SHARE = 0.3
 _NOISE = 0.43
 # Of the noise's variance: what all crops of one landmark share.
 _SHARED_NOISE = 0.3
@@ -39,8 +40,8 @@ class LabelModel:
     def of(landmark_map: LandmarkMap) -> 'LabelModel':
         """Return the model of a map's labels."""
         vectors = np.array([
-            np.sqrt(_CLASS_SHARE) * _direction(f'class {class_id}')
-            + np.sqrt(1.0 - _CLASS_SHARE) * _label_vector(landmark_map, row)
+            np.sqrt(CLASS_SHARE) * _direction(f'class {class_id}')
+            + np.sqrt(1.0 - CLASS_SHARE) * _label_vector(landmark_map, row)
             for row, class_id in enumerate(landmark_map.class_ids)])
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         biases = [np.sqrt(_SIZE) * _direction(f'crops of {name}')
@@ -62,19 +63,34 @@ class LabelModel:
             [px].
         """
         count = len(shown)
-        sizes = np.sqrt(np.prod(np.maximum(bboxes_xyxy[:, 2:] - bboxes_xyxy[:, :2], 1.0), axis=1))
-        noise = rng.normal(size=(count, _SIZE))
-        known = shown >= 0
-        noise[known] = (np.sqrt(1.0 - _SHARED_NOISE) * noise[known]
-                        + np.sqrt(_SHARED_NOISE) * self.biases[shown[known]])
-        crops = np.array([np.sqrt(_CLASS_SHARE) * _direction(f'class {name}')
+        biases, known = np.zeros((count, _SIZE)), shown >= 0
+        biases[known] = self.biases[shown[known]]
+        crops = np.array([np.sqrt(CLASS_SHARE) * _direction(f'class {name}')
                           for name in class_ids]).reshape(count, _SIZE)
         crops[known] = self.labels[shown[known]]
-        levels = np.log2(sizes / 64.0)[:, None]
-        crops += _NOISE * np.clip(1.0 - 0.45 * levels, 0.4, 2.2) * noise
-        cosines = crops @ self.labels.T
-        raised = 0.15 + 0.17 / (1.0 + np.exp(-((cosines - 0.35) * 1.1 + 0.55 * levels)))
-        return np.asarray(raised, dtype=np.float32)
+        noise = rng.normal(size=(count, _SIZE))
+        noise[known] = shared_noise(biases[known], noise[known])
+        return similarities_of(crops, _NOISE, noise, bboxes_xyxy, self.labels)
+
+
+def shared_noise(biases: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the noise (n, D) of crops, a part of which all crops of an object share."""
+    return np.asarray(np.sqrt(1.0 - _SHARED_NOISE) * noise + np.sqrt(_SHARED_NOISE) * biases)
+
+
+def similarities_of(crops: NDArray[np.float64], strength: float, noise: NDArray[np.float64],
+                    bboxes_xyxy: NDArray[np.float64], labels: NDArray[np.float64]
+                    ) -> NDArray[np.float32]:
+    """Return the similarities (n, L) of crops (n, D) with labels (L, D).
+
+    The strength of the noise (n, D) is that of a box with sides of 64 px. Smaller boxes have more
+    noise, and lower similarities.
+    """
+    sizes = np.sqrt(np.prod(np.maximum(bboxes_xyxy[:, 2:] - bboxes_xyxy[:, :2], 1.0), axis=1))
+    levels = np.log2(sizes / 64.0)[:, None]
+    seen = crops + strength * np.clip(1.0 - 0.45 * levels, 0.4, 2.2) * noise
+    raised = (seen @ labels.T - 0.35) * 1.1 + 0.55 * levels
+    return np.asarray(0.15 + 0.17 / (1.0 + np.exp(-raised)), dtype=np.float32)
 
 
 def _label_vector(landmark_map: LandmarkMap, row: int) -> NDArray[np.float64]:
