@@ -19,6 +19,7 @@ from cliploc_ros.evaluation.map_check.output import DATA, PAGE, write_report
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
 from cliploc_ros.mapping.checking.cross_validation import make_folds
+from cliploc_ros.mapping.checking.detector_model import measure_detector
 from cliploc_ros.mapping.checking.grid import make_grid
 from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
 from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
@@ -27,7 +28,6 @@ from cliploc_ros.mapping.checking.relocalization import try_recording
 from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import make_views
-from cliploc_ros.simulation.detector import measure_detector
 from cliploc_ros.simulation.labels import LabelModel
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')

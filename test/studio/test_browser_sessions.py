@@ -17,9 +17,9 @@ from browser import Person, value_of, wait_for
 from studio_map import ASSETS, open_page
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.mapping.checking.detector_model import guess_detector
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.simulation.detector import guess_detector
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.recording import Recording

@@ -17,6 +17,11 @@ from cliploc_ros.mapping.checking.cross_validation import (
     judge_boxes,
     make_folds,
 )
+from cliploc_ros.mapping.checking.detector_model import (
+    DetectorModel,
+    guess_detector,
+    measure_detector,
+)
 from cliploc_ros.mapping.checking.grid import Grid, make_grid
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
@@ -46,11 +51,6 @@ from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views, make_views
-from cliploc_ros.simulation.detector import (
-    DetectorModel,
-    guess_detector,
-    measure_detector,
-)
 
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]

@@ -15,9 +15,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.checking.cross_validation import Fold, fold_map
+from cliploc_ros.mapping.checking.detector_model import DetectorModel
 from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.simulation.detector import DetectorModel
 from cliploc_ros.simulation.labels import LabelModel
 
 Verdict = Literal['accepted', 'refused', 'misled']
