@@ -79,11 +79,11 @@ class LabelCache:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             # Remove the least recently used files, and those of writers that were killed.
-            files = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
-            stale = [file for file in self._folder.glob('.*.tmp')
-                     if _modified(file) < time.time() - _STALE_S]
-            for file in files[self._most_files - 1:] + stale:
-                file.unlink(missing_ok=True)
+            kept = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
+            stale = [one for one in self._folder.glob('.*.tmp')
+                     if _modified(one) < time.time() - _STALE_S]
+            for old in kept[self._most_files - 1:] + stale:
+                old.unlink(missing_ok=True)
             self._write(file, key, labels, embeddings)
         except OSError as error:
             logger.warning('label embeddings are not cached and the next start is slow again: '
