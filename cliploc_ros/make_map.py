@@ -83,14 +83,15 @@ class Labeller:
         return label_landmarks(landmark_map, embeddings, phrases), embeddings
 
 
-def find_labeller(detections: PosedDetections, clip: ClipOptions | None,
+def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] | None,
                   vocabulary: Path | None = None) -> Labeller:
     """Return what labels the landmarks of a recording.
 
     Parameters
     ----------
-    clip : ClipOptions, optional
-        The CLIP of the recording; None: labels are class names.
+    clip : callable, optional
+        Returns the CLIP of the recording; called only where the recording has embeddings. None:
+        labels are class names.
     vocabulary : Path, optional
         Phrases by class (YAML), besides the shipped ones.
 
@@ -103,7 +104,11 @@ def find_labeller(detections: PosedDetections, clip: ClipOptions | None,
     try:
         if clip is None:
             raise ModelError('--no-clip was given')
-        return Labeller(words, clip, _weights_of(detections, clip))
+        if not _has_embeddings(detections):
+            raise ModelError('the observations have no CLIP embeddings that name their encoder; '
+                             'record them again with CLIP')
+        options = clip()
+        return Labeller(words, options, _weights_of(detections, options))
     except ModelError as error:
         if vocabulary is not None:
             raise
@@ -112,9 +117,6 @@ def find_labeller(detections: PosedDetections, clip: ClipOptions | None,
 
 def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
     """Return the weights that made the embeddings; ModelError where they are not at hand."""
-    if not _has_embeddings(detections):
-        raise ModelError('the observations have no CLIP embeddings that name their encoder; '
-                         'record them again with CLIP')
     hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
     theirs = detections.encoder_key.split(':')[0]
     ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')

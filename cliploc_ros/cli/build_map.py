@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +116,7 @@ def build(options: argparse.Namespace) -> int:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    labeller = find_labeller(detections, clip_options(options) if options.clip else None,
+    labeller = find_labeller(detections, partial(clip_options, options) if options.clip else None,
                              options.vocabulary)
     name = source_of(options).name
     if update is None:
