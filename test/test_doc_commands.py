@@ -19,10 +19,10 @@ from doc_commands import FOREIGN, PROJECT, Command, commands, commands_of, inlin
 
 from cliploc_ros.command import split_ros_args
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
-NODES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
+NODES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.

@@ -8,13 +8,14 @@ import importlib.util
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import yaml
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
@@ -101,7 +102,8 @@ def test_the_messages_that_are_looked_up_exist():
 
 
 def test_the_default_parameters_are_valid_together():
-    relocalizer_options({row.name: row.default for row in RELOCALIZER})
+    DetectorParameters().check()
+    RelocalizerParameters().check()
 
 
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
@@ -130,18 +132,18 @@ def test_the_map_of_the_documents_is_valid(page, tmp_path):
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
 def test_config_files_hold_every_default(name):
     tree = yaml.safe_load((PROJECT / f'config/{name}.yaml').read_text())
-    rows = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}[name]
-    assert tree['/**']['ros__parameters'] == {row.name: row.default for row in rows}
+    defaults = {'detector': DetectorParameters, 'relocalizer': RelocalizerParameters}[name]()
+    assert tree['/**']['ros__parameters'] == asdict(defaults)
 
 
 def test_nav2s_example_is_of_parameters_that_there_are():
     text = (PROJECT / 'doc/nav2.md').read_text()
     example = re.search(r'    /\*\*:\n(?: {6}.*\n)+', text).group()
     values = yaml.safe_load(example)['/**']['ros__parameters']
-    rows = {row.name: row for row in RELOCALIZER}
+    rows = {row.name: row for row in RelocalizerParameters.rows()}
     for name, value in values.items():
         assert rows[name].validated(value) == value
-    relocalizer_options({row.name: row.default for row in RELOCALIZER} | values)
+    RelocalizerParameters(**values).check()
 
 
 def test_rviz_shows_what_is_published():
@@ -182,5 +184,5 @@ def test_robot_localization_reads_what_is_published():
     values = tree['ekf_filter_node_map']['ros__parameters']
     assert f'/{values["pose0"]}' in published_topics()
     assert [len(values[name]) for name in ('odom0_config', 'pose0_config')] == [15, 15]
-    rows = {row.name: row.default for row in RELOCALIZER}
-    assert (values['odom_frame'], rows['publish_tf']) == (rows['odom_frame'], False)
+    defaults = RelocalizerParameters()
+    assert (values['odom_frame'], defaults.publish_tf) == (defaults.odom_frame, False)

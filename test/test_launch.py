@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from cliploc_ros.cli.wake_up import make_parser
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
 DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]
-TABLES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
+TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 # The arguments of Nav2 1.3.13's bringup_launch.py and localization_launch.py, and those that mean
 # the same in ours.
 OF_NAV2 = {'namespace', 'use_namespace', 'slam', 'map', 'use_localization', 'use_sim_time',
@@ -131,7 +131,7 @@ def test_nav2_calls_our_service_and_waits_long_enough():
     call = ElementTree.fromstring(tree).find('ReinitializeGlobalLocalization')
     (name,) = set(re.findall(r'reinitialize_global_localization:=(\w+)', text))
     assert call.get('service_name') == name != 'reinitialize_global_localization'
-    timeout_s = next(row.default for row in RELOCALIZER if row.name == 'timeout_s')
+    timeout_s = RelocalizerParameters().timeout_s
     assert int(call.get('server_timeout')) > 1000 * (timeout_s + 2.0)
 
 

@@ -37,6 +37,7 @@ LAYERS = (
     ('simulation',),
     ('ros.qos', 'ros.conversions'),
     ('ros.node',),
+    ('ros.parameters',),
     ('ros.inputs',),
     ('ros.outputs', 'ros.replay'),
     ('ros',),

@@ -3,10 +3,11 @@
 """Load both nodes as on the robot, answer a request, and say what it costs and what to carry."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.node.parameters import Value
+from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters
 
 # A request is measured with as many boxes as a picture of a furnished room has.
 _BOXES = 12
@@ -69,7 +70,7 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
         Names the file, parameter or download to mend.
     """
     image_rgb = read_picture(picture)
-    used: list[Mapping[str, Value]] = []
+    used: list[CommonParameters] = []
     detector = None
     if has_detector:
         with _step('detector: weights and network'), _node(DetectorNode(), cache_dir) as node:
@@ -78,11 +79,11 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
             detector = node.detector
     with (_step('relocalizer: map, weights, labels, network, kernels'),
           _node(RelocalizerNode(), cache_dir) as node):
-        values = node.settings.snapshot()
-        used.append(values)
-        localizer = load_localizer(node, values)
+        parameters = node.settings.snapshot()
+        used.append(parameters)
+        localizer = load_localizer(node, parameters)
     with _step(f'{_REQUESTS} requests for {picture or "a picture of the demo"}'):
-        requests = [answer(image_rgb, detector, localizer, values) for _ in range(_REQUESTS)]
+        requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
@@ -105,7 +106,7 @@ def read_picture(file: Path | None) -> NDArray[np.uint8]:
 
 
 def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: Localizer,
-           values: Mapping[str, Value]) -> Request:
+           parameters: RelocalizerParameters) -> Request:
     """Answer a request for a picture as the nodes do, and measure it."""
     start = time.monotonic()
     found = _NOTHING if detector is None else detector.detect(image_rgb)
@@ -123,8 +124,8 @@ def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localize
     times = StageTimes('waiting', now)
     # what a request costs at most
     localized = localizer.localize(
-        Frame(image, info, detections_to_msg(boxes, header), now, now), {**values, 'crops': 'all'},
-        RobotState(np.eye(4)), times)
+        Frame(image, info, detections_to_msg(boxes, header), now, now),
+        replace(parameters, crops='all'), RobotState(np.eye(4)), times)
     stage_ms = {'detection': detection_ms} if detector is not None else {}
     return Request(stage_ms | times.ms, len(found), len(boxes),
                    localized.found.reason or 'accepted')
@@ -159,7 +160,7 @@ def cost_table(requests: list[Request]) -> str:
     return '\n'.join(lines)
 
 
-def carrying(cache_dir: Path, used: list[Mapping[str, Value]]) -> list[str]:
+def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
     """Return what to do with a folder to carry, in lines."""
     size = sum(file.stat().st_size for file in cache_dir.rglob('*') if file.is_file()
                and not file.is_symlink())
@@ -167,8 +168,9 @@ def carrying(cache_dir: Path, used: list[Mapping[str, Value]]) -> list[str]:
              'path there',
              f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another "
              'one compiles them at its first start']
-    names = {str(values[name]) for values in used for name in _FILES if values.get(name)}
-    maps = {name for values in used if 'map_file' in values for name in map_files(values)}
+    names = {getattr(one, name, '') for one in used for name in _FILES} - {''}
+    maps = {name for one in used if isinstance(one, RelocalizerParameters)
+            for name in map_files(one)}
     names |= maps | {str(embeddings_path(name)) for name in maps}
     files = sorted({Path(name).expanduser().absolute() for name in names})
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files
@@ -185,10 +187,10 @@ def _step(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def _node[Node: ManagedNode](node: Node, cache_dir: Path | None) -> Iterator[Node]:
+def _node[Node: ManagedNode[Any]](node: Node, cache_dir: Path | None) -> Iterator[Node]:
     """Yield a node whose parameter cache_dir has the expected value; destroy it afterwards."""
     try:
-        own = node.settings['cache_dir']
+        own = node.settings.values.cache_dir
         if cache_dir is not None and own != str(cache_dir):
             raise OptionsError(f'the parameter file sets cache_dir of the {node.get_name()} to '
                                f"'{own}': remove it there, or leave --cache-dir out")

@@ -35,7 +35,6 @@ from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.yolo_weights import YoloOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
-from cliploc_ros.ros.parameter_tables import relocalizer_options
 
 
 def run_map_demo(options: DemoOptions) -> None:
@@ -105,12 +104,12 @@ def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     look = LoadNetworks(YoloOptions(model=str(options.assets / 'yolo.pt')), clip)()
     recorded = record_every_frame(
         tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
-    method = Method(options.method, relocalizer_options(options.values))
+    method = Method(options.method, options.values.options())
     summaries = {}
     for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):
         landmark_map = LandmarkMap.from_file(file)
         queries = make_queries_of(recorded, landmark_map, embed_map(
-            clip, landmark_map, [str(file)], options.values['landmark_embeddings']))
+            clip, landmark_map, [str(file)], options.values.landmark_embeddings))
         summaries[name], = summarize(run_methods(
             landmark_map, [method], make_queries(queries, landmark_map), trials=1))
     return summaries

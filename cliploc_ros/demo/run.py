@@ -38,7 +38,7 @@ from cliploc_ros.demo.review import Judged, Observe, Review, Reviewer, judge, ob
 from cliploc_ros.demo.robot import Robot
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The first start compiles the kernels of the search.
 _PATIENCE_S = 180.0
@@ -88,9 +88,11 @@ class DemoOptions:
         return parameters
 
     @property
-    def values(self) -> dict[str, Any]:
-        """Return the values of all of the relocalizer's parameters."""
-        return {row.name: row.default for row in RELOCALIZER} | self.parameters
+    def values(self) -> RelocalizerParameters:
+        """Return all of the relocalizer's parameters."""
+        given: dict[str, Any] = {name: str(value) if isinstance(value, Path) else value
+                                 for name, value in self.parameters.items()}
+        return RelocalizerParameters(**given)
 
 
 def run_demo(options: DemoOptions) -> list[Judged]:
@@ -132,7 +134,7 @@ def prepare(options: DemoOptions) -> None:
     CliplocError
         For an unknown method, missing assets, and a folder that cannot be written.
     """
-    relocalizer_options(options.values)
+    options.values.check()
     # Make the folder for the pictures, and remove those of an earlier run.
     make_folder(options.out)
     for picture in options.out.glob(page.PICTURES):
@@ -232,7 +234,7 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
 
 def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence) -> Reviewer:
     values = options.values
-    method = relocalizer_options(values)
+    method = values.options()
     camera, _ = find_camera(None, sequence.folder)
 
     observe: Observe = observe_classes
@@ -240,14 +242,13 @@ def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequ
         from cliploc_ros.models.map_rows import load_encoder_for_map
         from cliploc_ros.models.observer import Observer
         observe = Observer(*load_encoder_for_map(
-            ClipOptions(model=str(values['clip_model']),
-                        pretrained=str(values['clip_pretrained'])),
-            landmark_map, [str(values['map_file'])], values['landmark_embeddings'])).observe
+            ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),
+            landmark_map, [values.map_file], values.landmark_embeddings)).observe
     relocalizer = Relocalizer(landmark_map, method)
 
     def relocalize(observation: Observation) -> Relocalization:
         return localize_on_demand(relocalizer, (), observation,
                                   recorded_crops(observation, method))[1]
     return Reviewer(sequence, camera, observe, relocalize,
-                    values['max_detections'],
+                    values.max_detections,
                     str if options.wake_up_map is None else options.wake_up_map.landmark_of)

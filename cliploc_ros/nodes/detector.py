@@ -5,8 +5,7 @@
 import math
 import threading
 import time
-from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
 from vision_msgs.msg import Detection2DArray
@@ -21,22 +20,21 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.node.parameters import Value
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
 
 
-class DetectorNode(ManagedNode):
+class DetectorNode(ManagedNode[DetectorParameters]):
     """Publishes what a YOLO network detects in the newest image."""
 
     def __init__(self) -> None:
-        super().__init__('detector', DETECTOR, detector_options, RELOCALIZER)
+        super().__init__('detector', DetectorParameters, RelocalizerParameters)
         self._detector: YoloDetector | None = None
         self._newest: LatestOnly[TimedImage] = LatestOnly(self.worker, self._detect)
-        self._images = ImageSource(self, self.settings['image_transport'], self._newest.offer)
+        self._images = ImageSource(self, self.settings.values.image_transport, self._newest.offer)
         self._published = 0
         self._last_error = ''
         self._rates = Rates()
@@ -53,8 +51,8 @@ class DetectorNode(ManagedNode):
 
     def load(self) -> str:
         """Load the network."""
-        options = with_detector(detector_options(self.settings.snapshot()),
-                                str(self.settings['profile']))
+        parameters = self.settings.snapshot()
+        options = with_detector(yolo_options(parameters), parameters.profile)
         self._detector = YoloDetector(options)
         return f'detector {options.model} ({self._detector.inference})'
 
@@ -79,7 +77,7 @@ class DetectorNode(ManagedNode):
 
     def examine(self, health: Health) -> None:
         """Report the input, rates, what was dropped, and the device."""
-        self._images.examine(health, self.settings['stale_after_s'])
+        self._images.examine(health, self.settings.values.stale_after_s)
         if self._last_error:
             health.warn(self._last_error)
         waiting = self._newest.waiting
@@ -112,7 +110,7 @@ class DetectorNode(ManagedNode):
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
         try:
-            self._detector.configure(detector_options(self.settings.snapshot()))
+            self._detector.configure(yolo_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
             times.begin('detection')
             detections = self._detector.detect(pixels)
@@ -130,11 +128,12 @@ class DetectorNode(ManagedNode):
                 self._awaited_since = math.inf
 
 
-def detector_options(values: Mapping[str, Value]) -> YoloOptions:
-    """Return the network's options from the values of the detector's parameters."""
-    fields: Any = {name: values[name] for name in YoloOptions.__dataclass_fields__
-                   if name in values}
-    return YoloOptions(**fields)
+def yolo_options(parameters: DetectorParameters) -> YoloOptions:
+    """Return the network's options."""
+    return YoloOptions(
+        model=parameters.model, conf=parameters.conf, iou=parameters.iou, imgsz=parameters.imgsz,
+        max_det=parameters.max_det, device=parameters.device, cache_dir=parameters.cache_dir,
+        inference=parameters.inference)
 
 
 def main() -> NoReturn:

@@ -25,30 +25,31 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
 
 _LOG_PERIOD_S = 5.0
 
 
-class RelocalizerNode(ManagedNode):
+class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     """Answers where the robot is: on request, or with every frame."""
 
     def __init__(self) -> None:
-        super().__init__('relocalizer', RELOCALIZER, relocalizer_options, DETECTOR)
-        continuous = self.settings['mode'] == 'continuous'
+        super().__init__('relocalizer', RelocalizerParameters, DetectorParameters)
+        parameters = self.settings.values
+        continuous = parameters.mode == 'continuous'
         self._robot = RobotStateSource(self)
         self._jumps = TimeJumps(self, self._forget)
         self._pipeline = Pipeline(self, self._robot, self._jumps)
         self._newest = LatestOnly(self.worker, self._localize_and_log)
-        self._frames = FrameSource(self, self.settings['image_transport'],
+        self._frames = FrameSource(self, parameters.image_transport,
                                    math.inf if continuous else LINGER_S,
                                    self._newest.offer if continuous else lambda frame: None,
-                                   self.settings['detections_type'])
+                                   parameters.detections_type)
         self._handoff = HandOff(self, self._robot.odometry)
         self._requests = Requests(self, self._frames, self._robot, self._localize_and_keep,
                                   self._handoff)
-        self._cases = CaseRecorder(bool(self.settings['record_folder']))
+        self._cases = CaseRecorder(bool(parameters.record_folder))
         self._counters = RequestCounters()
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
@@ -71,12 +72,13 @@ class RelocalizerNode(ManagedNode):
 
     def open(self) -> None:
         """Accept requests; in continuous mode subscribe to frames."""
-        self._handoff.open(self.settings['localizer_pose'])
+        parameters = self.settings.values
+        self._handoff.open(parameters.localizer_pose)
         self._robot.open()
         self._pipeline.open()
         self._frames.open()
         topic = self._frames.image_topic
-        if re.search('[/_]rect', topic) and not self.settings['rectified']:
+        if re.search('[/_]rect', topic) and not parameters.rectified:
             self.get_logger().warning(
                 f'{topic} sounds rectified, but the parameter rectified is false: poses would be '
                 'wrong by the distortion of the lens')
@@ -100,14 +102,15 @@ class RelocalizerNode(ManagedNode):
 
     def examine(self, health: Health) -> None:
         """Report the inputs, the last verdict and the device."""
-        self._frames.examine(health, self.settings['stale_after_s'])
+        parameters = self.settings.values
+        self._frames.examine(health, parameters.stale_after_s)
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           **self._counters.values(),
                           'map file': ', '.join(filter(None, [
-                              self.settings['map_file'], *self.settings['map_files']])),
-                          'base frame': self.settings['base_frame'],
-                          'time limit [s]': self.settings['timeout_s'],
+                              parameters.map_file, *parameters.map_files])),
+                          'base frame': parameters.base_frame,
+                          'time limit [s]': parameters.timeout_s,
                           'missing': '; '.join(self._missing())}
         localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
         if localizer is not None:
@@ -121,7 +124,7 @@ class RelocalizerNode(ManagedNode):
     def _missing(self) -> list[str]:
         """Return what a request needs and does not find, one line each."""
         missing = self._frames.missing()
-        if self.settings['require_localizer'] and (localizer := self._handoff.missing()):
+        if self.settings.values.require_localizer and (localizer := self._handoff.missing()):
             missing.append(localizer)
         return missing
 

@@ -4,12 +4,11 @@
 
 import threading
 from collections import deque
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
@@ -18,7 +17,7 @@ from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.parameter_tables import relocalizer_options
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 if TYPE_CHECKING:
     from cliploc_ros.datasets.cases import Case, CaseFrame
@@ -67,7 +66,7 @@ class CaseRecorder:
         with self._lock:
             self._seen.clear()
 
-    def store(self, values: Mapping[str, Any]) -> str:
+    def store(self, parameters: RelocalizerParameters) -> str:
         """Store the last request in record_folder; return what was stored, in one line.
 
         Raises
@@ -77,7 +76,7 @@ class CaseRecorder:
         CliplocError
             The folder is not given, full, or cannot be written.
         """
-        if not values['record_folder']:
+        if not parameters.record_folder:
             raise OptionsError('record_folder is empty: set it at the start, to a folder with '
                                'room for record_limit_mb')
         try:
@@ -86,13 +85,13 @@ class CaseRecorder:
             raise OptionsError(f'recording needs rosbags ({error}): pip install rosbags'
                                ) from error
         seen, last = self._linked()
-        folder = _made_folder(values['record_folder'])
+        folder = _made_folder(parameters.record_folder)
         found = seen[-1].answer
         case = Case(tuple(_case_frame(one) for one in seen), {
             'verdict': str(last.verdict), 'message': last.message, 'found': str(found.verdict),
-            'reason': found.detail, 'map_hash': found.map_hash, 'parameters': dict(values),
-            'options': asdict(relocalizer_options(values))})
-        _check_room(folder, case, values['record_limit_mb'])
+            'reason': found.detail, 'map_hash': found.map_hash, 'parameters': asdict(parameters),
+            'options': asdict(parameters.options())})
+        _check_room(folder, case, parameters.record_limit_mb)
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}'
         write_case(path, case)

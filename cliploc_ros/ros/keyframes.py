@@ -4,10 +4,8 @@
 
 import logging
 import time
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +22,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 logger = logging.getLogger(__name__)
 
@@ -78,12 +77,13 @@ class Keyframes:
                                deadline, times.begin)
 
 
-def load_keyframes(values: Mapping[str, Any], landmark_map: LandmarkMap) -> Keyframes | None:
+def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
+                   ) -> Keyframes | None:
     """Return the layer that the parameters name; None without one, or where it is bad.
 
     A bad layer is logged with what to do, and the relocalizer goes on with the landmarks.
     """
-    named, map_file = values['keyframes_file'], values['map_file']
+    named, map_file = parameters.keyframes_file, parameters.map_file
     if not named or (named == NEXT_TO_MAP and not map_file):
         return None
     path = layer_path(path_of(map_file)) if named == NEXT_TO_MAP else Path(named)

@@ -4,9 +4,8 @@
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
 from cliploc_ros.ros.map_parameters import load_hashed_map, map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
-from cliploc_ros.ros.parameter_tables import parse_class_map, relocalizer_options
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
 # of the time that is left, and for the answer. Guesses.
@@ -109,7 +108,7 @@ class Localizer:
         return (f'{len(self._map)} landmarks in {where}, {keyframes}'
                 f'{self._options.matching}_{self._options.algorithm}')
 
-    def reloaded(self, node: Node, values: Mapping[str, Any]) -> 'Localizer':
+    def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'Localizer':
         """Return a localizer for the map as it is now; the encoder stays the same.
 
         Raises
@@ -117,24 +116,24 @@ class Localizer:
         CliplocError
             Names what to fix in the map; this localizer stays as it was.
         """
-        options = relocalizer_options(values)
-        files = map_files(values)
+        options = parameters.options()
+        files = map_files(parameters)
         landmark_map, map_hash = load_hashed_map(node, files)
         relocalizer = Relocalizer(landmark_map, options)
         observer = self._observer
         if observer is not None:
             from cliploc_ros.models.map_rows import embed_map
             observer = observer.with_labels(embed_map(
-                _clip_options(values), landmark_map, files, values['landmark_embeddings']))
+                _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings))
         return Localizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
-                         load_keyframes(values, landmark_map))
+                         load_keyframes(parameters, landmark_map))
 
-    def localize(self, frame: Frame, values: Mapping[str, Any], state: RobotState,
+    def localize(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        `values` are the relocalizer's parameters as they are now, `state` is that at the stamp of
-        the frame. No crops are compared after `deadline` (monotonic clock) [s].
+        `parameters` are as they are now, `state` is that at the stamp of the frame. No crops are
+        compared after `deadline` (monotonic clock) [s].
 
         Raises
         ------
@@ -144,17 +143,17 @@ class Localizer:
         times.begin('decoding')
         image = image_from_msg(frame.image)
         height, width = image.shape[:2]
-        camera = camera_from_msg(frame.camera_info, (width, height), values['rectified'])
+        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
         detections = detections_from_msg(
-            frame.detections, parse_class_map(values['class_map'])).usable(
-                width, height, values['max_detections'])
+            frame.detections, parameters.class_names()).usable(
+                width, height, parameters.max_detections)
         place = state.place
         observation = Observation(
             camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
             up_in_camera=state.up_in_camera,
             odom_from_camera=None if place is None else place.odom_from_camera,
             odom_way_m=0.0 if place is None else place.way_m)
-        options = relocalizer_options(values)
+        options = parameters.options()
         session = self._session_for(options)
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
@@ -163,14 +162,14 @@ class Localizer:
         if place is None:
             found = session.localize(observation, crops=crops, recognizer=recognizer)
         else:
-            found = session.localize(observation, place.run, values['fuse_frames'],
-                                     values['fuse_window_s'], crops, recognizer)
+            found = session.localize(observation, place.run, parameters.fuse_frames,
+                                     parameters.fuse_window_s, crops, recognizer)
         seen = session.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = session.covariance_for_filter(found) \
-            if found.accepted and values['mode'] == 'continuous' else found.covariance
+            if found.accepted and parameters.mode == 'continuous' else found.covariance
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
@@ -220,7 +219,7 @@ class Localizer:
         return self._session
 
 
-def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
+def load_localizer(node: Node, parameters: RelocalizerParameters) -> Localizer:
     """Load map and, if the matching type asks for it, CLIP.
 
     Raises
@@ -228,21 +227,21 @@ def load_localizer(node: Node, values: Mapping[str, Any]) -> Localizer:
     CliplocError
         Names the file, parameter or download to mend.
     """
-    if values['cache_dir']:
-        KERNEL_FOLDERS.prefer(resolve_cache_dir(values['cache_dir']) / 'kernels')
-    options = relocalizer_options(values)
-    files = map_files(values)
+    if parameters.cache_dir:
+        KERNEL_FOLDERS.prefer(resolve_cache_dir(parameters.cache_dir) / 'kernels')
+    options = parameters.options()
+    files = map_files(parameters)
     landmark_map, map_hash = load_hashed_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
         from cliploc_ros.models.map_rows import load_encoder_for_map
         encoder, embeddings = load_encoder_for_map(
-            _clip_options(values), landmark_map, files, values['landmark_embeddings'])
+            _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings)
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
     return Localizer(landmark_map, observer, relocalizer, options, device, map_hash,
-                     load_keyframes(values, landmark_map))
+                     load_keyframes(parameters, landmark_map))
 
 
 def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation
@@ -257,8 +256,9 @@ def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observat
     return found, own.landmark_map, replace(seen, similarities=pieces[which])
 
 
-def _clip_options(values: Mapping[str, Any]) -> ClipOptions:
-    named = ClipOptions(model=values['clip_model'], pretrained=values['clip_pretrained'],
-                        checkpoint_path=values['clip_checkpoint_path'], device=values['device'],
-                        cache_dir=values['cache_dir'], inference=values['inference'])
-    return with_encoder(named, values['profile'])
+def _clip_options(parameters: RelocalizerParameters) -> ClipOptions:
+    named = ClipOptions(
+        model=parameters.clip_model, pretrained=parameters.clip_pretrained,
+        checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
+        cache_dir=parameters.cache_dir, inference=parameters.inference)
+    return with_encoder(named, parameters.profile)

@@ -3,7 +3,7 @@
 """The maps of a node: in files, or in its parameters, where `--params-file map.yaml` puts one."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from rclpy.node import Node
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, OptionsError
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _FILE, _PACKAGE = 'file://', 'package://'
 _PREFIX = 'map.'
@@ -47,7 +48,7 @@ def path_of(name: str) -> str:
                        'the workspace that has it') from error
 
 
-def map_files(values: Mapping[str, Any]) -> list[str]:
+def map_files(parameters: RelocalizerParameters) -> list[str]:
     """Return the paths of the files that the parameters map_file and map_files name.
 
     Raises
@@ -57,11 +58,11 @@ def map_files(values: Mapping[str, Any]) -> list[str]:
     MapError
         A URL names a package that is not installed.
     """
-    several = [name for name in values['map_files'] if name]
-    if several and values['map_file']:
+    several = [name for name in parameters.map_files if name]
+    if several and parameters.map_file:
         raise OptionsError("map_file and map_files both name files: set map_file to '' to search "
                            'all of map_files')
-    return [path_of(name) for name in several or [values['map_file']] if name]
+    return [path_of(name) for name in several or [parameters.map_file] if name]
 
 
 def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:

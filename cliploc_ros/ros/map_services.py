@@ -15,6 +15,7 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline
 
 
@@ -27,7 +28,8 @@ class MapServices:
         Of the services.
     """
 
-    def __init__(self, node: ManagedNode, pipeline: Pipeline, group: CallbackGroup) -> None:
+    def __init__(self, node: ManagedNode[RelocalizerParameters], pipeline: Pipeline,
+                 group: CallbackGroup) -> None:
         self._node = node
         self._pipeline = pipeline
         # Between the parameters of a map and its reading, nobody else may set them.
@@ -55,7 +57,8 @@ class MapServices:
             Names what to fix; parameters and maps stay as they were.
         """
         with self._lock:
-            before = {name: self._node.settings[name] for name in ('map_file', 'map_files')}
+            before = {name: getattr(self._node.settings.values, name)
+                      for name in ('map_file', 'map_files')}
             self._set(map_file=map_url, map_files=[''])
             try:
                 return self._node.worker.run(self._pipeline.reload_map)

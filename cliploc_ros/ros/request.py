@@ -30,6 +30,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Every frame that odometry does not link is another chance of a false accept.
 _MAX_UNLINKED = 3
@@ -59,8 +60,9 @@ class Requests:
     the frame's Answer. It is called in the worker's thread.
     """
 
-    def __init__(self, node: ManagedNode, frames: FrameSource, robot: RobotStateSource,
-                 localize: Callable[[Frame, StageTimes, float], Answer], handoff: HandOff) -> None:
+    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource,
+                 robot: RobotStateSource, localize: Callable[[Frame, StageTimes, float], Answer],
+                 handoff: HandOff) -> None:
         self._node = node
         self._frames = frames
         self._robot = robot
@@ -72,7 +74,7 @@ class Requests:
     def answer(self) -> Answer:
         """Return the answer to a request that arrives now, within timeout_s."""
         arrived_at = time.monotonic()
-        deadline = arrived_at + self._node.settings['timeout_s']
+        deadline = arrived_at + self._node.settings.values.timeout_s
         if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
             return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
         try:
@@ -163,7 +165,8 @@ class Pipeline:
     All methods but open and close run in the node's worker, one after another.
     """
 
-    def __init__(self, node: ManagedNode, robot: RobotStateSource, jumps: TimeJumps) -> None:
+    def __init__(self, node: ManagedNode[RelocalizerParameters], robot: RobotStateSource,
+                 jumps: TimeJumps) -> None:
         self._node = node
         self._jumps = jumps
         self._robot = robot
@@ -190,7 +193,7 @@ class Pipeline:
 
     def open(self) -> None:
         """Begin to broadcast map -> odom where that is asked for."""
-        if self._node.settings['publish_tf']:
+        if self._node.settings.values.publish_tf:
             self._map_to_odom.open()
 
     def close(self) -> None:
@@ -219,14 +222,14 @@ class Pipeline:
         if times is None:
             times = StageTimes('detection', frame.received_at)
             times.begin('waiting', frame.detected_at)
-        values = self._node.settings.snapshot()
+        parameters = self._node.settings.snapshot()
         self._node.check_active()
         localizer = self.localizer
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, values, deadline)
-        localized = localizer.localize(frame, values, state, times, deadline)
+        state = self._robot.at(image, parameters, deadline)
+        localized = localizer.localize(frame, parameters, state, times, deadline)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         self._node.check_active()

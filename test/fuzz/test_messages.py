@@ -23,15 +23,14 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.parameter_tables import RELOCALIZER
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 
 @pytest.fixture(scope='module')
 def values(tmp_path_factory):
     path = tmp_path_factory.mktemp('fuzz') / 'room.yaml'
     write_map(make_room(), path)
-    return {row.name: row.default for row in RELOCALIZER} | {
-        'map_file': str(path), 'matching': 'class'}
+    return RelocalizerParameters(map_file=str(path), matching='class')
 
 
 @pytest.fixture(scope='module')

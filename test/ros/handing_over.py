@@ -4,6 +4,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -13,9 +14,9 @@ from std_srvs.srv import Empty
 
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.outputs.handoff import HandOff
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
-VALUES = {'base_frame': 'base_link', 'max_speed_m_s': 0.1, 'max_turn_rad_s': 0.2,
-          'nomotion_updates': 10, 'require_localizer': True}
+PARAMETERS = RelocalizerParameters(base_frame='base_link')
 
 # Moments of odometry since the image [s].
 ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
@@ -62,7 +63,8 @@ class Robot:
     def hand_over(self, timeout_s=10.0, **changes):
         """Hand a pose over; return how long it took [s]."""
         start = time.monotonic()
-        self.handoff.hand_over(make_pose(), VALUES | changes, start + timeout_s, start)
+        self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
+                               start)
         return time.monotonic() - start
 
     def meet(self):

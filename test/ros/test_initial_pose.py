@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from handing_over import TEN_HZ, VALUES, make_pose, rest, tell
+from handing_over import PARAMETERS, TEN_HZ, make_pose, rest, tell
 
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.outputs.handoff import (
@@ -78,7 +78,7 @@ def test_updates_come_no_faster_than_scans(robot):
     robot.meet()
     robot.meet_service()
     assert 2.0 < robot.hand_over() < 6.0
-    assert len(robot.localizer.updates) == VALUES['nomotion_updates']
+    assert len(robot.localizer.updates) == PARAMETERS.nomotion_updates
 
 
 def test_updates_end_with_the_deadline_and_the_pose_is_delivered(robot):
@@ -113,7 +113,7 @@ def test_a_jump_between_search_and_hand_over_withholds_the_pose(robot):
     received_at = time.monotonic()
     robot.handoff.forget()
     with pytest.raises(TimeJumpError):
-        robot.handoff.hand_over(make_pose(), VALUES, received_at + 10.0, received_at)
+        robot.handoff.hand_over(make_pose(), PARAMETERS, received_at + 10.0, received_at)
     assert not robot.localizer.poses
 
 

@@ -26,6 +26,7 @@ from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
 from cliploc_ros.ros.node.diagnostics import StageTimes
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 ROOM = make_room()
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
@@ -49,7 +50,8 @@ def room(tmp_path):
 
 
 def load(map_file, keyframes_file='auto'):
-    return load_keyframes({'map_file': str(map_file), 'keyframes_file': str(keyframes_file)}, ROOM)
+    return load_keyframes(RelocalizerParameters(
+        map_file=str(map_file), keyframes_file=str(keyframes_file)), ROOM)
 
 
 def test_the_layer_next_to_the_map_or_a_named_one_is_read(room, tmp_path):

@@ -31,7 +31,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.parameter_tables import RELOCALIZER
+from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
 HEADER = Header(frame_id='camera')
@@ -75,10 +75,9 @@ def world(tmp_path_factory):
                        pretrained=str(ASSETS / 'clip.safetensors'))
     images = images_of(named, ClipEncoder(resolve_clip_weights(clip), clip))
     save_landmark_embeddings(embeddings_path(folder / 'map.yaml'), images)
-    values = {row.name: row.default for row in RELOCALIZER}
-    return values | {
-        'map_file': str(folder / 'map.yaml'), 'clip_model': clip.model, 'device': 'cpu',
-        'clip_pretrained': clip.pretrained, 'cache_dir': str(folder), 'time_budget_ms': 1e4}
+    return RelocalizerParameters(
+        map_file=str(folder / 'map.yaml'), clip_model=clip.model, device='cpu',
+        clip_pretrained=clip.pretrained, cache_dir=str(folder), time_budget_ms=1e4)
 
 
 @pytest.fixture(scope='module')
@@ -109,12 +108,12 @@ def finds(localizer, frame, values) -> bool:
 @pytest.mark.parametrize(('compare', 'accepted'), [('both', True), ('image', True),
                                                    ('text', False)])
 def test_images_tell_objects_apart(make_node, world, frame, compare, accepted):
-    values = world | {'landmark_embeddings': compare}
+    values = replace(world, landmark_embeddings=compare)
     assert finds(load_localizer(make_node(), values), frame, values) is accepted
 
 
 def test_reload_map_reads_the_images_again(make_node, world, frame, caplog):
-    file, node = embeddings_path(world['map_file']), make_node()
+    file, node = embeddings_path(world.map_file), make_node()
     content = file.read_bytes()
     localizer = load_localizer(node, world)
     assert finds(localizer, frame, world)

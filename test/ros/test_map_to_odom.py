@@ -3,6 +3,7 @@
 """map -> odom, and transforms before and after a jump; most of it with the real tf2_ros."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,10 +17,9 @@ from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransfo
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.outputs.map_to_odom import MapToOdom, transform_msg
-from cliploc_ros.ros.parameter_tables import RELOCALIZER, relocalizer_options
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
-VALUES = {row.name: row.default for row in RELOCALIZER} | {
-    'publish_tf': True, 'base_frame': 'base_link', 'tf_timeout_s': 5.0}
+PARAMETERS = RelocalizerParameters(publish_tf=True, base_frame='base_link', tf_timeout_s=5.0)
 QUARTER_LEFT = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
 MAP_FROM_BASE = transform_from_pose(np.array([5.0, 5.0, 0.0]), np.array(QUARTER_LEFT))
 
@@ -47,15 +47,15 @@ def test_a_transform_in_numbers():
 
 
 def test_a_robot_is_needed():
-    assert relocalizer_options(VALUES)
+    PARAMETERS.check()
     with pytest.raises(OptionsError, match='publish_tf: needs the parameter base_frame'):
-        relocalizer_options(VALUES | {'base_frame': ''})
+        replace(PARAMETERS, base_frame='').check()
 
 
 def test_closed_it_does_nothing(make_node):
     node = make_node()
     frame = MapToOdom(node, CoordinateFrames(node))
-    frame.update(Header(frame_id='map', stamp=STAMP), np.eye(4), VALUES, time.monotonic())
+    frame.update(Header(frame_id='map', stamp=STAMP), np.eye(4), PARAMETERS, time.monotonic())
     frame.forget()
     frame.close()
 
@@ -115,8 +115,8 @@ def robot(make_node, spin_until):
 def test_odom_is_tied_to_the_map(robot):
     robot.map_to_odom.open()
     robot.tell(100.0, 1.0)
-    robot.map_to_odom.update(Header(frame_id='map', stamp=STAMP), MAP_FROM_BASE, VALUES,
-                             time.monotonic())
+    robot.map_to_odom.update(Header(frame_id='map', stamp=STAMP), MAP_FROM_BASE,
+                             PARAMETERS, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     t = robot.heard[0].transform.translation
     # the same heading in both, so that odom lies a metre behind, along its own x
@@ -130,17 +130,17 @@ def test_a_jump_ends_the_broadcast_until_the_next_pose(robot):
     robot.tell(100.0, 1.0)
     received_at = time.monotonic()
     header = Header(frame_id='map', stamp=STAMP)
-    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, received_at)
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     robot.map_to_odom.forget()
     with pytest.raises(TimeJumpError):  # an image from before whose search ends after the jump
-        robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+        robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, received_at)
     robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods
     robot.spin_until(lambda: time.monotonic() > end, 'silence')
     assert not robot.heard
-    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, time.monotonic())
+    robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom again')
 
 
@@ -154,21 +154,21 @@ def test_odometry_that_restarts_ends_the_broadcast_until_the_next_pose(robot, re
     robot.tell_odometry(100.0, 1.0)
     received_at = time.monotonic()
     header = Header(frame_id='map', stamp=STAMP)
-    robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, received_at)
+    robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, received_at)
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     robot.tell_odometry(restart_s, x_m)
     # images from before: its search ends after the restart, or it arrives after it
     for at in (received_at, time.monotonic())[:1 if restart_s < 100.0 else 2]:
         with pytest.raises(TimeJumpError, match=r'^odometry restarted or time jumped since'):
-            robot.map_to_odom.update(header, MAP_FROM_BASE, VALUES, at)
+            robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, at)
     robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods
     robot.spin_until(lambda: time.monotonic() > end, 'silence')
     assert not robot.heard
     robot.tell(restart_s, 2.0)
-    robot.map_to_odom.update(Header(frame_id='map', stamp=stamp(restart_s)), MAP_FROM_BASE, VALUES,
-                             time.monotonic())
+    robot.map_to_odom.update(Header(frame_id='map', stamp=stamp(restart_s)), MAP_FROM_BASE,
+                             PARAMETERS, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom again')
     assert robot.heard[-1].transform.translation.x == pytest.approx(3.0)
 

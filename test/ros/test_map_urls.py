@@ -6,6 +6,7 @@ import pytest
 
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.map_parameters import map_files, path_of
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 
 @pytest.fixture
@@ -24,9 +25,9 @@ def test_paths_and_urls(prefix):
     assert path_of('maps/office.yaml') == 'maps/office.yaml'
     assert path_of('file:///maps/office.yaml') == '/maps/office.yaml'
     assert path_of('package://my_maps/a/office.yaml') == f'{share}/a/office.yaml'
-    assert map_files({'map_file': 'package://my_maps/b.yaml', 'map_files': ['']}) == [
+    assert map_files(RelocalizerParameters(map_file='package://my_maps/b.yaml')) == [
         f'{share}/b.yaml']
-    assert map_files({'map_file': '', 'map_files': ['a.yaml', 'package://my_maps/b.yaml']}) == [
+    assert map_files(RelocalizerParameters(map_files=['a.yaml', 'package://my_maps/b.yaml'])) == [
         'a.yaml', f'{share}/b.yaml']
 
 

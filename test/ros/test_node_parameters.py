@@ -2,38 +2,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of real nodes: given in files, changed at run time, refused."""
 
+from dataclasses import dataclass
+
 import pytest
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, yaml_defaults
-from cliploc_ros.ros.parameter_tables import DETECTOR, RELOCALIZER, relocalizer_options
-
-TABLE = (
-    ParameterRow('low', 1, 'Not above high.', low=0, high=100),
-    ParameterRow('high', 5, 'Not below low.', low=0, high=100),
-    ParameterRow('ratio', 0.5, 'A part.', low=0.0, high=1.0),
-    ParameterRow('mode', 'calm', 'How.', choices=('calm', 'wild'), read_only=True),
-    ParameterRow('span', [0.0, 1.0], 'From, to.', unit='m'),
-)
-DEFAULTS = {row.name: row.default for row in TABLE}
+from cliploc_ros.ros.node.parameters import NodeParameters, Parameters, parameter, yaml_defaults
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 
-def check(values):
-    if values['low'] > values['high']:
-        raise OptionsError('low: above high')
+@dataclass(frozen=True)
+class Probe(Parameters):
+    low: int = parameter(1, 'Not above high.', low=0, high=100)
+    high: int = parameter(5, 'Not below low.', low=0, high=100)
+    ratio: float = parameter(0.5, 'A part.', low=0.0, high=1.0)
+    mode: str = parameter('calm', 'How.', choices=('calm', 'wild'), read_only=True)
+    span: list[float] = parameter([0.0, 1.0], 'From, to.', unit='m')
+
+    def check(self):
+        if self.low > self.high:
+            raise OptionsError('low: above high')
 
 
 @pytest.fixture
 def declare(make_node, tmp_path):
     """Make a node with parameters from the text of a file; return it and its parameters."""
-    def run(text='', table=TABLE, check=check):
+    def run(text='', kind=Probe):
         path = tmp_path / 'parameters.yaml'
         path.write_text(text or '/**:\n  ros__parameters:\n    use_sim_time: false\n')
         node = make_node(cli_args=['--ros-args', '--params-file', str(path)],
                          automatically_declare_parameters_from_overrides=True)
-        return node, NodeParameters(node, table, check)
+        return node, NodeParameters(node, kind)
     return run
 
 
@@ -47,19 +48,17 @@ def set_values(node, **values):
         [Parameter(name, value=value) for name, value in values.items()])
 
 
-@pytest.mark.parametrize(('name', 'table', 'check'), [
-    ('detector', DETECTOR, lambda values: None),
-    ('relocalizer', RELOCALIZER, relocalizer_options)])
-def test_a_node_takes_the_generated_file(declare, name, table, check, capfd):
-    _, parameters = declare(yaml_defaults(name, table), table, check)
-    assert parameters.snapshot() == {row.name: row.default for row in table}
+@pytest.mark.parametrize('kind', [DetectorParameters, RelocalizerParameters])
+def test_a_node_takes_the_generated_file(declare, kind, capfd):
+    _, parameters = declare(yaml_defaults('any', kind.rows()), kind)
+    assert parameters.snapshot() == kind()
     assert 'unknown parameter' not in capfd.readouterr().err
 
 
 def test_without_a_file_all_is_at_its_default(declare):
     node, parameters = declare()
-    assert parameters.snapshot() == DEFAULTS
-    assert parameters['ratio'] == 0.5
+    assert parameters.snapshot() == Probe()
+    assert parameters.values.ratio == 0.5
     descriptor = node.describe_parameter('span')
     assert (descriptor.description, descriptor.read_only) == ('From, to. [m]', False)
     assert node.describe_parameter('mode').read_only
@@ -68,9 +67,8 @@ def test_without_a_file_all_is_at_its_default(declare):
 
 def test_given_values_are_taken_whole_numbers_too(declare):
     _, parameters = declare(given(low=2, ratio=1, mode='wild', span='[1, 2]'))
-    assert parameters.snapshot() == DEFAULTS | {
-        'low': 2, 'ratio': 1.0, 'mode': 'wild', 'span': [1.0, 2.0]}
-    assert type(parameters['ratio']) is float
+    assert parameters.snapshot() == Probe(low=2, ratio=1.0, mode='wild', span=[1.0, 2.0])
+    assert type(parameters.values.ratio) is float
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
@@ -99,7 +97,7 @@ def test_problems_are_reported_together_and_corrected_one_by_one(declare):
         parameters.snapshot()
     assert not set_values(node, ratio=3.0).successful
     assert set_values(node, ratio=0.25).successful
-    assert parameters.snapshot() == DEFAULTS | {'low': 3, 'ratio': 0.25}
+    assert parameters.snapshot() == Probe(low=3, ratio=0.25)
 
 
 def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
@@ -114,7 +112,7 @@ def test_changes_at_run_time(declare):
     node, parameters = declare()
     assert set_values(node, low=50, high=60).successful
     assert set_values(node, span=[2.0, 3.0]).successful
-    assert parameters.snapshot() == DEFAULTS | {'low': 50, 'high': 60, 'span': [2.0, 3.0]}
+    assert parameters.snapshot() == Probe(low=50, high=60, span=[2.0, 3.0])
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
@@ -128,7 +126,7 @@ def test_a_refused_change_changes_nothing(declare, values, reason):
     node, parameters = declare()
     answer = set_values(node, **values)
     assert not answer.successful and reason in answer.reason
-    assert parameters.snapshot() == DEFAULTS
+    assert parameters.snapshot() == Probe()
 
 
 def test_what_another_callback_refuses_has_no_effect(declare):

@@ -4,6 +4,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from cliploc_ros.core.geometry.transforms import make_transform, transform_from_
 from cliploc_ros.ros.conversions import pose_to_msg
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 BASE_FROM_CAMERA = transform_from_pose(np.array(OPTICAL[:3]), np.array(OPTICAL[3:]))
-VALUES = {'base_frame': 'base_link', 'base_from_camera': OPTICAL, 'tf_timeout_s': 0.0,
-          'gravity': 'none', 'fuse_frames': 5}
+PARAMETERS = RelocalizerParameters(base_frame='base_link', base_from_camera=OPTICAL,
+                                   tf_timeout_s=0.0)
 
 
 def stamp(seconds):
@@ -56,7 +58,8 @@ def talk(source, *seconds, **frames):
 
 
 def place(robot, seconds, **values):
-    return robot.at(Header(frame_id='camera', stamp=stamp(seconds)), VALUES | values).place
+    image = Header(frame_id='camera', stamp=stamp(seconds))
+    return robot.at(image, replace(PARAMETERS, **values)).place
 
 
 def test_the_camera_is_where_its_mount_has_it(robot, source):

@@ -11,12 +11,7 @@ from hypothesis import strategies as st
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.node.parameters import ParameterRow, markdown_table, yaml_defaults
-from cliploc_ros.ros.parameter_tables import (
-    DETECTOR,
-    RELOCALIZER,
-    parse_class_map,
-    relocalizer_options,
-)
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 TEXT = ParameterRow('text', 'a', 'Some text.')
 CHOICE = ParameterRow('choice', 'raw', 'One of two.', choices=('raw', 'compressed'))
@@ -27,8 +22,7 @@ POSITIVE = ParameterRow('positive', 1.0, 'Not below 0.', low=0.0)
 SWITCH = ParameterRow('switch', False, 'On or off.')
 MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
 
-TABLES = {'detector': DETECTOR, 'relocalizer': RELOCALIZER}
-RELOCALIZER_DEFAULTS = {row.name: row.default for row in RELOCALIZER}
+TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 
 
 @pytest.mark.parametrize(('row', 'value', 'validated'), [
@@ -172,38 +166,40 @@ def test_tables_are_sound(name):
 
 def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
     # offline a search may take its time; a request's answer is waited for
-    assert relocalizer_options(RELOCALIZER_DEFAULTS) == RelocalizerOptions(time_budget_s=0.05)
-    rows = {row.name: row for row in RELOCALIZER}
+    assert RelocalizerParameters().options() == RelocalizerOptions(time_budget_s=0.05)
+    rows = {row.name: row for row in RelocalizerParameters.rows()}
     for name in ('iterations', 'iou_threshold', 'min_inliers', 'k'):
         for end in (rows[name].low, rows[name].high):
             value = type(rows[name].default)(end)
-            options = relocalizer_options(RELOCALIZER_DEFAULTS | {name: value})
+            options = RelocalizerParameters(**{name: value}).options()
             assert getattr(options, name) == value
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'matching': 'class', 'algorithm': 'b-prosac'},
      "algorithm 'b-prosac' needs similarities"),
+    ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
+    ({'gravity': 'base_frame'}, 'needs the parameter base_frame'),
     ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera: .* not of unit length'),
     ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera: .* not of unit length')])
 def test_values_that_do_not_fit_together(changes, message):
     with pytest.raises(OptionsError, match=message):
-        relocalizer_options(RELOCALIZER_DEFAULTS | changes)
+        RelocalizerParameters(**changes).check()
 
 
 @pytest.mark.parametrize('mount', [[0.0] * 7, [1.0, 2.0, 3.0, 0.5, -0.5, 0.5, -0.5],
                                    [0.0] * 6 + [0.995]])
 def test_mounts_that_fit(mount):
-    relocalizer_options(RELOCALIZER_DEFAULTS | {'base_from_camera': mount})
+    RelocalizerParameters(base_from_camera=mount).check()
 
 
 def test_classes_get_the_maps_names():
-    assert parse_class_map(' tvmonitor=tv , potted plant = plant,') == {
-        'tvmonitor': 'tv', 'potted plant': 'plant'}
-    assert parse_class_map('') == {}
+    given = RelocalizerParameters(class_map=' tvmonitor=tv , potted plant = plant,')
+    assert given.class_names() == {'tvmonitor': 'tv', 'potted plant': 'plant'}
+    assert RelocalizerParameters().class_names() == {}
 
 
 @pytest.mark.parametrize('text', ['tv', 'tv=', '=tv', 'a=b, a=c'])
 def test_a_class_map_that_is_none_is_refused(text):
     with pytest.raises(OptionsError, match='class_map'):
-        relocalizer_options(RELOCALIZER_DEFAULTS | {'class_map': text})
+        RelocalizerParameters(class_map=text).check()

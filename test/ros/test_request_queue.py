@@ -15,6 +15,7 @@ import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
@@ -26,15 +27,21 @@ from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameter_tables import RELOCALIZER
+from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Requests
+
+
+def set_values(node, **values):
+    answer = node.set_parameters_atomically(
+        [Parameter(name, value=value) for name, value in values.items()])
+    assert answer.successful, answer.reason
 
 
 class Answering(ManagedNode):
     """A managed node whose map is what `loads` returns and whose frames `localize` answers."""
 
     def __init__(self):
-        super().__init__('answering', RELOCALIZER, lambda values: None)
+        super().__init__('answering', RelocalizerParameters)
         self.loads = lambda: 'nothing'
         self.localize = lambda frame: Answer(Verdict.REFUSED, 'nothing known',
                                              received_at=frame.received_at)
@@ -140,7 +147,7 @@ def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
 
 
 def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, clients, wait):
-    node.settings._values = node.settings._values | {'timeout_s': 0.6}
+    set_values(node, timeout_s=0.6)
     release = threading.Event()
     node.localize = lambda frame: release.wait(10.0)
     start = time.monotonic()
@@ -174,7 +181,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
     boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
     wait(request.done, 'the answer')
     assert request.result().message == 'refused: nothing known'
-    node.settings._values = node.settings._values | {'timeout_s': 3.0}
+    set_values(node, timeout_s=3.0)
     request = clients.submit(node.requests.answer)
     for number in range(13, 27):
         take(number)
@@ -191,7 +198,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
      'timeout_s')])
 def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clients, wait, kind,
                                                              advice):
-    node.settings._values = node.settings._values | {'timeout_s': 0.6}
+    set_values(node, timeout_s=0.6)
     node.robot.is_linked_soon = lambda stamp, deadline: True
     node.localize = lambda frame: Answer(
         Verdict.REFUSED, 'turn the camera', received_at=frame.received_at, kind=kind,
@@ -204,7 +211,7 @@ def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clien
 
 
 def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
-    node.settings._values = node.settings._values | {'timeout_s': 0.3}
+    set_values(node, timeout_s=0.3)
     start = time.monotonic()
     requests = [clients.submit(node.requests.answer) for _ in range(4)]
     wait(lambda: all(request.done() for request in requests), 'the answers')
@@ -227,8 +234,7 @@ class LateTransforms:
 
 @pytest.mark.parametrize('late_s', [1.2, 60.0])
 def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
-    values = {'base_frame': 'base_link', 'timeout_s': 4.0, 'tf_timeout_s': 0.0}
-    node.settings._values = node.settings._values | values
+    set_values(node, base_frame='base_link', timeout_s=4.0, tf_timeout_s=0.0)
     node.robot.transforms._buffer = LateTransforms(late_s)
     node.localize = lambda frame: Answer(
         Verdict.REFUSED, 'seen', received_at=frame.received_at,
@@ -245,7 +251,7 @@ def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
 
 
 def test_an_answer_keeps_to_the_time_out_while_the_map_loads(node, clients, wait):
-    node.settings._values = node.settings._values | {'timeout_s': 0.3}
+    set_values(node, timeout_s=0.3)
     release = threading.Event()
     wait(lambda: node.active, 'the node to be active')
     node.loads = lambda: str(release.wait(10.0))
@@ -271,7 +277,7 @@ def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wai
     assert sum('[ERROR]' in line and 'office.yaml' in line
                for line in capfd.readouterr().err.splitlines()) == 1
     node.loads = lambda: 'a map'
-    node.settings._values = node.settings._values | {'timeout_s': 0.2}
+    set_values(node, timeout_s=0.2)
     assert 'no fresh frame' in node.requests.answer().message
 
 

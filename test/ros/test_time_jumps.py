@@ -21,6 +21,7 @@ from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 from cliploc_ros.ros.inputs.time_jumps import StampOrder, TimeJumpError, TimeJumps
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 S = 1_000_000_000
 
@@ -132,7 +133,7 @@ def test_closed_it_watches_no_longer(simulation, jumps):
     assert not jumps.forgot
 
 
-VALUES = {'base_frame': 'base_link', 'tf_timeout_s': 0.0, 'gravity': 'imu'}
+PARAMETERS = RelocalizerParameters(base_frame='base_link', tf_timeout_s=0.0, gravity='imu')
 
 
 class Inputs:
@@ -187,7 +188,7 @@ class Inputs:
         return self.odometry.pose_at(stamp(stamp_s)).run
 
     def up(self, stamp_s):
-        return self.vertical.up_in_camera(VALUES, np.eye(4), 'camera', stamp(stamp_s))
+        return self.vertical.up_in_camera(PARAMETERS, np.eye(4), 'camera', stamp(stamp_s))
 
     def is_known(self, stamp_s):
         try:

@@ -14,6 +14,7 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource, sample_from_msg
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 CAMERA_FROM_BASE = np.linalg.inv(transform_from_pose(np.array(OPTICAL[:3]),
@@ -31,8 +32,8 @@ def imu(acceleration=(0.0, 0.0, 9.81), quat_xyzw=None, frame_id='base_link', sec
                linear_acceleration=Vector3(**dict(zip('xyz', acceleration, strict=True))))
 
 
-def values(gravity='imu', base_frame='base_link'):
-    return {'gravity': gravity, 'base_frame': base_frame, 'tf_timeout_s': 0.0}
+def parameters(gravity='imu', base_frame='base_link'):
+    return RelocalizerParameters(gravity=gravity, base_frame=base_frame, tf_timeout_s=0.0)
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def source(make_node):
 
 
 def up(source, **changes):
-    return source.up_in_camera(values(**changes), CAMERA_FROM_BASE, 'camera', AT)
+    return source.up_in_camera(parameters(**changes), CAMERA_FROM_BASE, 'camera', AT)
 
 
 def test_nobody_asks_for_it(source):

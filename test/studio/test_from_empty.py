@@ -31,7 +31,6 @@ from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.yolo_detector import YoloOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
-from cliploc_ros.ros.parameter_tables import relocalizer_options
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import open_images, views_of_folder
@@ -156,7 +155,7 @@ def wake_ups(maps):
         queries = make_queries_of(recorded, landmark_map,
                                   embed_map(clip, landmark_map, [], 'text'))
         found[name], = summarize(run_methods(
-            landmark_map, [Method(options.method, relocalizer_options(options.values))],
+            landmark_map, [Method(options.method, options.values.options())],
             make_queries(queries, landmark_map), trials=1))
     return found
 

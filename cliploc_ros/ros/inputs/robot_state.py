@@ -4,9 +4,7 @@
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -19,6 +17,7 @@ from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
 _RETRY_S = 0.02
@@ -52,7 +51,7 @@ class RobotState:
 class RobotStateSource:
     """Gathers the mount, the vertical and odometry while the node is active."""
 
-    def __init__(self, node: ManagedNode) -> None:
+    def __init__(self, node: ManagedNode[RelocalizerParameters]) -> None:
         self._node = node
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
@@ -61,11 +60,12 @@ class RobotStateSource:
 
     def open(self) -> None:
         """Subscribe to what the parameters ask for."""
-        values = self._node.settings
-        if values['publish_tf'] or (values['base_frame'] and not any(values['base_from_camera'])):
+        parameters = self._node.settings.values
+        if parameters.publish_tf or (parameters.base_frame
+                                     and not any(parameters.base_from_camera)):
             # in the worker, for importing tf2 takes a while
             self._node.worker.run(self.transforms.open)
-        self._vertical.open(values['gravity'])
+        self._vertical.open(parameters.gravity)
         self.odometry.open()
 
     def close(self) -> None:
@@ -86,10 +86,10 @@ class RobotStateSource:
         Waits for odometry that has just begun, until `deadline` (monotonic clock) [s].
         """
         patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
-        return (self._node.settings['fuse_frames'] > 1
+        return (self._node.settings.values.fuse_frames > 1
                 and self.odometry.covers_soon(stamp, patience_s))
 
-    def at(self, image: Header, values: Mapping[str, Any], deadline: float = math.inf
+    def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf
            ) -> RobotState:
         """Return the robot's state at the stamp of an image.
 
@@ -103,49 +103,49 @@ class RobotStateSource:
         NoTransformError
             The mount is not known.
         """
-        camera_from_base = self._mount(image, values, deadline)
+        camera_from_base = self._mount(image, parameters, deadline)
         up_in_camera = None
         try:
-            up_in_camera = self._vertical.up_in_camera(values, camera_from_base, image.frame_id,
-                                                       image.stamp)
+            up_in_camera = self._vertical.up_in_camera(parameters, camera_from_base,
+                                                       image.frame_id, image.stamp)
         except (NoVerticalError, NoTransformError) as error:
             self._warn(f'localizing without the vertical: {error}')
         return RobotState(camera_from_base, up_in_camera,
-                          self._place(image, values, camera_from_base))
+                          self._place(image, parameters, camera_from_base))
 
-    def _mount(self, image: Header, values: Mapping[str, Any], deadline: float
+    def _mount(self, image: Header, parameters: RelocalizerParameters, deadline: float
                ) -> NDArray[np.float64]:
         now = time.monotonic()
-        slice_s: float = values['tf_timeout_s']
+        slice_s = parameters.tf_timeout_s
         until = now + slice_s if math.isinf(deadline) else 0.5 * (now + deadline)
         while True:
             wait_s = min(slice_s, max(0.0, until - time.monotonic()))
             try:
                 return self.transforms.camera_from_base(
-                    values['base_frame'], values['base_from_camera'], image.frame_id, image.stamp,
-                    wait_s)
+                    parameters.base_frame, parameters.base_from_camera, image.frame_id,
+                    image.stamp, wait_s)
             except NoTransformError:
                 if time.monotonic() + _RETRY_S > until:
                     raise
                 self._node.check_active()
                 time.sleep(_RETRY_S)
 
-    def _place(self, image: Header, values: Mapping[str, Any],
+    def _place(self, image: Header, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
-        if values['fuse_frames'] == 1:
+        if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
             if body.body_frame == image.frame_id:
                 return CameraPlace(body.odom_from_body, body.run, body.way_m)
             camera_from_body = camera_from_base
-            if body.body_frame != values['base_frame']:
+            if body.body_frame != parameters.base_frame:
                 # do not wait again for a transform that tf2 did not know the last time
                 is_new = self._unmounted != body.body_frame
                 self._unmounted = body.body_frame
                 camera_from_body = self.transforms.lookup(
                     image.frame_id, body.body_frame, image.stamp,
-                    values['tf_timeout_s'] if is_new else 0.0)
+                    parameters.tf_timeout_s if is_new else 0.0)
                 self._unmounted = ''
         except NoOdometryError as error:
             self._node.get_logger().debug(f'one frame alone: {error}')

@@ -4,8 +4,8 @@
 
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -20,8 +20,8 @@ from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import StampOrder
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
-SOURCES = ('none', 'base_frame', 'imu')
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDARD_GRAVITY = 9.80665
 # An acceleration further from gravity than this is one of a moving IMU (a guess) [m/s^2].
@@ -125,8 +125,9 @@ class VerticalSource:
             self._samples.append(sample)
             self._imu_frame = msg.header.frame_id
 
-    def up_in_camera(self, values: Mapping[str, Any], camera_from_base: NDArray[np.float64],
-                     camera_frame: str, stamp: Time) -> NDArray[np.float64] | None:
+    def up_in_camera(self, parameters: RelocalizerParameters,
+                     camera_from_base: NDArray[np.float64], camera_frame: str, stamp: Time
+                     ) -> NDArray[np.float64] | None:
         """Return the vertical (3,), a unit vector in the camera's optical coordinate frame.
 
         None where gravity is 'none'. `camera_frame` and `stamp` are those of the image.
@@ -138,16 +139,16 @@ class VerticalSource:
         NoTransformError
             The IMU's mount is unknown.
         """
-        if values['gravity'] == 'none':
+        if parameters.gravity == 'none':
             return None
-        if values['gravity'] == 'base_frame':
+        if parameters.gravity == 'base_frame':
             return np.asarray(camera_from_base[:3, :3] @ _UP)
         up_in_imu, imu_frame = self._up_in_imu(stamp_ns(stamp))
         if imu_frame == camera_frame:
             return up_in_imu
-        camera_from_imu = camera_from_base if imu_frame == values['base_frame'] else \
+        camera_from_imu = camera_from_base if imu_frame == parameters.base_frame else \
             self._transforms.camera_from_base(imu_frame, [], camera_frame, stamp,
-                                              values['tf_timeout_s'])
+                                              parameters.tf_timeout_s)
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
     def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:

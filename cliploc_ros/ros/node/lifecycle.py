@@ -8,7 +8,7 @@ import threading
 import time
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
@@ -24,7 +24,7 @@ from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.executor import BoundedCallbackGroup
-from cliploc_ros.ros.node.parameters import NodeParameters, ParameterRow, Value
+from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
 from cliploc_ros.ros.node.worker import Worker
 from cliploc_ros.units import NS_PER_S
 
@@ -91,7 +91,7 @@ class NotActiveError(CliplocError):
     """The node is not active; the message names its state and the remedy."""
 
 
-class ManagedNode(LifecycleNodeMixin, Node):
+class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
     """A lifecycle node whose networks run in a worker beside its executor.
 
     The node brings itself up, and retries when that fails, until a client changes its state:
@@ -101,17 +101,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
     ----------
     name : str
         Name of the node. Parameters given at start-up are declared as they come.
-    table : iterable of ParameterRow
-        Its parameters, `autostart` among them.
-    check : callable
-        Takes all values by name; raises OptionsError where they do not fit together.
-    others : iterable of ParameterRow
-        Of the nodes that may be given the same file.
+    parameters : type
+        Its parameters.
+    others : type, optional
+        Parameters of the nodes that may be given the same file.
     """
 
-    def __init__(self, name: str, table: Iterable[ParameterRow],
-                 check: Callable[[Mapping[str, Value]], object],
-                 others: Iterable[ParameterRow] = ()) -> None:
+    def __init__(self, name: str, parameters: type[P],
+                 others: type[Parameters] = Parameters) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         LifecycleNodeMixin.__init__(
             self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
@@ -119,7 +116,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         _PACKAGE_LOGGER.setLevel(logging.INFO)
         _PACKAGE_LOGGER.addHandler(self._log_handler)
         self.worker = Worker(self.report)
-        self.settings = NodeParameters(self, table, check, others)
+        self.settings = NodeParameters(self, parameters, others)
         self.active = False
         self._transition = threading.Lock()
         self._failure = ''
@@ -127,7 +124,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._answer_impossible_transitions()
         self.stages = Stages()
         self.diagnostics = Diagnostics(self, self._health, lambda: self.state)
-        self._self_managed: bool = self.settings['autostart']
+        self._self_managed = self.settings.values.autostart
         self._starting = ThreadPoolExecutor(1, 'start')
         self._start: Future[None] | None = None
         self._start_lock = threading.Lock()

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters declared once: each row of a table is declaration, validation and documentation.
+"""Parameters declared once: each field of a dataclass is declaration, validation, documentation.
 
 generate_parameter_library does the same at build time, but has no package outside of apt.
 """
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -111,8 +111,36 @@ class ParameterRow:
         return value
 
 
-class NodeParameters:
-    """The parameters of one node: declared from its table, validated at every change.
+def parameter(default: Value, description: str, unit: str = '', low: float = -math.inf,
+              high: float = math.inf, choices: tuple[str, ...] = (), read_only: bool = False
+              ) -> Any:
+    """Return the field of a parameter in a subclass of Parameters; see ParameterRow."""
+    row = ParameterRow('', default, description, unit, low, high, choices, read_only)
+    if isinstance(default, list):
+        return field(default_factory=default.copy, metadata={'row': row})
+    return field(default=default, metadata={'row': row})
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The values of a node's parameters; a subclass has a field for each, made by `parameter`."""
+
+    autostart: bool = parameter(
+        True, 'Configure and activate at start-up; false: wait for a lifecycle manager.',
+        read_only=True)
+
+    @classmethod
+    def rows(cls) -> tuple[ParameterRow, ...]:
+        """Return what is declared of each, its own first, then those that it inherits."""
+        own_first = sorted(fields(cls), key=lambda one: one.name not in cls.__annotations__)
+        return tuple(replace(one.metadata['row'], name=one.name) for one in own_first)
+
+    def check(self) -> None:
+        """Raise OptionsError where values do not fit together."""
+
+
+class NodeParameters[P: Parameters]:
+    """The parameters of one node: declared from a dataclass, validated at every change.
 
     An invalid value in a parameter file does not end the node: snapshot() raises it until the
     value is corrected.
@@ -121,34 +149,25 @@ class NodeParameters:
     ----------
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
-    check : callable
-        Takes all values by name; raises OptionsError where they do not fit together.
-    others : iterable of ParameterRow
-        Of the nodes that may be given the same file.
+    others : type, optional
+        Parameters of the nodes that may be given the same file.
     """
 
-    def __init__(self, node: Node, table: Iterable[ParameterRow],
-                 check: Callable[[Mapping[str, Value]], object],
-                 others: Iterable[ParameterRow] = ()) -> None:
+    def __init__(self, node: Node, kind: type[P], others: type[Parameters] = Parameters) -> None:
         self._node = node
-        self._rows = {row.name: row for row in table}
-        self._check = check
+        self._rows = {row.name: row for row in kind.rows()}
         self._problems: dict[str, str] = {}
         for row in self._rows.values():
             self._declare(row)
-        self._report_unknown({row.name for row in others})
-        # Replaced as a whole: a reader sees all of a change or none of it.
-        self._values: dict[str, Value] = {
-            name: node.get_parameter(name).value for name in self._rows}
+        self._report_unknown({row.name for row in others.rows()})
+        #: The values, which may not fit together. Replaced as a whole: a reader sees all of a
+        #: change or none of it.
+        self.values: P = kind(**{name: node.get_parameter(name).value for name in self._rows})
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._take)
 
-    def __getitem__(self, name: str) -> Any:
-        """Return a parameter's value."""
-        return self._values[name]
-
-    def snapshot(self) -> dict[str, Value]:
-        """Return all values, by name.
+    def snapshot(self) -> P:
+        """Return the values.
 
         Raises
         ------
@@ -157,9 +176,9 @@ class NodeParameters:
         """
         if self._problems:
             raise OptionsError('parameter ' + '; '.join(self._problems.values()))
-        values = self._values
-        self._check(values)
-        return dict(values)
+        values = self.values
+        values.check()
+        return values
 
     def _declare(self, row: ParameterRow) -> None:
         """Declare one parameter with its value from the command line or file, or its default."""
@@ -193,7 +212,7 @@ class NodeParameters:
                     raise OptionsError(f'{parameter.name}: the map is read at start-up')
             changed = self._validated(parameters)
             if not self._problems.keys() - changed.keys():
-                self._check(self._values | changed)
+                replace(self.values, **changed).check()
         except OptionsError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -201,11 +220,11 @@ class NodeParameters:
     def _take(self, parameters: list[Parameter]) -> None:
         """Use a change that every callback allowed."""
         changed = self._validated(parameters)
-        self._values = self._values | changed
+        self.values = replace(self.values, **changed)
         self._problems = {name: text for name, text in self._problems.items()
                           if name not in changed}
 
-    def _validated(self, parameters: list[Parameter]) -> dict[str, Value]:
+    def _validated(self, parameters: list[Parameter]) -> dict[str, Any]:
         """Return the values of the parameters that the table declares, by name."""
         return {parameter.name: self._rows[parameter.name].validated(parameter.value)
                 for parameter in parameters if parameter.name in self._rows}
@@ -225,7 +244,7 @@ def yaml_defaults(node_name: str, table: Iterable[ParameterRow]) -> str:
     lines = ['# SPDX-FileCopyrightText: 2026 the cliploc_ros authors',
              '# SPDX-License-Identifier: Apache-2.0',
              f'# Every parameter of the {node_name} node at its default.',
-             '# Written by script/document from cliploc_ros/ros/parameter_tables.py: '
+             '# Written by script/document from cliploc_ros/ros/parameters.py: '
              'copy it to change it.',
              '/**:',
              '  ros__parameters:']

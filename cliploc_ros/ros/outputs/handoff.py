@@ -10,9 +10,7 @@ shows tells whether it has taken one.
 import math
 import threading
 import time
-from collections.abc import Mapping
 from copy import deepcopy
-from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time as Stamp
@@ -32,6 +30,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
 # degree. AMCL draws its particles from x, y and yaw; without any scatter they would all be one.
@@ -117,7 +116,7 @@ class HandOff:
                     'the topic of its pose by localizer_pose')
         return ''
 
-    def hand_over(self, pose: PoseWithCovarianceStamped, values: Mapping[str, Any],
+    def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float) -> None:
         """Publish a pose on `initialpose` until the localizer shows it, and let it settle.
 
@@ -127,8 +126,6 @@ class HandOff:
         ----------
         pose : PoseWithCovarianceStamped
             Accepted, in the map's coordinate frame, with the image's stamp.
-        values : mapping
-            The relocalizer's parameters.
         deadline, received_at : float
             When to return at the latest, and when the image arrived (monotonic clock) [s]. A
             hand-over that need not wait is made after the deadline, too.
@@ -142,18 +139,18 @@ class HandOff:
         TimeJumpError
             Time has jumped back since.
         """
-        if not values['base_frame']:
+        if not parameters.base_frame:
             self._node.get_logger().warning(
                 "initialpose carries the camera's pose: base_frame is empty; for AMCL set it to "
                 "AMCL's base_frame_id", once=True)
-        if values['require_localizer']:
+        if parameters.require_localizer:
             self._wait_for_localizer(deadline)
-        must_show = values['require_localizer'] and self._subscription is not None
+        must_show = parameters.require_localizer and self._subscription is not None
         given, times, begun_at = pose, 0, time.monotonic()
         while not times or (must_show and not self._shows(given, deadline)):
             if must_show and _left_s(deadline) < _LEAST_S:
                 raise NoLocalizerError(self._not_taken(given, times, begun_at))
-            self._check_rest(values['max_speed_m_s'], values['max_turn_rad_s'], deadline)
+            self._check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             self._check_place(pose.header.stamp, deadline)
             if self._jumped_at >= received_at:
                 raise TimeJumpError('time jumped back before the hand-over: the pose is from '
@@ -163,7 +160,7 @@ class HandOff:
             given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
             self._shown = None
             self._publisher.publish(given)
-        self._settle(values['nomotion_updates'], deadline)
+        self._settle(parameters.nomotion_updates, deadline)
         if must_show and not is_taken(given, self._shown):
             raise NoLocalizerError(self._not_taken(given, times, begun_at))
 

@@ -5,7 +5,6 @@
 import math
 import threading
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from std_msgs.msg import Header
 from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Between broadcasts. Each is dated ahead to the next one, so that a lookup at now need not wait.
 _PERIOD_S = 0.1
@@ -78,8 +78,8 @@ class MapToOdom:
             self._transform, self._jumped_at = None, time.monotonic()
             self._began_ns = began_ns
 
-    def update(self, header: Header, map_from_base: NDArray[np.float64], values: Mapping[str, Any],
-               received_at: float) -> None:
+    def update(self, header: Header, map_from_base: NDArray[np.float64],
+               parameters: RelocalizerParameters, received_at: float) -> None:
         """Take in where the robot was; does nothing while closed.
 
         The header has the stamp of the image and the coordinate frame of the map; the image
@@ -94,10 +94,10 @@ class MapToOdom:
         """
         if self._timer is None:
             return
-        base_from_odom = self._transforms.lookup(values['base_frame'], values['odom_frame'],
-                                                 header.stamp, values['tf_timeout_s'],
+        base_from_odom = self._transforms.lookup(parameters.base_frame, parameters.odom_frame,
+                                                 header.stamp, parameters.tf_timeout_s,
                                                  'correct odom_frame')
-        transform = transform_msg(header, values['odom_frame'], map_from_base @ base_from_odom)
+        transform = transform_msg(header, parameters.odom_frame, map_from_base @ base_from_odom)
         with self._lock:
             if received_at <= self._jumped_at or stamp_ns(header.stamp) < self._began_ns:
                 raise TimeJumpError('odometry restarted or time jumped since the image: the pose '

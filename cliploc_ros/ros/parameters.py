@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of the two nodes, and the method's options made from them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from cliploc_ros.core.fit.rig import MAX_FRAMES
+from cliploc_ros.core.options import (
+    ALGORITHMS,
+    COMPARED,
+    CROPS,
+    MATCHINGS,
+    RelocalizerOptions,
+)
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.models.devices import INFERENCES
+from cliploc_ros.models.profiles import PROFILE_NAMES
+from cliploc_ros.ros.conversions import DETECTION_TYPES
+from cliploc_ros.ros.node.parameters import Parameters, parameter
+
+TRANSPORTS = ('raw', 'compressed')
+MODES = ('on_request', 'continuous')
+VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
+
+# Of timeout_s, for algorithms other than auto.
+_SEARCH_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class CommonParameters(Parameters):
+    """Parameters that both nodes have."""
+
+    device: str = parameter('auto',
+        "Where the network runs: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.",
+        read_only=True)
+    inference: str = parameter('auto',
+        "What runs the network: 'auto' (OpenVINO on a CPU where it is installed, else "
+        "PyTorch), 'pytorch' or 'openvino'.", choices=INFERENCES, read_only=True)
+    cache_dir: str = parameter('',
+        'Folder of downloads, label embeddings, converted networks and compiled kernels; '
+        'empty: ~/.cache/cliploc_ros.', read_only=True)
+    image_transport: str = parameter('raw',
+        "Subscribe to 'image' or to 'image/compressed'.", choices=TRANSPORTS, read_only=True)
+    stale_after_s: float = parameter(2.0,
+        'The diagnostics warn of an input that is silent for longer.', unit='s', low=0.1,
+        high=3600.0)
+
+
+@dataclass(frozen=True)
+class DetectorParameters(CommonParameters):
+    """The parameters of the detector."""
+
+    profile: str = parameter('auto',
+        "Detector of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
+        'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
+    model: str = parameter('',
+        'Weights: a local file, a folder with an OpenVINO export, or a name that ultralytics '
+        "downloads once; empty: the profile's.", read_only=True)
+    conf: float = parameter(0.1, 'Drop detections below this confidence.', low=0.0, high=1.0)
+    iou: float = parameter(0.7,
+        'Drop the weaker of two boxes of one class that overlap more.', low=0.0, high=1.0)
+    imgsz: int = parameter(640,
+        'Longer side of the image as the network sees it.', unit='px', low=32, high=4096)
+    max_det: int = parameter(100,
+        'Publish only the most confident detections, this many.', low=1, high=1000)
+
+
+@dataclass(frozen=True)
+class RelocalizerParameters(CommonParameters):
+    """The parameters of the relocalizer."""
+
+    map_file: str = parameter('',
+        'Map file, read when the node is configured and by reload_map: a path, or '
+        "package://PACKAGE/PATH in a package's share folder; empty: map_files, or the "
+        "parameters below 'map', hold the map.")
+    map_files: list[str] = parameter([''],
+        'Map files of floors and buildings instead of map_file: a request searches all of '
+        'them. Each has a frame_id of its own, which names the map in answers and poses.')
+    keyframes_file: str = parameter('auto',
+        "Layer of keyframes of the map, read with it: a file, or 'auto': NAME.keyframes.npz "
+        'next to map_file NAME.yaml, where there is one; empty: none.')
+    mode: str = parameter('on_request',
+        'Localize on request, or with every frame.', choices=MODES, read_only=True)
+    timeout_s: float = parameter(10.0,
+        'A request is answered within this time.', unit='s', low=0.1, high=3600.0)
+    matching: str = parameter('hybrid',
+        'Correspondence candidates: equal classes, similarity by CLIP, or CLIP with classes '
+        'for verification.', choices=MATCHINGS, read_only=True)
+    algorithm: str = parameter('auto',
+        'How minimal samples are chosen: auto tries all compatible ones, the likeliest first; '
+        "bf tries all; the others are the paper's.", choices=ALGORITHMS)
+    k: int = parameter(3, 'Landmarks retrieved for each crop.', low=1, high=1000)
+    iterations: int = parameter(10_000,
+        'Try at most this many minimal samples per frame.', low=1, high=1_000_000)
+    iou_threshold: float = parameter(0.2,
+        'IoU above which a detection matches a landmark.', low=0.0, high=1.0)
+    random_seed: int = parameter(0, 'Equal seeds repeat results; below 0, every search differs.')
+    time_budget_ms: float = parameter(50.0,
+        'Limit of search and refinement with auto. The other algorithms have half of '
+        'timeout_s; a search that is cut short is refused.', unit='ms', low=1.0, high=3.6e6)
+    gravity: str = parameter('none',
+        'Source of the vertical: base_frame (the robot stands upright) or the topic imu. auto '
+        'then needs two objects instead of three.', choices=VERTICAL_SOURCES, read_only=True)
+    tilt_deviation_deg: float = parameter(40.0,
+        'Standard deviation of the tilt of the camera off upright, where no vertical is known; '
+        "0: any tilt is as likely, as where the map's z axis is not up.", unit='deg', low=0.0,
+        high=60.0)
+    vertical_deviation_deg: float = parameter(1.0,
+        'Standard deviation of that vertical.', unit='deg', low=0.01, high=45.0)
+    height_range_m: list[float] = parameter([0.0, 0.0],
+        'Least and greatest height of the camera in the map; equal values: any height.', unit='m')
+    max_tilt_deg: float = parameter(180.0,
+        'Greatest tilt of the camera off upright; 180: any.', unit='deg', low=0.0, high=180.0)
+    refine: bool = parameter(True,
+        'Refine the best poses on all of their inliers; the paper does not.')
+    min_inliers: int = parameter(3, 'Refuse a pose with fewer inliers.', low=3, high=1000)
+    min_confidence: float = parameter(0.9,
+        'Refuse a pose that is less likely to be within 1 m of the truth.', low=0.0, high=1.0)
+    fuse_frames: int = parameter(5,
+        'Localize with up to this many frames together where odom links them; 1: each frame '
+        'alone.', low=1, high=MAX_FRAMES)
+    fuse_window_s: float = parameter(5.0,
+        'Drop frames older than this from fusion.', unit='s', low=0.1, high=60.0)
+    detections_type: str = parameter('vision_msgs',
+        'Package of the type of detections: vision_msgs/Detection2DArray or '
+        'yolo_msgs/DetectionArray (yolo_ros).', choices=DETECTION_TYPES, read_only=True)
+    class_map: str = parameter('',
+        "The map's names for another detector's classes, such as 'tvmonitor=tv, "
+        "pottedplant=potted plant'.")
+    crops: str = parameter('on_demand',
+        'Crops that CLIP sees: all, or on demand: the most informative first, until the pose '
+        'is accepted. matching hybrid with algorithm auto only; else all.', choices=CROPS)
+    max_detections: int = parameter(50,
+        'Use only the most confident detections, this many.', low=3, high=1000)
+    profile: str = parameter('auto',
+        "Encoder of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
+        'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
+    clip_model: str = parameter('',
+        "Architecture: an open_clip name, or a model config (.json); empty: the profile's.",
+        read_only=True)
+    clip_pretrained: str = parameter('',
+        "Weights: a tag of open_clip, or a local file; empty: the profile's, or openai with a "
+        'clip_model.', read_only=True)
+    clip_checkpoint_path: str = parameter('',
+        'Local file with the weights of that tag; empty: download them once.', read_only=True)
+    landmark_embeddings: str = parameter('image',
+        "What crops are compared with: the map's labels ('text'), the images next to map_file "
+        "('image'), or both. Without images of this CLIP: labels.", choices=COMPARED,
+        read_only=True)
+    record_folder: str = parameter('',
+        'Folder where ~/record stores the last request; empty: keep no frames.', read_only=True)
+    record_limit_mb: int = parameter(1000,
+        'Record nothing more once that folder holds this much.', unit='MiB', low=1,
+        high=1_000_000)
+    rectified: bool = parameter(False,
+        'The image is rectified: use P of camera_info and no distortion.')
+    base_frame: str = parameter('', 'Coordinate frame to publish the pose of; empty: the camera.')
+    base_from_camera: list[float] = parameter([0.0] * 7,
+        'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w; all zeros: '
+        'ask tf2.', unit='m')
+    max_speed_m_s: float = parameter(0.1,
+        'Withhold initialpose while odom shows a faster robot.', unit='m/s', low=0.0, high=100.0)
+    max_turn_rad_s: float = parameter(0.2,
+        'Withhold initialpose while odom shows a faster turn.', unit='rad/s', low=0.0, high=100.0)
+    nomotion_updates: int = parameter(10,
+        'Call request_nomotion_update this often after initialpose, where it is served, so '
+        "that AMCL's particles converge.", low=0, high=100)
+    require_localizer: bool = parameter(True,
+        'A request succeeds only if a localizer such as AMCL takes its pose; false: without '
+        'one, for ~/pose or publish_tf.')
+    localizer_pose: str = parameter('amcl_pose',
+        'Topic where the localizer shows its pose: it has to agree with the one on '
+        'initialpose. Empty: any subscriber of initialpose will do.', read_only=True)
+    publish_tf: bool = parameter(False,
+        'Broadcast map -> odom_frame (REP 105) after an accepted pose; only where no other '
+        'localizer does.', read_only=True)
+    odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
+    tf_timeout_s: float = parameter(0.5,
+        "Wait this long for a transform at the image's stamp. A request waits for the camera's "
+        'mount on base_frame until timeout_s.', unit='s', low=0.0, high=60.0)
+
+    def check(self) -> None:
+        """Raise OptionsError where values do not fit together; the message names the parameter."""
+        mount = self.base_from_camera
+        if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
+            raise OptionsError(
+                f'base_from_camera: the quaternion {mount[3:]} is not of unit length')
+        if self.gravity == 'base_frame' and not self.base_frame:
+            raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
+        if self.publish_tf and not self.base_frame:
+            raise OptionsError('publish_tf: needs the parameter base_frame')
+        self.class_names()
+        self.options()
+
+    def options(self) -> RelocalizerOptions:
+        """Return the method's options.
+
+        Raises
+        ------
+        OptionsError
+            Names the parameter and its allowed values.
+        """
+        names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s',
+                                                                  'height_range_m'}
+        given: dict[str, Any] = {name: getattr(self, name) for name in names}
+        low, high = self.height_range_m
+        # A search of the paper's algorithms that is cut short is refused, so they get more time;
+        # the rest of the request waits for frames, runs the networks and hands over.
+        return RelocalizerOptions(
+            **given, height_range_m=(low, high) if low != high else (-math.inf, math.inf),
+            time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
+            else _SEARCH_SHARE * self.timeout_s)
+
+    def class_names(self) -> dict[str, str]:
+        """Return the map's class name for each of the detector's that has another.
+
+        Raises
+        ------
+        OptionsError
+            A pair of class_map has not the form theirs=ours, or a name occurs twice.
+        """
+        found: dict[str, str] = {}
+        for pair in filter(None, map(str.strip, self.class_map.split(','))):
+            theirs, sign, ours = (part.strip() for part in pair.partition('='))
+            if not (theirs and sign and ours):
+                raise OptionsError(f"class_map: '{pair}' is not of the form theirs=ours")
+            if theirs in found:
+                raise OptionsError(f"class_map: '{theirs}' occurs twice")
+            found[theirs] = ours
+        return found
