@@ -25,9 +25,9 @@ from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.localizer import Localizer, load_localizer
 from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -105,7 +105,7 @@ def read_picture(file: Path | None) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
-def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: Localizer,
+def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: FrameLocalizer,
            parameters: RelocalizerParameters) -> Request:
     """Answer a request for a picture as the nodes do, and measure it."""
     start = time.monotonic()

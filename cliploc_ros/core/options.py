@@ -63,7 +63,7 @@ class RelocalizerOptions:
     #: A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
     #: cliploc_ros.core.acceptance.confidence
     min_confidence: float = 0.9
-    #: 'all' or 'on_demand': which crops are compared with labels, see cliploc_ros.core.on_demand.
+    #: 'all' or 'on_demand': which crops are compared with labels, see cliploc_ros.core.localizer.
     #: hybrid_auto alone uses this.
     crops: str = 'on_demand'
 

@@ -15,9 +15,9 @@ import numpy as np
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
+from cliploc_ros.core.localizer import localize_on_demand, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import localize_on_demand, recorded_crops
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.bag_reader import BagReader

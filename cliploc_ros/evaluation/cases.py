@@ -16,12 +16,11 @@ from cliploc_ros.core.keyframes.localization import (
     query_features,
 )
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import recorded_crops
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import Session
 from cliploc_ros.datasets.bag_messages import detections_of
 from cliploc_ros.datasets.cases import Case, CaseFrame
 from cliploc_ros.errors import DatasetError, OptionsError
@@ -90,7 +89,7 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
         A message or the report is broken.
     """
     options, parameters = options_of(case), _parameters(case)
-    session = Session(Relocalizer(landmark_map, options))
+    session = Localizer(Relocalizer(landmark_map, options))
     keyframes = None if layer is None else KeyframeLocalizer(layer)
     found = None
     for frame in case.frames:

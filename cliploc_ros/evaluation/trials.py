@@ -15,14 +15,14 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
-from cliploc_ros.core.map.joined_map import place_of
-from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.on_demand import (
+from cliploc_ros.core.localizer import (
     can_do_without_crops,
     localize_on_demand,
     recorded_crops,
 )
+from cliploc_ros.core.map.joined_map import place_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame

@@ -20,11 +20,11 @@ from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
-from cliploc_ros.ros.localizer import Localized, Localizer, load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
@@ -170,7 +170,7 @@ class Pipeline:
         self._node = node
         self._jumps = jumps
         self._robot = robot
-        self.localizer: Localizer | None = None
+        self.localizer: FrameLocalizer | None = None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._map_to_odom = MapToOdom(node, robot.transforms)
         robot.odometry.on_restart(self._map_to_odom.forget)
@@ -249,7 +249,7 @@ class Pipeline:
                 localized.landmark_map, found, answer.message))
         return answer
 
-    def _use(self, localizer: Localizer) -> str:
+    def _use(self, localizer: FrameLocalizer) -> str:
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
                                     else localizer.keyframes.layer)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import recorded_crops
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import Session
 from cliploc_ros.evaluation.trials import Query
 from cliploc_ros.simulation.sensors import with_mount_error, with_neighbours
 from studies.acceptance.places import (
@@ -62,7 +61,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
     """Let a robot look 20 times at each query; each look misses some boxes and shifts others."""
     relocalizer, rng = Relocalizer(landmark_map, options), np.random.default_rng(seed)
     for query in queries:
-        session = Session(relocalizer)
+        session = Localizer(relocalizer)
         alone, accepted, errors_m = [], [], []
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
@@ -130,7 +129,7 @@ def grow(place: Place, options: RelocalizerOptions, seed: int, vertical: bool
     landmark_map = place.landmark_map
     relocalizer = Relocalizer(landmark_map, replace(options, k=min(options.k, len(landmark_map))))
     for group in dict.fromkeys(place.groups):
-        session = Session(relocalizer)
+        session = Localizer(relocalizer)
         answers: list[Answer] = []
         for query in sorted((one for one, its in zip(queries, place.groups, strict=True)
                              if its == group), key=lambda one: one.observation.stamp_ns):

@@ -28,9 +28,9 @@ from cliploc_ros.core.geometry.transforms import (
     move_covariance,
     pose_difference,
 )
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import Session
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query
 from studies.worlds.places import KINDS
@@ -76,7 +76,7 @@ def walk_squares(kind: str, seed: int) -> NDArray[np.float64]:
         One of KINDS.
     """
     world = make_walk(kind, seed, _IMAGES)
-    session = Session(Relocalizer(world.landmark_map, RelocalizerOptions(
+    session = Localizer(Relocalizer(world.landmark_map, RelocalizerOptions(
         k=min(3, len(world.landmark_map)))))
     filters: list[Filter] = []
     squares = []

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.localizer import Crops, localize_on_demand
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.on_demand import Crops, localize_on_demand
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -9,15 +9,15 @@ import pytest
 from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.on_demand import (
+from cliploc_ros.core.localizer import (
     BATCH,
     Crops,
     informative_first,
     localize_on_demand,
     recorded_crops,
 )
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError

@@ -20,7 +20,7 @@ import numpy as np
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import Session
+from cliploc_ros.core.localizer import Localizer
 from test_matching import make_world
 
 landmark_map, observation = make_world(60)
@@ -31,7 +31,7 @@ for method in sys.argv[3:]:
     matching, _, algorithm = method.partition('_')
     for up in (None, np.array([0.0, -1.0, 0.0])):
         options = RelocalizerOptions(matching=matching, algorithm=algorithm, iterations=200)
-        session = Session(Relocalizer(landmark_map, options))
+        session = Localizer(Relocalizer(landmark_map, options))
         for number in range(3):
             place = np.eye(4) + 0.1 * number * np.eye(4, k=3)
             session.localize(replace(observation, up_in_camera=up, stamp_ns=number,

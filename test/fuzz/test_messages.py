@@ -19,9 +19,9 @@ from hypothesis import given
 from scene import make_room, write_map
 
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 

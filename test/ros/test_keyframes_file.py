@@ -24,7 +24,7 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
+from cliploc_ros.ros.frame_localizer import Keyframes, load_keyframes
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 

@@ -27,9 +27,9 @@ from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S

@@ -2,12 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Localizing frame after frame of one moving camera: what the relocalizer node does.
 
-A session fuses each frame with the last few that odometry links to it, and accepts a pose only
+A localizer fuses each frame with the last few that odometry links to it, and accepts a pose only
 where the successive looks are sure of it on average.
+
+Crops are compared on demand. A network that embeds crops takes longer than all else on a CPU. The
+frame is first localized by classes alone, then with more and more of its crops, the most
+informative ones first, until the pose is accepted or no crop is left. Each of these searches is
+another chance of a false accept. So a pose from a part of the crops needs a greater confidence,
+see cliploc_ros.core.acceptance.verdict.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +23,107 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.tolerances import SAME_VIEW
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import Crops, localize_on_demand
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.succession import Known, succeed
 from cliploc_ros.units import NS_PER_S
+
+#: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
+BATCH = 4
+_NO_LOOKS = Looks()
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The crops of one frame, which a search compares with the labels as it needs them."""
+
+    #: Takes the rows of m detections; returns their similarities (m, L)
+    compare: Callable[[NDArray[np.int64]], Similarities]
+    #: (m,): detections whose similarities cost nothing; the first search has them
+    known: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    room: Callable[[], int] = lambda: BATCH  #: Returns how many crops to compare next; 0 ends
+
+
+def can_do_without_crops(options: RelocalizerOptions) -> bool:
+    """Return whether a frame can be localized without some of its crops: by hybrid_auto alone."""
+    return options.algorithm == 'auto' and options.matching == 'hybrid'
+
+
+def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
+    """Return the crops on demand of an observation that has all similarities.
+
+    A search gets only those that it needs; None where the options give it all at once.
+    """
+    if options.crops != 'on_demand' or not can_do_without_crops(options):
+        return None
+    recorded = np.asarray(observation.similarities)
+    return Crops(lambda rows: recorded[rows])
+
+
+def informative_first(landmark_map: LandmarkMap, observation: Observation) -> NDArray[np.int64]:
+    """Return the detections in the order in which their crops say most about the pose.
+
+    A crop tells the landmarks of its class apart, the more of them there are; a large crop does
+    so more reliably.
+    """
+    classes = landmark_map.classes.classes_of(observation.detections.class_ids)
+    sizes = landmark_map.classes.sizes_of(classes)
+    boxes = observation.detections.bboxes_xyxy
+    sides = np.sqrt(np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0), axis=1))
+    return np.asarray(np.argsort(-np.log2(1.0 + sizes) * sides, kind='stable'))
+
+
+def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
+                       observation: Observation, crops: Crops | None = None,
+                       looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None
+                       ) -> tuple[SearchedFrame, Relocalization]:
+    """Localize a frame with more and more of its crops until its pose is accepted.
+
+    Parameters
+    ----------
+    earlier : sequence of SearchedFrame
+        Frames before it, linked by odometry.
+    crops : Crops, optional
+        They take the place of its similarities; without them it is localized once, as it is.
+    looks : Looks, optional
+        Results of earlier frames, which have to agree.
+    recognizer : ImageRecognizer, optional
+        Of the keyframes.
+
+    Returns
+    -------
+    frame : SearchedFrame
+        With the crops that it took.
+    found : Relocalization
+        Its time is that of all searches.
+
+    Raises
+    ------
+    OptionsError
+        See Relocalizer.relocalize.
+    """
+    search_ms, left = 0.0, np.empty(0, dtype=np.int64)
+    if crops is not None:
+        compared = crops.known
+        observation = replace(observation, similarities=crops.compare(compared),
+                              compared=compared)
+        left = informative_first(relocalizer.landmark_map, observation)
+        left = left[~np.isin(left, compared)]
+    while True:
+        budget = relocalizer.begin(len(earlier) + 1)
+        frame = relocalizer.search(observation, budget.search_end())
+        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer)
+        search_ms += found.search_ms
+        if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
+            return frame, replace(found, search_ms=search_ms)
+        compared, left = np.append(compared, left[:count]), left[count:]
+        observation = replace(observation, similarities=crops.compare(compared),
+                              compared=compared)
 
 
 class KeptFrame(NamedTuple):
@@ -36,7 +136,7 @@ class KeptFrame(NamedTuple):
     anchor: NDArray[np.float64]
 
 
-class Session:
+class Localizer:
     """Localizes with each frame and those before it."""
 
     def __init__(self, relocalizer: Relocalizer) -> None:
@@ -60,7 +160,7 @@ class Session:
         Parameters
         ----------
         observation : Observation
-            Without odom_from_camera it is localized alone, and the session does not change.
+            Without odom_from_camera it is localized alone, and the localizer does not change.
         run : int
             Number of the run of odometry.
         limit : int
@@ -68,14 +168,14 @@ class Session:
         length_s : float
             Older frames are dropped [s].
         crops : Crops, optional
-            Of this frame, compared until the pose is accepted, see cliploc_ros.core.on_demand.
+            Of this frame, compared until the pose is accepted.
         recognizer : ImageRecognizer, optional
             Of the keyframes, for the image of this frame.
 
         Raises
         ------
         OptionsError
-            See Relocalizer.relocalize. The session drops this frame.
+            See Relocalizer.relocalize. The localizer drops this frame.
         """
         if observation.odom_from_camera is None:
             alone, found = localize_on_demand(self._relocalizer, (), observation, crops,

@@ -2,25 +2,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame to a relocalization: the map and the network that stay loaded between requests."""
 
+import logging
 import math
 import time
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
+from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.localizer import (
+    BATCH,
+    Crops,
+    Localizer,
+    can_do_without_crops,
+    informative_first,
+)
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, split_similarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.on_demand import BATCH, Crops, can_do_without_crops, informative_first
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import Session
+from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import camera_from_msg, image_from_msg
 from cliploc_ros.models.clip_weights import ClipOptions
@@ -32,15 +46,65 @@ from cliploc_ros.ros.conversions import (
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.keyframes import Keyframes, load_keyframes
-from cliploc_ros.ros.map_parameters import load_hashed_map, map_files
+from cliploc_ros.ros.map_parameters import load_hashed_map, map_files, path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
+logger = logging.getLogger(__name__)
+
 # Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
 # of the time that is left, and for the answer. Guesses.
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
+#: Value of keyframes_file for the layer next to the map, if there is one.
+NEXT_TO_MAP = 'auto'
+# Without so much time left, the objects' answer stands: extracting features cannot be stopped.
+_LEAST_S = 0.5
+
+
+class Keyframes:
+    """A layer, and where it is from.
+
+    Parameters
+    ----------
+    file, file_hash : str
+        Where the layer is from, for the diagnostics.
+    """
+
+    def __init__(self, localizer: KeyframeLocalizer, file: str = '', file_hash: str = '') -> None:
+        self.file, self.file_hash = file, file_hash
+        self._localizer = localizer
+        self._notes: set[str] = set()
+
+    def __len__(self) -> int:
+        """Return the number of keyframes."""
+        return len(self._localizer.layer)
+
+    @property
+    def layer(self) -> KeyframeLayer:
+        """Return the layer."""
+        return self._localizer.layer
+
+    def recognizer(self, image_rgb: NDArray[np.uint8], camera: Camera, deadline: float,
+                   times: StageTimes) -> ImageRecognizer | None:
+        """Return the keyframe search of an image; None where too little time is left.
+
+        Parameters
+        ----------
+        image_rgb : ndarray (h, w, 3) uint8
+        deadline : float
+            When the request ends (monotonic clock) [s].
+        times : StageTimes
+            Of this image.
+        """
+        if deadline - time.monotonic() < _LEAST_S:
+            return None
+        note = self._localizer.layer.camera_note(camera)
+        if note and note not in self._notes:
+            self._notes.add(note)
+            logger.warning('%s', note)
+        return ImageRecognizer(self._localizer, partial(query_features, image_rgb), camera,
+                               deadline, times.begin)
 
 
 class Localized(NamedTuple):
@@ -61,7 +125,7 @@ class Localized(NamedTuple):
     for_filter: NDArray[np.float64] | None
 
 
-class Localizer:
+class FrameLocalizer:
     """A map and, unless only classes are matched, an observer for its labels and images.
 
     Parameters
@@ -85,7 +149,7 @@ class Localizer:
         self._map = landmark_map
         self._observer = observer
         self._options = options
-        self._session = Session(relocalizer)
+        self._localizer = Localizer(relocalizer)
         relocalizer.warm_up()
 
     @property
@@ -108,7 +172,7 @@ class Localizer:
         return (f'{len(self._map)} landmarks in {where}, {keyframes}'
                 f'{self._options.matching}_{self._options.algorithm}')
 
-    def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'Localizer':
+    def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'FrameLocalizer':
         """Return a localizer for the map as it is now; the encoder stays the same.
 
         Raises
@@ -125,7 +189,7 @@ class Localizer:
             from cliploc_ros.models.map_rows import embed_map
             observer = observer.with_labels(embed_map(
                 _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings))
-        return Localizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
+        return FrameLocalizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
                          load_keyframes(parameters, landmark_map))
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
@@ -154,21 +218,21 @@ class Localizer:
             odom_from_camera=None if place is None else place.odom_from_camera,
             odom_way_m=0.0 if place is None else place.way_m)
         options = parameters.options()
-        session = self._session_for(options)
+        localizer = self._localizer_for(options)
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, camera, deadline, times)
         times.begin('search')
         if place is None:
-            found = session.localize(observation, crops=crops, recognizer=recognizer)
+            found = localizer.localize(observation, crops=crops, recognizer=recognizer)
         else:
-            found = session.localize(observation, place.run, parameters.fuse_frames,
+            found = localizer.localize(observation, place.run, parameters.fuse_frames,
                                      parameters.fuse_window_s, crops, recognizer)
-        seen = session.observation
+        seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
-        for_filter = session.covariance_for_filter(found) \
+        for_filter = localizer.covariance_for_filter(found) \
             if found.accepted and parameters.mode == 'continuous' else found.covariance
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
@@ -212,14 +276,14 @@ class Localizer:
         return None, replace(observation, similarities=every.compare(rows[:count]),
                              compared=rows[:count])
 
-    def _session_for(self, options: RelocalizerOptions) -> Session:
-        """Return the session; other options begin a new one."""
+    def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
+        """Return the localizer; other options begin a new one."""
         if options != self._options:
-            self._session, self._options = Session(Relocalizer(self._map, options)), options
-        return self._session
+            self._localizer, self._options = Localizer(Relocalizer(self._map, options)), options
+        return self._localizer
 
 
-def load_localizer(node: Node, parameters: RelocalizerParameters) -> Localizer:
+def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocalizer:
     """Load map and, if the matching type asks for it, CLIP.
 
     Raises
@@ -240,7 +304,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> Localizer:
             _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings)
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
-    return Localizer(landmark_map, observer, relocalizer, options, device, map_hash,
+    return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
                      load_keyframes(parameters, landmark_map))
 
 
@@ -262,3 +326,23 @@ def _clip_options(parameters: RelocalizerParameters) -> ClipOptions:
         checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
         cache_dir=parameters.cache_dir, inference=parameters.inference)
     return with_encoder(named, parameters.profile)
+
+
+def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
+                   ) -> Keyframes | None:
+    """Return the layer that the parameters name; None without one, or where it is bad.
+
+    A bad layer is logged with what to do, and the relocalizer goes on with the landmarks.
+    """
+    named, map_file = parameters.keyframes_file, parameters.map_file
+    if not named or (named == NEXT_TO_MAP and not map_file):
+        return None
+    path = layer_path(path_of(map_file)) if named == NEXT_TO_MAP else Path(named)
+    if named == NEXT_TO_MAP and not path.exists():
+        return None
+    try:
+        layer = load_layer_of_map(path, landmark_map)
+        return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
+    except MapError as error:
+        logger.error('localizing without keyframes: %s', error)
+        return None

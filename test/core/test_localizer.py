@@ -13,10 +13,10 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.localizer import KeptFrame, Localizer, frames_to_fuse
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.session import KeptFrame, Session, frames_to_fuse
 from cliploc_ros.errors import OptionsError
 
 ROOM = make_room()
@@ -104,7 +104,7 @@ def test_frames_without_detections_are_dropped(window):
 @pytest.fixture
 def session():
     RELOCALIZER.warm_up()
-    return Session(RELOCALIZER)
+    return Localizer(RELOCALIZER)
 
 
 def fused(session, observation, run=0):
@@ -279,7 +279,7 @@ def test_a_look_without_odometry_stands_alone(camera):
 
 
 def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
-    session = Session(RELOCALIZER)
+    session = Localizer(RELOCALIZER)
     deviations = []
     for seconds, run in ((0, 0), (1, 0), (2, 1)):
         found = session.localize(frame(seconds), run, 5, 5.0)
@@ -308,7 +308,7 @@ class Says:
 
 
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
-    session, fine = Session(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
+    session, fine = Localizer(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
     keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9,
                                      pixels=np.array([[0.0, 0.0], [640.0, 480.0]])))
 

@@ -15,9 +15,9 @@ from std_msgs.msg import Header
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
 from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
-from cliploc_ros.ros.localizer import load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
