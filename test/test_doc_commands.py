@@ -28,6 +28,8 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
 OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
+# A module for each subcommand.
+OF_STUDIES = ('studies.covariance.', 'studies.speed.')
 MODULES = re.compile(r'(cliploc_ros|demo_world|studies)\.')
 
 
@@ -52,7 +54,10 @@ def parser_of(module: str) -> argparse.ArgumentParser:
         patch.setattr(argparse.ArgumentParser, 'parse_args', caught)
         patch.setattr(sys, 'argv', [module])
         with pytest.raises(_CaughtError) as found:
-            runpy.run_module(module, run_name='__main__')
+            if module.startswith(OF_STUDIES):
+                importlib.import_module(module).run([])
+            else:
+                runpy.run_module(module, run_name='__main__')
     return found.value.parser
 
 
@@ -63,6 +68,8 @@ def program_of(command: Command) -> tuple[str, list[str]]:
         first, *rest = rest[1:]
         first, *rest = rest
     elif first in ('python', 'python3') and rest[0] == '-m' and MODULES.match(rest[1]):
+        if rest[1] + '.' in OF_STUDIES:
+            return f'{rest[1]}.{rest[2]}', rest[3:]
         return rest[1], rest[2:]
     name = re.sub('^(install/lib/cliploc_ros/|script/(?=demo$)|cliploc_(?!ros))', '', first)
     if name in EXECUTABLES:

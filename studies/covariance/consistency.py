@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Do covariances hold the errors? ``python -m studies.covariance.consistency --help``.
+"""Do covariances hold the errors? ``python -m studies.covariance consistency --help``.
 
 For each mode: how many of the accepted poses within 1 m lie in the ellipsoid that their covariance
 says holds 95 %. Verticals are off by 1 degree on each axis, the same for all images of a group.
@@ -8,7 +8,6 @@ Odometry is off by 1 cm and 0.5 degrees in each step. Worlds are simulated.
 """
 
 import argparse
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from tqdm import tqdm
 
-from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.command import positive_int
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_difference
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -123,7 +122,7 @@ def table(squares: Mapping[str, Squares]) -> str:
 
 def run(arguments: list[str]) -> int:
     """Print the table and draw the figure."""
-    parser = argparse.ArgumentParser(prog='consistency', description=__doc__,
+    parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['room', 'office', 'shop'])
     parser.add_argument('--worlds', type=positive_int, default=20, metavar='N',
@@ -172,12 +171,3 @@ def _draw(folder: Path, squares: Mapping[str, Squares]) -> None:
     axes.set(xlim=(0, 1), ylim=(0, 1.01))
     add_legend(figure)
     print(f'wrote {save_figure(figure, folder / "consistency.png")}')
-
-
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A filter that fuses all answers: ``python -m studies.covariance.continuous --help``.
+"""A filter that fuses all answers: ``python -m studies.covariance continuous --help``.
 
 A robot walks through simulated worlds and is localized with every image, as in continuous mode. A
 Kalman filter fuses odometry with the accepted poses, once with their own covariances, once with
@@ -9,7 +9,6 @@ its 3-sigma ellipsoids as often as they should be.
 """
 
 import argparse
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tqdm import tqdm
 
-from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.command import positive_int
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
@@ -113,7 +112,7 @@ def _odometry(queries: tuple[Query, ...], rng: np.random.Generator) -> list[NDAr
 
 def run(arguments: list[str]) -> int:
     """Print the share of consistent states of both filters."""
-    parser = argparse.ArgumentParser(prog='continuous', description=__doc__,
+    parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['room', 'office'])
     parser.add_argument('--worlds', type=positive_int, default=10, metavar='N',
@@ -133,12 +132,3 @@ def run(arguments: list[str]) -> int:
               f'| {(own < chi2.ppf(0.9973, 6)).mean():.3f} '
               f'| {np.median(own) / chi2.median(6):.2f} |')
     return 0
-
-
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

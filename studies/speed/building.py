@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests that search all floors of a building: success, false accepts, time, memory. Simulated.
 
-Usage: python -m studies.speed.building --floors 20 --objects 2000 --queries 200
+Usage: python -m studies.speed building --floors 20 --objects 2000 --queries 200
 
 Each query is seen on one floor. It is searched in the map of this floor alone, on all floors, and
 (queries of the first three floors) on all floors but this one, where every accepted pose is wrong.
@@ -11,7 +11,6 @@ Embeddings of crops and labels are random vectors that share a part with their c
 
 import argparse
 import resource
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.command import positive_int
 from cliploc_ros.core.geometry.tolerances import RIGHT_M
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.localizer import Crops, localize_on_demand
@@ -69,9 +68,9 @@ def searched(maps: Sequence[LandmarkMap], labels: Sequence[NDArray[np.float32]],
                     rows.in_parts([len(one) for one in maps]))
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def run(arguments: Sequence[str]) -> int:
     """Run the benchmark; return the exit code."""
-    parser = argparse.ArgumentParser(prog='building', description=__doc__,
+    parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--floors', type=positive_int, default=20, help='(%(default)s)')
     parser.add_argument('--objects', type=positive_int, default=2000,
@@ -89,7 +88,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--processor-time', action='store_true',
                         help='the budget is one of processor time, as on a machine with nothing '
                         'else to do; for a busy machine')
-    options = parser.parse_args(args)
+    options = parser.parse_args(arguments)
     if options.processor_time:
         time.perf_counter = time.process_time
     measure(options)
@@ -209,7 +208,3 @@ def _units(rng: np.random.Generator, count: int, size: int) -> NDArray[np.float3
 
 def _unit(rows: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
-
-
-if __name__ == '__main__':
-    sys.exit(run_command(main))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time and memory of mapping a simulated floor: build_map, evaluate and check_map.
 
-Usage: python -m studies.speed.floor --objects 5000 --frames 36000 --out DIR
+Usage: python -m studies.speed floor --objects 5000 --frames 36000 --out DIR
 
 Each step runs in a process of its own, so that its peak memory is its own.
 """
@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.observations import load_observations, save_observations
@@ -58,9 +57,9 @@ class Measured(NamedTuple):
     peak_mb: float
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def run(arguments: Sequence[str]) -> int:
     """Run the benchmark; return the exit code."""
-    parser = argparse.ArgumentParser(prog='floor', description=__doc__,
+    parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--objects', type=int, default=5000, help='(%(default)s)')
     parser.add_argument('--frames', type=int, default=36000, help='at 10 Hz (%(default)s)')
@@ -74,7 +73,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--check', action='store_true', help='also run check_map: minutes')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
-    options = parser.parse_args(args)
+    options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     print(f'{options.objects} objects, {options.frames} frames; simulated', flush=True)
     show('simulate', measure(simulate, options))
@@ -230,7 +229,3 @@ def _run(executable: str, log: Path, *arguments: object) -> None:
     with log.open('w') as file:  # check_map ends with 1 if the map misses a threshold
         subprocess.call([sys.executable, '-m', f'cliploc_ros.cli.{executable}',
                          *map(str, arguments)], stdout=file)
-
-
-if __name__ == '__main__':
-    sys.exit(run_command(main))

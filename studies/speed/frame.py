@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure a request by stage for each profile: ``python -m studies.speed.frame``.
+"""Measure a request by stage for each profile: ``python -m studies.speed frame``.
 
 Each profile runs in two processes, one with PyTorch and one with OpenVINO, which take turns. The
 image, its boxes and the map are the demo's. The search uses the similarities of the demo's own
@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -53,10 +53,9 @@ _TIME_BUDGET_S = 0.05
 _ASSETS = Path(__file__).parents[1] / 'demo' / 'assets'
 
 
-def main() -> None:
+def run(arguments: Sequence[str]) -> int:
     """Print the table, or serve as one of its processes."""
-    parser = argparse.ArgumentParser(prog='python -m studies.speed.frame',
-                                     description=__doc__,
+    parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--profiles', nargs='+', choices=PROFILES, default=list(PROFILES))
     parser.add_argument('--crops', type=int, default=12, metavar='N', help='(%(default)s)')
@@ -64,10 +63,10 @@ def main() -> None:
     parser.add_argument('--threads', type=int, default=2, metavar='N', help='(%(default)s)')
     parser.add_argument('--device', default='cpu', help='with a GPU, PyTorch alone (%(default)s)')
     parser.add_argument('--child', nargs=4, metavar='X', help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.child:
         _serve(*options.child, crops=options.crops, device=options.device)
-        return
+        return 0
     engines = ENGINES if options.device == 'cpu' else ENGINES[:1]
     print(f'{options.crops} crops of 640 x 480 px, all embedded; {options.threads} threads, device'
           f' {options.device}; median of {options.rounds} rounds: ms (ms of processor time)')
@@ -76,6 +75,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_frame_') as folder:
         for name in options.profiles:
             _print_profile(name, engines, options, Path(folder))
+    return 0
 
 
 def _print_profile(name: str, engines: tuple[str, ...], options: argparse.Namespace,
@@ -138,7 +138,7 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
 
 
 def _start(options: argparse.Namespace, *child: str) -> 'subprocess.Popen[str]':
-    command = [sys.executable, '-m', 'studies.speed.frame', '--crops', str(options.crops),
+    command = [sys.executable, '-m', 'studies.speed', 'frame', '--crops', str(options.crops),
                '--device', options.device, '--child', *child]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                             env=os.environ | {'OMP_NUM_THREADS': str(options.threads)})
@@ -215,7 +215,3 @@ def _resident_mib() -> float:
     match = re.search(r'VmRSS:\s+(\d+) kB', Path('/proc/self/status').read_text())
     assert match
     return int(match[1]) / 1024
-
-
-if __name__ == '__main__':
-    main()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure the start of the relocalizer with the demo's map: the first ones, and a warm one.
 
-    python -m studies.speed.node_start [--package FOLDER]
+    python -m studies.speed node_start [--package FOLDER]
 
 Each start is a process of its own, from its command line to its log line that it is ready.
 """
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,15 +89,12 @@ def format_starts(starts: list[NodeStart]) -> str:
     return '\n'.join(lines)
 
 
-def main() -> None:
+def run(arguments: Sequence[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--package', type=Path, default=_PROJECT, metavar='FOLDER',
                         help='folder with the package to measure (default: this one)')
-    package = parser.parse_args().package.resolve()
+    package = parser.parse_args(arguments).package.resolve()
     print(format_starts([start for matching in MATCHINGS
                          for start in measure_starts(package, matching)]))
-
-
-if __name__ == '__main__':
-    main()
+    return 0

@@ -4,7 +4,7 @@
 
 Both kinds of refinement also run with simulated odometry, a random walk as OdometryErrors says.
 
-    python -m studies.speed.pose_errors --observations office.npz --every 2
+    python -m studies.speed pose_errors --observations office.npz --every 2
 
 Landmarks are compared with the nearest of their class in the map of the poses as they are. Errors
 that drift move the whole map: all maps are also compared after the rigid motion that lays most
@@ -12,7 +12,6 @@ landmarks on one another.
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -160,9 +159,9 @@ def _show(head: str, built: BuiltMap, medians: NDArray[np.float64], plain: NDArr
           f'{built.report.median_iou:5.3f} {seconds:6.1f} {" ".join(notes)}', flush=True)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def run(arguments: Sequence[str]) -> int:
     """Print the table; return the exit code."""
-    parser = argparse.ArgumentParser(prog='python -m studies.speed.pose_errors')
+    parser = argparse.ArgumentParser()
     parser.add_argument('--observations', type=Path, required=True, metavar='NPZ')
     parser.add_argument('--every', type=int, default=1, metavar='N', help='(%(default)s)')
     parser.add_argument('--seeds', type=int, nargs='+', default=[0], metavar='N')
@@ -172,7 +171,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--odometry-noise', type=float, nargs=2, metavar=('METRES', 'DEGREES'),
                         default=(OdometryErrors.sigma_m, OdometryErrors.sigma_deg),
                         help='after a metre, on each axis (%(default)s)')
-    options = parser.parse_args(args)
+    options = parser.parse_args(arguments)
     odometry = OdometryErrors(*options.odometry_noise)
     recorded = load_observations(options.observations)
     detections = recorded.select_frames(range(0, len(recorded), options.every))
@@ -184,7 +183,3 @@ def main(args: Sequence[str] | None = None) -> int:
             for seed in options.seeds:
                 compare(detections, kind, LEVELS[level], seed, truth, odometry)
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

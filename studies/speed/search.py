@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the speed of the search: ``python -m studies.speed.search``.
+"""Measure the speed of the search: ``python -m studies.speed search``.
 
 One run compares the kernel on one core with a plain loop over OpenCV and NumPy, and measures maps
 of several sizes. With --queries and --map, it also searches each recorded query to the end.
@@ -12,9 +12,8 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -51,15 +50,14 @@ _CHORDS = 32
 _K, _IOU_THRESHOLD = 3, 0.2
 
 
-def main() -> int:
+def run(arguments: Sequence[str]) -> int:
     """Measure and print; return the exit code."""
-    parser = argparse.ArgumentParser(prog='python -m studies.speed.search',
-                                     description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--queries', type=Path, metavar='NPZ', help='recorded frames')
     parser.add_argument('--map', type=Path, metavar='YAML', help='their map')
     parser.add_argument('--landmarks', type=int, nargs='*', default=(100, 100_000, 1_000_000),
                         metavar='N', help='sizes of the maps (%(default)s); 1,000,000 take 6 GB')
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if (options.queries is None) != (options.map is None):
         parser.error('--queries and --map belong together')
     measure_first_request()
@@ -274,7 +272,3 @@ def _plain_iou(box: NDArray[np.float64], conic: NDArray[np.float64] | None) -> f
         (high - low) / 2 * np.pi / _CHORDS)
     area = np.pi * (box[2] * box[3] + np.sqrt(exx * eyy - exy * exy))
     return float(shared / (area - shared))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

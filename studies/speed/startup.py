@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure time and memory of a start of CLIP: open_clip's own, a first one, one with a warm cache.
 
-    python -m studies.speed.startup --model ViT-L-14
+    python -m studies.speed startup --model ViT-L-14
 
 Each start is a process of its own. Without ``--checkpoint`` the weights are random.
 """
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ class StartupResult:
 
 def measure_startup(kind: str, options: ClipOptions) -> StartupResult:
     """Start CLIP in a new process; return its time and memory."""
-    command = [sys.executable, '-m', 'studies.speed.startup', '--child', kind,
+    command = [sys.executable, '-m', 'studies.speed', 'startup', '--child', kind,
                '--options', json.dumps(asdict(options))]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True)
     return StartupResult(**json.loads(done.stdout))
@@ -111,28 +112,25 @@ def _peak_mib() -> float:
     return int(match[1]) / 1024
 
 
-def main() -> None:
+def run(arguments: Sequence[str]) -> int:
     """Print the table for a model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--model', default='ViT-B-32', help='a name of open_clip.list_models()')
     parser.add_argument('--checkpoint', help='its weights as a file; random ones if not given')
     parser.add_argument('--child', choices=KINDS, help=argparse.SUPPRESS)
     parser.add_argument('--options', help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.child:
-        options = ClipOptions(**json.loads(arguments.options))
-        print(json.dumps(asdict(_start_and_report(arguments.child, options))))
-        return
+    given = parser.parse_args(arguments)
+    if given.child:
+        options = ClipOptions(**json.loads(given.options))
+        print(json.dumps(asdict(_start_and_report(given.child, options))))
+        return 0
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_startup_') as folder:
-        checkpoint = arguments.checkpoint
+        checkpoint = given.checkpoint
         if not checkpoint:
             checkpoint = str(Path(folder) / 'random.pt')
-            write_random_checkpoint(arguments.model, Path(checkpoint))
-        options = ClipOptions(arguments.model, checkpoint, device='cpu', cache_dir=folder)
+            write_random_checkpoint(given.model, Path(checkpoint))
+        options = ClipOptions(given.model, checkpoint, device='cpu', cache_dir=folder)
         results = [measure_startup(kind, options) for kind in KINDS]
-    print(f'CLIP {arguments.model} on the CPU, {len(_LABELS)} labels')
+    print(f'CLIP {given.model} on the CPU, {len(_LABELS)} labels')
     print(format_results(results))
-
-
-if __name__ == '__main__':
-    main()
+    return 0

@@ -14,7 +14,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 @pytest.mark.clock
 def test_the_kernel_is_two_orders_faster_than_a_plain_loop_and_as_good():
-    done = subprocess.run([sys.executable, '-m', 'studies.speed.search', '--landmarks',
+    done = subprocess.run([sys.executable, '-m', 'studies.speed', 'search', '--landmarks',
                            '100', '1000'], capture_output=True, text=True, cwd=PROJECT, check=True)
     print(f'\n{done.stdout}')
     ratio = float(re.search(r'(\d+) times as long', done.stdout).group(1))
@@ -26,7 +26,7 @@ def test_the_kernel_is_two_orders_faster_than_a_plain_loop_and_as_good():
 
 
 def test_queries_need_their_map():
-    done = subprocess.run([sys.executable, '-m', 'studies.speed.search', '--queries', 'x'],
+    done = subprocess.run([sys.executable, '-m', 'studies.speed', 'search', '--queries', 'x'],
                           capture_output=True, text=True, cwd=PROJECT, check=False)
     assert done.returncode == 2
     assert '--queries and --map belong together' in done.stderr
