@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.evaluation.summary import wilson_interval
 
 #: Confidences (n,), and whether each pose is right (n,).

@@ -92,7 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
 def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.keyframes.layer_file import remove_layer
+    from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.make_map import find_labeller, make_map, update_map

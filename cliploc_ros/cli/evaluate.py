@@ -211,7 +211,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     CliplocError
         Keyframes are asked for, and cannot be used.
     """
-    from cliploc_ros.core.keyframes.layer_file import layer_path
+    from cliploc_ros.core.keyframes.layer import layer_path
 
     wanted, problem = options.keyframes, ''
     if not any(one.keyframes for one in methods):

@@ -86,7 +86,7 @@ def make_parser() -> argparse.ArgumentParser:
 def import_map(options: argparse.Namespace) -> int:
     """Import as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.keyframes.layer_file import remove_layer
+    from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.datasets.map_formats.given_map import place
 

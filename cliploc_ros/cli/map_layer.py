@@ -71,7 +71,7 @@ def layer_input(options: argparse.Namespace) -> 'tuple[Frames | None, LayerOptio
 
 def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:
     """Write a layer next to its map; return what was written, in a line."""
-    from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+    from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 
     path = layer_path(map_file)
     save_layer(path, layer)
@@ -101,7 +101,7 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
     MapError
         The layer is wanted, and is missing or bad.
     """
-    from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map
+    from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 
     path = layer_path(map_file)
     if wanted is False or (wanted is None and not path.exists()):

@@ -26,7 +26,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from cliploc_ros.ros.replay.player import Player
+    from cliploc_ros.ros.replay import Player
 
 NODE_NAME = 'replay'
 
@@ -100,7 +100,7 @@ def replay(args: list[str], stop: Interruption) -> int:
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.node import Node
     with running_ros(ros_args), BagReader(options.bag) as reader:
-        from cliploc_ros.ros.replay.player import Player, PlayOptions
+        from cliploc_ros.ros.replay import Player, PlayOptions
 
         # Nothing spins this node, so it could not serve its parameters.
         node = Node(NODE_NAME, start_parameter_services=False)

@@ -68,7 +68,7 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Inter
         from rclpy.exceptions import InvalidServiceNameException
         from rclpy.validate_topic_name import validate_topic_name
 
-        from cliploc_ros.ros.wake_up.waking import WakeUp, WakeUpOptions
+        from cliploc_ros.ros.wake_up import WakeUp, WakeUpOptions
     try:
         validate_topic_name(f'{options.relocalizer}/relocalize', is_service=True)
     except InvalidServiceNameException as error:

@@ -20,9 +20,9 @@ from cliploc_ros.core.acceptance.comparison import (
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.fit.finalists import find_with_rivals
-from cliploc_ros.core.geometry.tolerances import SAME_PLACE
+from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

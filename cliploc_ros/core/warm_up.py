@@ -12,21 +12,19 @@ import logging
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.fit.box_edges import jacobian_of, residuals_of
-from cliploc_ros.core.fit.refinement import one_to_one, refine_rig
-from cliploc_ros.core.fit.rig import make_rig
-from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
+from cliploc_ros.core.fit.refinement import jacobian_of, one_to_one, refine_rig, residuals_of
+from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
 from cliploc_ros.core.map.similarities import keep_greatest
-from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import Leaders, are_near, same_place
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 from cliploc_ros.core.search.strategies import (
+    Leaders,
+    are_near,
+    same_place,
     search_exhaustively,
     search_progressively,
     search_samples,

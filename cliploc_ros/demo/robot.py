@@ -22,7 +22,7 @@ from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
 from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns
-from cliploc_ros.ros.replay.player import create_publisher
+from cliploc_ros.ros.replay import create_publisher
 from cliploc_ros.units import NS_PER_S
 
 _PATIENCE_S = 60.0

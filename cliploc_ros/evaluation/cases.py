@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
     KeyframeLocalizer,
     query_features,
 )
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation

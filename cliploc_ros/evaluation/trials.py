@@ -13,8 +13,7 @@ from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import Features
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
 from cliploc_ros.core.localizer import (
     can_do_without_crops,
     localize_on_demand,

@@ -16,10 +16,17 @@ from rclpy.node import Node
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, load_layer_of_map
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.keyframes.layer import (
+    KeyframeLayer,
+    layer_hash,
+    layer_path,
+    load_layer_of_map,
+)
+from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
+    KeyframeLocalizer,
+    query_features,
+)
 from cliploc_ros.core.localizer import (
     BATCH,
     Crops,
@@ -121,7 +128,7 @@ class Localized(NamedTuple):
     #: Whether there was no time for the other crops, which could have helped.
     is_cut: bool
     #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
-    #: the new information, see cliploc_ros.core.succession.
+    #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
 
 

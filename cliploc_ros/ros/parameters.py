@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from cliploc_ros.core.fit.rig import MAX_FRAMES
+from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.options import (
     ALGORITHMS,
     COMPARED,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.trials import run_trial

@@ -19,8 +19,7 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
-from cliploc_ros.core.geometry.transforms import pose_difference
+from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_difference
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -4,7 +4,7 @@
 
 A robot walks through simulated worlds and is localized with every image, as in continuous mode. A
 Kalman filter fuses odometry with the accepted poses, once with their own covariances, once with
-those for a filter (cliploc_ros.core.succession). A filter is consistent if its errors are within
+those for a filter (cliploc_ros.core.localizer). A filter is consistent if its errors are within
 its 3-sigma ellipsoids as often as they should be.
 """
 

@@ -23,8 +23,7 @@ from scipy.optimize import minimize
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.candidates import candidates_of, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
 from studies.keyframes.judge import decide
 from studies.keyframes.records import Record, StoredCase

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cliploc_ros.core.fit.covariance import normalized_square
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalization import Relocalization

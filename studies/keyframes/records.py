@@ -22,18 +22,18 @@ from cliploc_ros.core.keyframes.features import DIMENSIONS, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     NOTHING_KNOWN,
+    ImageRecognizer,
     KeyframeLocalizer,
     query_features,
 )
 from cliploc_ros.core.keyframes.places import Recognition
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.core.search.prior import Prior
+from cliploc_ros.core.search.scene import Prior
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.command import positive_int
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
 from cliploc_ros.core.localizer import Crops, localize_on_demand
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap

@@ -25,12 +25,11 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.leaders import Leaders
-from cliploc_ros.core.search.matching import match_frame
+from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.screening import set_up
-from cliploc_ros.core.search.strategies import search_samples
+from cliploc_ros.core.search.strategies import Leaders, search_samples
 
 _CROPS, _DIMENSIONS, _K, _CLASSES = 12, 512, 3, 40
 _CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)

@@ -31,12 +31,11 @@ from cliploc_ros.core.search.candidates import (
     joined,
     nearest_candidates,
 )
-from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import Leaders
-from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
+    Leaders,
     Progress,
     search_exhaustively,
     search_progressively,

@@ -9,7 +9,7 @@ import pytest
 
 from cliploc_ros.cli.build_map import main, make_parser
 from cliploc_ros.cli.map_layer import layer_input, write_layer
-from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, remove_layer
+from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, remove_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, MappingError
 from cliploc_ros.recording.keyframe_layer import build_layer

@@ -9,15 +9,13 @@ bounds and without culling.
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.fit.rig import make_rig
-from cliploc_ros.core.fit.verification import Verified, verify_rig
+from cliploc_ros.core.fit.verification import Verified, make_rig, verify_rig
 from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.p3p import solve_p3p
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.search.candidates import Candidates
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.scene import Scene
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene
 
 # A pose: rotation (3, 3) and translation (3,) of camera_from_map.
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]

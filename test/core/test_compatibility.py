@@ -9,17 +9,16 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.compatibility import (
+from cliploc_ros.core.search.sampling import (
     FARTHEST,
     NEAREST,
     _depths,
     _distance_range,
     compatible_pairs,
+    enumerate_compatible_triples,
 )
-from cliploc_ros.core.search.leaders import Leaders
-from cliploc_ros.core.search.sampling import enumerate_compatible_triples
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.core.search.strategies import search_exhaustively, search_progressively
+from cliploc_ros.core.search.strategies import Leaders, search_exhaustively, search_progressively
 
 
 @pytest.fixture(scope='module')

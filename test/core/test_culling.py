@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from reference import sample_pose, verify
 
-from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
-from cliploc_ros.core.geometry.projection import Poses
+from cliploc_ros.core.geometry.ellipsoid import (
+    Poses,
+    ellipse_bboxes,
+    project_ellipsoids,
+    shape_matrices,
+)
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.culling import (
     make_groups,
@@ -18,10 +22,9 @@ from cliploc_ros.core.map.culling import (
     sort_landmarks,
     visible_members,
 )
-from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.scene import Scene, make_scene
-from cliploc_ros.core.search.strategies import search_samples
+from cliploc_ros.core.search.strategies import Leaders, search_samples
 
 HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))
 

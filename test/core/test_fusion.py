@@ -8,16 +8,15 @@ from reference import verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.fit.box_edges import robust_cost
 from cliploc_ros.core.fit.refinement import (
     linearize_rig,
     move,
     one_to_one,
     refine_rig,
     residuals_of_rig,
+    robust_cost,
 )
-from cliploc_ros.core.fit.rig import make_rig
-from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
+from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -27,9 +26,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.matching import match_frame
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 FRAMES = 4
 

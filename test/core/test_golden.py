@@ -12,9 +12,8 @@ from cliploc_ros.core.search.candidates import (
     nearest_candidates,
     prosac_order,
 )
-from cliploc_ros.core.search.leaders import Leaders
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.core.search.strategies import search_exhaustively
+from cliploc_ros.core.search.strategies import Leaders, search_exhaustively
 
 
 @pytest.fixture(scope='module')

@@ -10,10 +10,16 @@ import pytest
 from scene import CAMERA, make_room
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes import layer_file
+from cliploc_ros.core.keyframes import layer as layers
 from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
-from cliploc_ros.core.keyframes.layer_file import layer_path, load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.layer import (
+    KeyframeLayer,
+    layer_path,
+    learn_words,
+    load_layer_of_map,
+    nearest_words,
+    save_layer,
+)
 from cliploc_ros.errors import MapError
 
 ROOM = make_room()
@@ -66,7 +72,7 @@ def test_a_layer_comes_back_as_it_was(file):
 
 
 def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
-    monkeypatch.setattr(layer_file, '_SCHEMA', replace(layer_file._SCHEMA, largest_read=0))
+    monkeypatch.setattr(layers, '_SCHEMA', replace(layers._SCHEMA, largest_read=0))
     layer = load_layer_of_map(file, ROOM)
     assert isinstance(layer.descriptors, np.memmap)
     assert np.array_equal(layer.descriptors, make_layer().descriptors)

@@ -18,8 +18,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.core.map.parameter_file import read_parameter_file
-from cliploc_ros.core.map.written_map import parse_written_map
+from cliploc_ros.core.map.parameter_file import parse_written_map, read_parameter_file
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],

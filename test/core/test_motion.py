@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.motion import compare_motion
+from cliploc_ros.core.acceptance.genuine import compare_motion
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.keyframes.layer import FROM_DEPTH

@@ -10,11 +10,14 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.fit.box_edges import LEAST_DEVIATION, RELATIVE_DEVIATION, edge_deviation
-from cliploc_ros.core.fit.covariance import normalized_square
-from cliploc_ros.core.fit.refined_covariance import refined_covariance
-from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.covariance import normalized_square, refined_covariance
+from cliploc_ros.core.fit.refinement import (
+    LEAST_DEVIATION,
+    RELATIVE_DEVIATION,
+    edge_deviation,
+    refine_rig,
+)
+from cliploc_ros.core.fit.verification import make_rig
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
@@ -26,8 +29,7 @@ from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')

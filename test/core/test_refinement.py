@@ -8,12 +8,16 @@ from reference import verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.fit.box_edges import jacobian_of, residuals_of
-from cliploc_ros.core.fit.refinement import LEAST_SHARE, move, refine_rig
-from cliploc_ros.core.fit.rig import make_rig
+from cliploc_ros.core.fit.refinement import (
+    LEAST_SHARE,
+    jacobian_of,
+    move,
+    refine_rig,
+    residuals_of,
+)
+from cliploc_ros.core.fit.verification import make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN
-from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 
 @pytest.fixture(scope='module')

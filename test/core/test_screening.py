@@ -13,13 +13,11 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import Leaders
-from cliploc_ros.core.search.prior import Prior
-from cliploc_ros.core.search.sampling import draw_ransac
-from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
+from cliploc_ros.core.search.scene import Prior, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
+    Leaders,
     search_exhaustively,
     search_progressively,
     search_samples,

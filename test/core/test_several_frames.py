@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import odometry_deviations
-from cliploc_ros.core.fit.rig import MAX_FRAMES
+from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,

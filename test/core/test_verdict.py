@@ -13,11 +13,10 @@ import yaml
 from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, FILE
-from cliploc_ros.core.acceptance.genuine import Signs, chance_genuine
-from cliploc_ros.core.acceptance.motion import Motion
+from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.fit.covariance import share_within
-from cliploc_ros.core.geometry.tolerances import RIGHT_M
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation

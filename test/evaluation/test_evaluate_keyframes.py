@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.evaluate import main
-from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes import localization
-from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
+from cliploc_ros.core.keyframes.layer import load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions

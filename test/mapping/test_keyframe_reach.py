@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map

@@ -13,7 +13,7 @@ from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.keyframes.layer_file import layer_hash, layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera

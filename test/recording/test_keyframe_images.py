@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes.layer import PIXEL_SCALE
-from cliploc_ros.core.keyframes.layer_file import load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import DepthImage
 from cliploc_ros.datasets.folders import tum_frames

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
 from cliploc_ros.ros.conversions import pose_to_msg
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.odometry import NoOdometryError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 

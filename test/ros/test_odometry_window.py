@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError, OdometryWindow
+from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryWindow
 
 S = 1_000_000_000
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])

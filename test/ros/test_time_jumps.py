@@ -17,8 +17,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.frame_source import FrameSource
-from cliploc_ros.ros.inputs.odometry import OdometrySource
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import StampOrder, TimeJumpError, TimeJumps
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from cliploc_ros.core.succession import succeed
+from cliploc_ros.core.localizer import succeed
 from studies.covariance.continuous import COVARIANCES, Filter, walk_squares
 
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])

@@ -10,8 +10,7 @@ from scene import CAMERA, make_room, write_map
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.layer_file import layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.bag_writer import BagWriter

@@ -20,6 +20,7 @@ from cliploc_ros.core.acceptance.candidates import (
     Candidate,
     JoinedFrames,
     candidates_of,
+    chance_not_mirrored,
     refined,
     supports_of,
     unrefined,
@@ -31,11 +32,9 @@ from cliploc_ros.core.acceptance.confidence import (
     objects_utility,
     points_utility,
 )
-from cliploc_ros.core.acceptance.genuine import Signs, signs_of
+from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
-from cliploc_ros.core.acceptance.motion import Motion, compare_motion
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
@@ -45,12 +44,12 @@ from cliploc_ros.core.fit.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.geometry.tolerances import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
-from cliploc_ros.core.keyframes.recognizer import ImageRecognizer
 from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.search.frame_search import coverage_of, prior_of
-from cliploc_ros.core.search.leaders import MAX_DISTINCT
+from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
 # The most poses of objects that propose keyframes.
 _MOST_GUESSES = 3

@@ -5,6 +5,9 @@
 Objects and points that lie in a picture of a place agree on where it was taken. Neither judges
 the other: they see the same pixels. What tells is what lies around the picture, its size and
 aspect, which other intrinsics would explain, and how it moves.
+
+A picture of the room shows the same points as the room, but moves as a plane: where the robot
+drives sideways, the poses of its keyframes turn instead. So two looks of a moving robot tell.
 """
 
 import math
@@ -12,12 +15,83 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.acceptance.motion import SURE_MOTION, Motion
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
+from cliploc_ros.core.keyframes.localization import PER_RADIAN
 from cliploc_ros.core.keyframes.places import RecognizedPlace
+from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
+
+#: Motions of right poses are no further off, in squared deviations (95 %, dof 6).
+SURE_MOTION = float(chi2.ppf(0.95, 6))
+# Distances of pictures from the first camera [m], and how many points are tried on them.
+_PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
+# A camera sees what is further ahead than this [m].
+_AHEAD_M = 0.1
+
+
+class Motion(NamedTuple):
+    """How well two looks agree with odometry: squared Mahalanobis distances, dof 6."""
+
+    square: float  #: Of the motion between the two poses from that by odometry
+    #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
+    #: motion does not tell a picture from the place: a camera that only turns sees both move
+    #: alike.
+    picture: float
+
+
+def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
+                   first_from_second: NDArray[np.float64]) -> Motion:
+    """Compare the poses of two looks with odometry.
+
+    Parameters
+    ----------
+    first_from_second : ndarray (4, 4)
+        Motion of the camera by odometry.
+    """
+    expected = first.map_from_camera @ first_from_second
+    information = np.linalg.inv(_covariance(deviation_per_metre, first, second, first_from_second))
+
+    def square(pose: NDArray[np.float64]) -> float:
+        step = pose_difference(expected, pose)
+        return float(step @ information @ step)
+    pictures = [_on_picture(first, first_from_second, away_m) for away_m in _PICTURES_M]
+    return Motion(square(second.map_from_camera), min(
+        np.inf if one is None else square(one.map_from_camera) for one in pictures))
+
+
+def _covariance(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
+                first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of the second pose about the one that odometry expects.
+
+    A wrong pose of a keyframe moves both looks at it alike, so it does not count where the same
+    keyframes are seen. What their points add with the distance counts for the way between.
+    """
+    shares = dict(zip(second.keyframes, second.shares, strict=True))
+    same = sum(min(share, shares.get(keyframe, 0.0))
+               for keyframe, share in zip(first.keyframes, first.shares, strict=True))
+    way, turn = first_from_second[:3, 3], Rotation.from_matrix(first_from_second[:3, :3])
+    grown = (deviation_per_metre * np.linalg.norm(way), PER_RADIAN * turn.magnitude())
+    before, after = (one.covariance - same * one.shared for one in (first, second))
+    return move_covariance(before, first.map_from_camera[:3, :3] @ way) + after + np.diag(
+        odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2)
+
+
+def _on_picture(first: RecognizedPlace, first_from_second: NDArray[np.float64], away_m: float
+                ) -> PointPose | None:
+    """Return where the second image is recognized if both show a picture that faced the first."""
+    points = first.points[::1 + len(first.points) // _MOST_POINTS]
+    inside = (points - first.map_from_camera[:3, 3]) @ first.map_from_camera[:3, :3]
+    shown = away_m * inside / inside[:, 2:]
+    moved = (shown - first_from_second[:3, 3]) @ first_from_second[:3, :3]
+    ahead = moved[:, 2] > _AHEAD_M
+    return find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
+
 
 # Errors of the intrinsics count from so many deviations on, and no further than this.
 _SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25

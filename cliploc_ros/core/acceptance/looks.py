@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.geometry.tolerances import SAME_LOOK
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.observation import Observation
 

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.genuine import Signs, chance_genuine
-from cliploc_ros.core.acceptance.motion import Motion
+from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
@@ -93,7 +92,7 @@ class Evidence:
     #: That the place is there and no picture of it; None where keyframes do not propose it
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
-    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.mirror
+    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.candidates
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0

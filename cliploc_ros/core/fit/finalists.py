@@ -13,22 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import (
+    POSE_UNKNOWN,
     box_scatter,
     odometry_deviations,
     pose_covariance,
-)
-from cliploc_ros.core.fit.refined_covariance import (
-    POSE_UNKNOWN,
     refined_covariance,
 )
 from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.rig import Rig
-from cliploc_ros.core.fit.verification import choose_distinct, scores_of, verify_rig
+from cliploc_ros.core.fit.verification import Rig, choose_distinct, scores_of, verify_rig
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.tolerances import SAME_MINIMUM
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, move_covariance
+from cliploc_ros.core.geometry.transforms import (
+    SAME_MINIMUM,
+    invert_transform,
+    make_transform,
+    move_covariance,
+)
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
-from cliploc_ros.core.search.leaders import MAX_DISTINCT, are_near, same_place
+from cliploc_ros.core.search.strategies import MAX_DISTINCT, are_near, same_place
 
 # The most refined poses that are compared by their support. Of 614 frames of TUM fr3 (maps of its
 # splits, one image), 16 solve 449 within 0.5 m, 8 solve 440.

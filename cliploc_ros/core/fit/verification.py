@@ -5,21 +5,146 @@
 Every detection takes the potential landmark whose outline overlaps its box's ellipse most, if
 their IoU exceeds the threshold. The score is the sum of these IoUs (Matsuzaki et al. 2024,
 Sec. III-D2). Detections of the minimal sample choose like all others.
+
+Frames of one moving camera are joined by odometry: their cameras form a rigid rig. A pose of the
+rig is the pose of the reference frame's camera. It fixes the poses of all others.
 """
 
+from collections.abc import Sequence
 from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.fit.rig import camera_pose, scene_of
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
-from cliploc_ros.core.geometry.projection import Poses
+from cliploc_ros.core.geometry.ellipsoid import Poses, project_ellipsoid
+from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
-from cliploc_ros.core.map.culling import visible_members
-from cliploc_ros.core.search.leaders import same_place
+from cliploc_ros.core.map.culling import Groups, visible_members
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.search.scene import Potential, Scene
+from cliploc_ros.core.search.strategies import same_place
+from cliploc_ros.errors import OptionsError
+
+#: The most frames that are fused. The leaders of each frame are verified on every frame, so the
+#: time grows with the square; and the tenth view of the same objects adds little.
+MAX_FRAMES = 10
+
+
+class FrameStarts(NamedTuple):
+    """Where each frame's rows begin in the arrays of a rig: arrays (F + 1,)."""
+
+    #: (F + 1,): in the box ellipses, and in the landmarks and detections of potential
+    boxes: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    #: (F + 1,): in the groups, and in their detections, members, levels and spheres
+    groups: NDArray[np.int64]
+    shown: NDArray[np.int64]
+    members: NDArray[np.int64]
+    levels: NDArray[np.int64]
+    spheres: NDArray[np.int64]
+
+
+class Rig(NamedTuple):
+    """The scenes of F frames, one behind the other, and where their cameras are."""
+
+    #: All arrays but the map's are concatenated. Numbers in them count within their frame, and
+    #: starts have an end of their own for each frame. It has no pairs.
+    scene: Scene
+    starts: FrameStarts
+    #: (F, 3, 4): rotation and translation of each camera_from_reference
+    cameras: NDArray[np.float64]
+    verticals: NDArray[np.float64]  #: (F, 7): see VERTICAL_UNKNOWN
+    #: (L,): standard deviation of each landmark's centre on each axis [m]
+    sigmas: NDArray[np.float64]
+
+
+def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
+    """Return each camera from the last (F, 4, 4), by odometry."""
+    if not 1 <= len(observations) <= MAX_FRAMES:
+        raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
+    cameras = np.tile(np.eye(4), (len(observations), 1, 1))
+    if len(observations) == 1:
+        return cameras
+    linked = []
+    for number, one in enumerate(observations, start=1):
+        where = f'odom_from_camera of frame {number} of {len(observations)}'
+        if one.odom_from_camera is None:
+            raise OptionsError(f'{where} is missing: several frames need it')
+        if not is_rigid(one.odom_from_camera):
+            raise OptionsError(f'{where} is no rigid transform')
+        linked.append(one.odom_from_camera)
+    for row, odom_from_camera in enumerate(linked[:-1]):
+        cameras[row] = invert_transform(odom_from_camera) @ linked[-1]
+    return cameras
+
+
+def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
+             verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
+    """Return the rig of F scenes of one map, see Rig.
+
+    Cameras are camera_from_reference (F, 4, 4), verticals (F, 7), sigmas (L,).
+    """
+    first = scenes[0]
+    joined = first._replace(
+        box_ellipses=np.concatenate([one.box_ellipses for one in scenes]),
+        bearings=np.concatenate([one.bearings for one in scenes]),
+        potential=Potential(*map(np.concatenate, zip(*(one.potential for one in scenes),
+                                                     strict=True))),
+        pairs=first.pairs[:0],
+        groups=Groups(*map(np.concatenate, zip(*(one.groups for one in scenes), strict=True))))
+    sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
+    starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
+    return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
+               np.ascontiguousarray(verticals), sigmas)
+
+
+def _sizes(scene: Scene) -> list[int]:
+    """Return how many rows a frame has in each array, in the order of FrameStarts."""
+    potential, groups = scene.potential, scene.groups
+    return [len(scene.box_ellipses), len(potential.landmarks), len(potential.detections),
+            len(groups.starts) - 1, len(groups.detections), len(groups.members),
+            len(groups.levels), len(groups.spheres)]
+
+
+@compiled
+def scene_of(rig, frame):
+    """Return the scene of one frame."""
+    scene, starts, potential, groups = rig.scene, rig.starts, rig.scene.potential, rig.scene.groups
+    after = frame + 1
+    # starts and frusta have one row more than their frame has landmarks or groups
+    landmarks, landmarks_end = starts.landmarks[frame], starts.landmarks[after]
+    groups_begin, groups_end = starts.groups[frame] + frame, starts.groups[after] + after
+    boxes = scene.box_ellipses[starts.boxes[frame]:starts.boxes[after]]
+    bearings = scene.bearings[starts.boxes[frame]:starts.boxes[after]]
+    own_potential = Potential(
+        potential.landmarks[landmarks:landmarks_end],
+        potential.starts[landmarks + frame:landmarks_end + after],
+        potential.detections[starts.pairs[frame]:starts.pairs[after]])
+    own_groups = Groups(
+        groups.starts[groups_begin:groups_end],
+        groups.detections[starts.shown[frame]:starts.shown[after]],
+        groups.frusta[groups_begin:groups_end],
+        groups.members[starts.members[frame]:starts.members[after]],
+        groups.levels[starts.levels[frame]:starts.levels[after]],
+        groups.spheres[starts.spheres[frame]:starts.spheres[after]])
+    return Scene(boxes, bearings, scene.centers, scene.shapes, own_potential, scene.pairs,
+                 scene.iou_threshold, scene.sorted_landmarks, own_groups)
+
+
+@compiled
+def camera_pose(camera, rotation, translation):
+    """Return camera_from_map (3, 3), (3,) of a camera (3, 4) at a pose of the reference."""
+    own_rotation, own_translation = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            own_rotation[i, j] = (camera[i, 0] * rotation[0, j] + camera[i, 1] * rotation[1, j]
+                                  + camera[i, 2] * rotation[2, j])
+        own_translation[i] = (camera[i, 0] * translation[0] + camera[i, 1] * translation[1]
+                              + camera[i, 2] * translation[2] + camera[i, 3])
+    return own_rotation, own_translation
 
 
 class Verified(NamedTuple):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.projection import project
+from cliploc_ros.core.geometry.ellipsoid import project
 from cliploc_ros.core.kernels.compiled import compiled
 
 #: Up to so many landmarks, comparing with all is faster than culling.

@@ -25,8 +25,12 @@ from cliploc_ros.core.map.landmark_details import (
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
-from cliploc_ros.core.map.written_map import WrittenMap, parse_written_map
+from cliploc_ros.core.map.parameter_file import (
+    WrittenMap,
+    parse_parameters,
+    parse_written_map,
+    read_text,
+)
 from cliploc_ros.errors import MapError
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

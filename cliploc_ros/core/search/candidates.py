@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Correspondence candidates: the landmarks that a detection may show.
+"""The association of one frame: from an observation and a map to the scene that is searched.
 
-Matching types (Matsuzaki et al. 2024, Sec. IV-A3): *class* pairs equal detector classes, *clip*
-each detection with the k landmarks whose labels are most similar to its crop, *hybrid* samples
-from clip and verifies with both.
+Candidates are pairs of a detection and a landmark that it may show. Matching types (Matsuzaki et
+al. 2024, Sec. IV-A3): *class* pairs equal detector classes, *clip* each detection with the k
+landmarks whose labels are most similar to its crop, *hybrid* samples from clip and verifies with
+both.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.map.classes import ClassIndex
-from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks
+from cliploc_ros.core.map.culling import FEW, SortedLandmarks
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.errors import OptionsError
 
 
@@ -129,3 +136,122 @@ def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candid
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return concatenated([first, second.select(new)])
+
+
+#: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a
+#: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
+#: iterations do: candidates of equal class are hardly ever neighbours.
+MAX_CANDIDATES = 1_500
+
+# Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
+_FARTHEST = 1e6
+
+
+def match_frame(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
+                ) -> tuple[Scene, int]:
+    """Associate one frame with the map.
+
+    Returns
+    -------
+    scene : Scene
+        Its pairs are the candidates, in the order of the sampler.
+    left_out : int
+        How many candidates exceed the limit of auto.
+
+    Raises
+    ------
+    OptionsError
+        The matching type needs similarities that are missing, of the wrong shape, or not finite.
+    """
+    bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
+    # NaN where the lens model has no inverse; a box turned inside out has no ellipse
+    sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1) & (np.abs(bboxes) < _FARTHEST).all(axis=1)
+    classes = landmark_map.classes.classes_of(observation.detections.class_ids)
+    classes[~sound] = -1
+    nearest = _nearest(landmark_map, observation, options, sound)
+    candidates, left_out = _candidates(landmark_map, observation.detections.class_ids, classes,
+                                       nearest, options)
+    by_class = classes if options.matching != 'clip' else np.full_like(classes, -1)
+    single, sorted_landmarks = _potential(landmark_map, by_class, nearest)
+    # no pair uses the placeholder of a box that is not sound
+    return make_scene(np.where(sound[:, None], bboxes, 1.0), landmark_map.centers,
+                      landmark_map.shapes, single, candidates.pairs, options.iou_threshold,
+                      sorted_landmarks, by_class), left_out
+
+
+def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
+               ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
+    """Return the pairs (p, 2) to verify, and the landmarks to verify by class besides.
+
+    In a small map the pairs are complete: culling costs more there than it saves.
+    """
+    if len(landmark_map) <= FEW:
+        of_class = class_candidates(landmark_map.classes, classes)
+        return (of_class if nearest is None else
+                joined(nearest, of_class, len(landmark_map))).pairs, None
+    if nearest is None:
+        return np.empty((0, 2), dtype=np.int64), landmark_map.sorted_landmarks
+    by_class = landmark_map.classes.have(nearest.landmarks, classes[nearest.detections])
+    return nearest.select(~by_class).pairs, landmark_map.sorted_landmarks
+
+
+def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,
+             sound: NDArray[np.bool_]) -> Candidates | None:
+    """Return the k most similar landmarks of each sound, compared detection; None without CLIP."""
+    if not options.needs_similarities:
+        return None
+    compared = observation.compared
+    if compared is None:
+        compared = np.arange(len(observation.detections))
+    shape = (len(compared), len(landmark_map))
+    similarities = observation.similarities
+    if similarities is None or similarities.shape != shape:
+        found = 'none' if similarities is None else f'{similarities.shape}'
+        raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
+                           f'{shape}, found {found}')
+    parts = parts_of(landmark_map)
+    sizes = [len(part.landmark_map) for part in parts]
+    # k of each map, so that the labels of one map do not hide the rivals on the others
+    nearest = concatenated([
+        nearest_candidates(some, min(options.k, size)).moved(part.first)
+        for part, size, some in zip(parts, sizes, split_similarities(similarities, sizes),
+                                    strict=True)])
+    nearest = replace(nearest, detections=compared[nearest.detections])
+    return nearest.select(sound[nearest.detections])
+
+
+def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
+                classes: NDArray[np.int64], nearest: Candidates | None,
+                options: RelocalizerOptions) -> tuple[Candidates, int]:
+    """Return the candidates in the order of the sampler, and how many are left out."""
+    automatic = options.algorithm == 'auto'
+    if nearest is not None:
+        if options.algorithm == 'prosac':
+            nearest = prosac_order(nearest)
+        elif options.algorithm in ('b-prosac', 'auto'):
+            nearest = balanced_order(nearest)
+        if options.matching == 'clip' or not automatic:
+            return nearest, 0
+    index = landmark_map.classes
+    if not automatic:
+        return class_candidates(index, classes), 0
+    of_class = _of_rarest_classes(landmark_map, class_ids, classes)
+    left_out = int(index.sizes_of(classes).sum()) - len(of_class)
+    return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out
+
+
+def _of_rarest_classes(landmark_map: LandmarkMap, class_ids: Sequence[str],
+                       classes: NDArray[np.int64]) -> Candidates:
+    """Return pairs of equal class, at most MAX_CANDIDATES.
+
+    Each of several maps gets an equal share, and they take turns: a search that is cut short has
+    looked for rivals on all of them.
+    """
+    parts, found = parts_of(landmark_map), []
+    for part in parts:
+        index = part.landmark_map.classes
+        own = np.where(classes >= 0, index.classes_of(class_ids), -1)
+        found.append(rarest_class_candidates(index, own, MAX_CANDIDATES // len(parts))
+                     .moved(part.first))
+    turns = np.concatenate([np.arange(len(some)) for some in found])
+    return concatenated(found).ordered(turns)

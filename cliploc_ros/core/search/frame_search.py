@@ -15,13 +15,17 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.compatibility import compatible_pairs
-from cliploc_ros.core.search.leaders import MAX_DISTINCT, Leaders
-from cliploc_ros.core.search.matching import match_frame
-from cliploc_ros.core.search.prior import VERTICAL_UNKNOWN, Prior
-from cliploc_ros.core.search.sampling import SAMPLE_SIZE, draw_prosac, draw_ransac
-from cliploc_ros.core.search.scene import Scene
+from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.sampling import (
+    SAMPLE_SIZE,
+    compatible_pairs,
+    draw_prosac,
+    draw_ransac,
+)
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Prior, Scene
 from cliploc_ros.core.search.strategies import (
+    MAX_DISTINCT,
+    Leaders,
     Progress,
     search_exhaustively,
     search_progressively,

@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
+from cliploc_ros.core.geometry.ellipsoid import Poses, project
 from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS, p3p
-from cliploc_ros.core.geometry.projection import Poses, project
 from cliploc_ros.core.geometry.two_point import two_point
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 from cliploc_ros.core.map.culling import Groups, project_visible
-from cliploc_ros.core.search.prior import Prior
-from cliploc_ros.core.search.scene import Scene
+from cliploc_ros.core.search.scene import Prior, Scene
 
 
 class Targets(NamedTuple):

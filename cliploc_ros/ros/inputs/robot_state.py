@@ -13,8 +13,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
-from cliploc_ros.ros.inputs.odometry import OdometrySource
-from cliploc_ros.ros.inputs.odometry_window import NoOdometryError
+from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters

@@ -23,8 +23,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from std_srvs.srv import Empty
 
-from cliploc_ros.core.geometry.tolerances import SAME_SPOT, TAKEN, Tolerance
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import SAME_SPOT, TAKEN, Tolerance, pose_error
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
