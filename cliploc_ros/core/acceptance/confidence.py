@@ -42,8 +42,8 @@ class Support:
     #: labels on average, in standard deviations, summed
     likeness: float = 0.0
     #: Summed over the objects that have a class of their landmark: the logarithm of the map's
-    #: number of landmarks for each landmark of this class. A rare class is matched by
-    #: chance less often than a common one. A class that the detector takes the landmark for at times counts
+    #: number of landmarks for each landmark of this class. A rare class is matched by chance less
+    #: often than a common one. A class that the detector takes the landmark for at times counts
     #: by its share, see ClassIndex.shares.
     rarity: float = 0.0
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
@@ -173,7 +173,7 @@ class Setting(NamedTuple):
 
     @property
     def vertical(self) -> float:
-        """Return the log of the attitudes that a vertical rules out: 3.8 to 1 degree, 0 for none."""
+        """Return the log of the attitudes that it rules out: 3.8 to 1 degree, 0 for none."""
         return math.log(_VAGUE_VERTICAL_DEG / min(max(self.vertical_deg, _BEST_VERTICAL_DEG),
                                                   _VAGUE_VERTICAL_DEG))
 

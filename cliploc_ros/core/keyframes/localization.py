@@ -45,7 +45,8 @@ NOTHING_KNOWN = Prior()
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
 # Points near each other share errors, and several keyframes have the same point: the errors of
-# poses and focal lengths are this many times those of as many independent points. Of 570 right poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
+# poses and focal lengths are this many times those of as many independent points. Of 570 right
+# poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
 _MUCH_ALIKE = 4.5
 # A rolling shutter stretches the image of a camera that turns: deviations of the logarithms of the
 # focal length and its aspect.
