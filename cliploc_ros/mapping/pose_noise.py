@@ -36,7 +36,7 @@ from cliploc_ros.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes, pro
 from cliploc_ros.mapping.options import PoseErrors
 from cliploc_ros.mapping.views import Views
 
-# The estimate uses so many frames and landmarks at most: more of them add time, hardly precision.
+# The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
 _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
 # They are from the middle of a long recording: frames far apart show no landmark in common.
 _MAX_SPAN = 3000
@@ -53,7 +53,7 @@ _HIGHEST = np.log([1.0, 20.0, 100.0, 5.0])
 # Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
 _POSE_ERROR_S = 3.0
 # Boxes that are matched wrongly before the poses are refined bend the map: parts of it are off by
-# so many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
+# this many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
 # and 10 cm over 3 s (seeds 0 to 4 of studies/speed/pose_errors.py).
 _BENDING = 1.6
 

@@ -16,10 +16,14 @@ from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_towers import cut_padding, load_text_tower, quiet_root_logger
+from cliploc_ros.models.clip_towers import (
+    cut_padding,
+    load_text_tower,
+    load_tower,
+    quiet_root_logger,
+)
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory, resolve_device
-from cliploc_ros.models.image_towers import load_tower
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 
