@@ -31,15 +31,7 @@ logger = logging.getLogger(__name__)
 
 
 class TorchYolo:
-    """A detection network in PyTorch.
-
-    Parameters
-    ----------
-    file : Path
-        A ``.pt`` file.
-    precision : str
-        'fp16' or 'fp32'.
-    """
+    """A detection network in PyTorch, of a ``.pt`` file; the precision is 'fp16' or 'fp32'."""
 
     inference = 'pytorch'
 
@@ -50,8 +42,8 @@ class TorchYolo:
             from ultralytics.utils import DEFAULT_CFG_DICT
 
             # The name changed within 8.4, and the old one warns with every image.
-            half_precision = {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
-            self._settings |= half_precision
+            has_new_name = 'quantize' in DEFAULT_CFG_DICT
+            self._settings |= {'quantize': 16} if has_new_name else {'half': True}
         self.stride = stride_of(self._model.model)
         self.names: dict[int, str] = self._model.names
 
@@ -63,11 +55,6 @@ class TorchYolo:
 
 class YoloDetector:
     """An `ObjectDetector`: a detection network of ultralytics.
-
-    Parameters
-    ----------
-    options : YoloOptions
-        Which YOLO, and how to run it.
 
     Raises
     ------
@@ -82,8 +69,12 @@ class YoloDetector:
 
         threads = torch.get_num_threads()
         import_ultralytics()
-        self._device = resolve_device(options.device)
-        self._network = _load(options, self._device)
+        device = resolve_device(options.device)
+        self.device = str(device)
+        self._network = _load(options, device)
+        self.inference = self._network.inference  #: 'pytorch' or 'openvino'
+        #: All classes that the model knows
+        self.class_names = tuple(self._network.names.values())
         self.configure(options)
         # The first pass sets up the predictor: do it before the first image.
         side = self._network.stride
@@ -97,21 +88,6 @@ class YoloDetector:
         self._settings: dict[str, Any] = {
             'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
             'imgsz': -(-options.imgsz // stride) * stride}
-
-    @property
-    def device(self) -> str:
-        """Return where the network runs."""
-        return str(self._device)
-
-    @property
-    def inference(self) -> str:
-        """Return what runs the network: 'pytorch' or 'openvino'."""
-        return self._network.inference
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """Return the names of all classes that the model knows."""
-        return tuple(self._network.names.values())
 
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.

@@ -33,11 +33,8 @@ _FIELDS = {'names': dict, 'stride': int, 'task': str}
 class OpenVinoYolo:
     """A detection network in OpenVINO, with ultralytics' own steps before and after it.
 
-    Parameters
-    ----------
-    network : Network
-        Its field ``about`` holds names (by their number), stride, end2end and size: the height
-        and width of its input, None where that varies.
+    The network's field ``about`` holds names (by their number), stride, end2end and size: the
+    height and width of its input, None where that varies.
     """
 
     inference = 'openvino'
