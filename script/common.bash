@@ -8,7 +8,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 logs=$root/build/setup
 
-# Some containers set it. Hundreds of processes would then compile what they import, each anew.
+# Some containers set it. Hundreds of processes would then compile their imports, each again.
 unset PYTHONDONTWRITEBYTECODE
 
 say() { printf '==> %s\n' "$*"; }

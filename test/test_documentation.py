@@ -77,6 +77,13 @@ def test_commands_run_what_there_is(path):
         assert (PROJECT / 'script' / script).exists(), script
 
 
+def test_the_tests_of_the_capabilities_exist():
+    text = (PROJECT / 'test/README.md').read_text()
+    named = re.findall(r'`([\w/]+(?:\.py|/))`', text)
+    assert len(named) > 90
+    assert not [name for name in named if not (PROJECT / 'test' / name).exists()]
+
+
 def texts(node):
     """Return the strings of a syntax tree; what they insert is an ellipsis."""
     if isinstance(node, ast.JoinedStr):

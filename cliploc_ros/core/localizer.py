@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Localizing frame after frame of one moving camera: what the relocalizer node does.
+"""Localizing frame after frame of one moving camera: as the relocalizer node does.
 
 A localizer fuses each frame with the last few that odometry links to it, and accepts a pose only
 where the successive looks are sure of it on average.
@@ -57,7 +57,7 @@ _LEAST_SHARE = 1e-4
 
 
 class Known(NamedTuple):
-    """What a filter knows that fused all answers of one run of odometry."""
+    """The state of a filter that fused all answers of one run of odometry."""
 
     #: (4, 4): at the last answer
     odom_from_camera: NDArray[np.float64]
@@ -68,7 +68,7 @@ class Known(NamedTuple):
 def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
             map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
             ) -> tuple[NDArray[np.float64], Known]:
-    """Return the covariance of an answer to a filter, and what the filter knows after it.
+    """Return the covariance of an answer to a filter, and the state of the filter after it.
 
     An answer that contradicts its predecessors makes both less certain: one of them is wrong. So
     an outlier hardly moves the filter, and a filter that it misled recovers. Poses (4, 4) and
@@ -97,7 +97,7 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
 
 
 def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
-    """Return what is known after the camera moved on by odometry."""
+    """Return the state after the camera moved on by odometry."""
     motion = invert_transform(known.odom_from_camera) @ odom_from_camera
     pose = known.map_from_camera @ motion
     covariance = move_covariance(known.covariance, pose[:3, 3] - known.map_from_camera[:3, 3])

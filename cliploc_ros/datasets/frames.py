@@ -69,7 +69,7 @@ Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a source that is read anew each time, one image in memory at a time."""
+    """Frames of a source that is read again each time, one image in memory at a time."""
 
     source: Path  #: Folder or file
     count: int  #: How many images there are

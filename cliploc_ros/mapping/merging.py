@@ -119,7 +119,7 @@ def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:
 
 
 def seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
-    """Return in which share of the frames of the rarer landmark both have a box of their own.
+    """Return in which share of the frames of the landmark with fewer both have a box of their own.
 
     Two boxes that overlap well are one object under two classes.
     """

@@ -31,7 +31,7 @@ class OdometryErrors:
     #: Standard deviations on each axis after a metre [m] [deg]
     sigma_m: float = 0.03
     sigma_deg: float = 1.5
-    #: A radian of turning counts as so many metres: wheels move then, too
+    #: A radian of turning counts as this number of metres: wheels move then, too
     metres_per_radian: float = 0.5
     #: Of each step, for stamps and interpolation [m] [deg]
     floor_m: float = 0.002
@@ -60,9 +60,9 @@ class MappingOptions:
     #: An edge this near to the image border is open: the object may extend beyond it [px]
     border_px: float = 3.0
     pairs_per_box: int = 3  #: Hypotheses that each box is the seed of
-    #: At most so many frames of a viewpoint are searched for new landmarks
+    #: At most this number of frames of a viewpoint are searched for new landmarks
     frames_per_viewpoint: int = 8
-    min_viewpoints: int = 3  #: A landmark needs support from so many viewpoints
+    min_viewpoints: int = 3  #: A landmark needs support from this number of viewpoints
     #: How often boxes without a landmark are searched for new ones, and how often after that
     #: landmarks are associated, merged and fitted
     discovery_rounds: int = 2
@@ -72,7 +72,7 @@ class MappingOptions:
     #: cliploc_ros.mapping.merging.normalized_distance
     merge_distance: float = 0.8
     class_merge_distance: float = 0.4  #: The same for landmarks of two classes
-    #: Unless more than this share of the frames of the rarer one show them as two boxes
+    #: Unless more than this share of the frames of the one with fewer show them as two boxes
     max_seen_apart: float = 0.15
     merge_loss: float = 0.1  #: Or the mean IoU of their boxes falls by more than this
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
@@ -90,7 +90,7 @@ class MappingOptions:
     #: Of odometry between frames, which joins the poses while they are refined
     odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
-    rebuilds: int = 1  #: How often the map is built anew with refined poses
+    rebuilds: int = 1  #: How often the map is built again with refined poses
     #: How often poses and landmarks are refined together before each of these, and after all
     refinements: int = 3
     #: What the map says of itself: its coordinate frame, and where it comes from

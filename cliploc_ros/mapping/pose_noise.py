@@ -36,7 +36,7 @@ from cliploc_ros.mapping.options import PoseErrors
 from cliploc_ros.mapping.projection import POSE_SIZE, project_box
 from cliploc_ros.mapping.views import Views
 
-# The estimate uses so many frames and landmarks at most: more of them add time, hardly precision.
+# The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
 _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
 # They are from the middle of a long recording: frames far apart show no landmark in common.
 _MAX_SPAN = 3000

@@ -24,7 +24,7 @@ from cliploc_ros.mapping.views import Views
 # Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
 _POSE_ERROR_S = 3.0
 # Boxes that are matched wrongly before the poses are refined bend the map: parts of it are off by
-# so many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
+# this many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
 # and 10 cm over 3 s (seeds 0 to 4 of studies/speed/pose_errors.py).
 _BENDING = 1.6
 

@@ -101,7 +101,7 @@ def camera_from_map(map_from_camera: NDArray[np.float64]
 
 
 def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
-    """Return a mask (F,) of at most so many frames of each viewpoint, evenly chosen."""
+    """Return a mask (F,) of a number of frames of each viewpoint at most, evenly chosen."""
     counts = np.bincount(views.viewpoints - views.viewpoints[0])
     places = np.arange(len(views.viewpoints)) - np.repeat(np.cumsum(counts) - counts, counts)
     counts = np.maximum(np.repeat(counts, counts), most)

@@ -7,14 +7,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.devices import resolve_device, resolve_inference, resolve_precision
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.devices import (
+    import_openvino,
+    resolve_device,
+    resolve_inference,
+    resolve_precision,
+)
+from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.images import check_image_rgb
-from cliploc_ros.models.openvino_networks import ConversionError
-from cliploc_ros.models.yolo_openvino import OpenVinoYolo, load_converted, open_export
+from cliploc_ros.models.openvino_networks import (
+    Conversion,
+    ConversionError,
+    Network,
+    convert_module,
+    load_network,
+    release_pages,
+)
 from cliploc_ros.models.yolo_weights import (
     YoloOptions,
     import_ultralytics,
@@ -27,7 +40,124 @@ from cliploc_ros.models.yolo_weights import (
 if TYPE_CHECKING:
     import torch
 
+# Of an export, in metadata.yaml, with their types.
+_FIELDS = {'names': dict, 'stride': int, 'task': str}
 logger = logging.getLogger(__name__)
+
+
+class OpenVinoYolo:
+    """A detection network in OpenVINO, with ultralytics' own steps before and after it.
+
+    The network's field ``about`` holds names (by their number), stride, end2end and size: the
+    height and width of its input, None where that varies.
+    """
+
+    inference = 'openvino'
+
+    def __init__(self, network: Network) -> None:
+        about = network.about
+        self._network = network
+        self._size = about['size']
+        self._is_end2end = bool(about['end2end'])
+        self.stride = int(about['stride'])
+        self.names = {int(number): str(name) for number, name in about['names'].items()}
+
+    def find(self, image_bgr: NDArray[np.uint8], conf: float, iou: float, max_det: int,
+             imgsz: int) -> NDArray[np.float32]:
+        """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class."""
+        import_ultralytics()
+        import torch
+        from ultralytics.data.augment import LetterBox
+        from ultralytics.utils import nms, ops
+
+        letterbox = LetterBox(self._size or (imgsz, imgsz), auto=self._size is None,
+                              stride=self.stride)
+        pixels = letterbox(image=image_bgr)[..., ::-1].transpose(2, 0, 1)[None]
+        inputs = np.ascontiguousarray(pixels, dtype=np.float32) / np.float32(255)
+        rows = nms.non_max_suppression(torch.from_numpy(self._network(inputs)), conf, iou,
+                                       max_det=max_det, end2end=self._is_end2end)[0]
+        rows[:, :4] = ops.scale_boxes(inputs.shape[2:], rows[:, :4], image_bgr.shape)
+        return np.asarray(rows[:, :6].numpy())
+
+
+def open_export(folder: Path, options: YoloOptions) -> OpenVinoYolo:
+    """Return the network of a folder that ``yolo export format=openvino`` made.
+
+    ModelError: files are missing or damaged, or the network is for another task.
+    """
+    about = _read_metadata(folder / 'metadata.yaml')
+    file = sorted(folder.glob('*.xml'))[0]
+    try:
+        network = import_openvino().Core().read_model(file)
+        # Without a fixed size, int8 kernels crash on some CPUs (openvino issue 37577).
+        if any(node.get_type_name() == 'FakeQuantize' for node in network.get_ops()):
+            network.reshape([1, 3, options.imgsz, options.imgsz])
+        shape = network.input().partial_shape
+        size = None if shape.is_dynamic else [shape[2].get_length(), shape[3].get_length()]
+        compiled = Network(network, about | {'size': size})
+        found = compiled(np.zeros((1, 3, *(size or [2 * about['stride']] * 2)), dtype=np.float32))
+    except Exception as error:  # OpenVINO has no exceptions of its own
+        raise ModelError(f'{file} cannot be run by OpenVINO: {first_line(error)}; export the '
+                         'network again') from error
+    wanted = 4 + len(about['names'])
+    if found.ndim != 3 or (found.shape[1] != wanted and found.shape[2] != 6):
+        raise ModelError(f'{file} is no detection network of {len(about["names"])} classes: its '
+                         f'output has the shape {found.shape}')
+    release_pages(file.with_suffix('.bin'))
+    return OpenVinoYolo(compiled)
+
+
+def _read_metadata(file: Path) -> dict[str, Any]:
+    try:
+        read = yaml.safe_load(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ModelError(f'{file} cannot be read: {first_line(error)}; export the network again'
+                         ) from error
+    for name, kind in _FIELDS.items():
+        value = read.get(name) if isinstance(read, dict) else None
+        if not isinstance(value, kind) or not value:
+            raise ModelError(f"{file}: the field '{name}' is missing or no {kind.__name__}: "
+                             'export the network again')
+    if read['task'] != 'detect':
+        raise ModelError(f"{file.parent} is a YOLO model for the task '{read['task']}': one for "
+                         "'detect' is needed")
+    if sorted(read['names']) != list(range(len(read['names']))) or not 1 <= read['stride'] <= 256:
+        raise ModelError(f"{file}: the field 'names' must have the keys 0, 1 ... and 'stride' "
+                         'must be 1 to 256: export the network again')
+    return {name: read[name] for name in ('names', 'stride')} | {
+        'end2end': bool(read.get('end2end'))}
+
+
+def load_converted(file: Path, options: YoloOptions) -> OpenVinoYolo:
+    """Return the network of a ``.pt`` file, converted once.
+
+    ConversionError: OpenVINO cannot run it as PyTorch does. ModelError: the file is damaged or no
+    detection model.
+    """
+    import torch
+
+    identity = [fingerprint_file(file), import_ultralytics().__version__, torch.__version__]
+    return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity,
+                                     lambda: _convert(file)))
+
+
+def _convert(file: Path) -> Conversion:
+    import torch
+
+    loaded = load_yolo(file)
+    model = loaded.model.float().eval().fuse(verbose=False)
+    stride = stride_of(model)
+    for module in model.modules():
+        if hasattr(module, 'export'):  # the head: it then has one output, for images of any size
+            module.export, module.dynamic, module.format = True, True, 'openvino'
+    probe = np.random.default_rng(0).random((1, 3, 2 * stride, 3 * stride), dtype=np.float32)
+    with torch.inference_mode():
+        outputs = model(torch.from_numpy(probe))
+        expected = outputs[0] if isinstance(outputs, tuple | list) else outputs
+    network = convert_module(model, torch.zeros(1, 3, 4 * stride, 4 * stride), (1, 3, -1, -1))
+    about = {'names': {int(number): str(name) for number, name in loaded.names.items()},
+             'stride': stride, 'size': None, 'end2end': bool(getattr(model, 'end2end', False))}
+    return Conversion(network, probe, expected.numpy(), about)
 
 
 class TorchYolo:

@@ -36,7 +36,7 @@ from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
-# The unit of depth is judged by the boxes of so many frames.
+# The unit of depth is judged by the boxes of this number of frames.
 _FRAMES_FOR_UNIT = 10
 _UNKNOWN = np.full((4, 4), np.nan)
 

@@ -37,7 +37,7 @@ class Answer:
     pose: PoseWithCovarianceStamped | None = None  #: None unless accepted
     #: When the image arrived (monotonic clock) [s]; -inf without one
     received_at: float = -math.inf
-    #: What the robot knew at the stamp of the image; None without an image
+    #: The robot's state at the stamp of the image; None without an image
     state: RobotState | None = None
     #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
@@ -79,7 +79,7 @@ class RequestCounters:
             self._longest_s = max(self._longest_s, duration_s)
 
     def values(self) -> dict[str, object]:
-        """Return the counts; they only grow until the node is started anew."""
+        """Return the counts; they only grow until the node is restarted."""
         with self._lock:
             return {'requests': self._counts.total(),
                     **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},

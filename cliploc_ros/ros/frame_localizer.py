@@ -65,7 +65,7 @@ logger = logging.getLogger(__name__)
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 #: Value of keyframes_file for the layer next to the map, if there is one.
 NEXT_TO_MAP = 'auto'
-# Without so much time left, the objects' answer stands: extracting features cannot be stopped.
+# With less time left, the objects' answer stands: extracting features cannot be stopped.
 _LEAST_S = 0.5
 
 

@@ -311,8 +311,8 @@ class WakeUp(Node):
             return _verdict_of(message), message
         self._client.remove_pending_request(future)
         return Verdict.FAILED, self._status.problem() or (
-            f'no answer within {time.monotonic() - begun_at:.0f} s: the relocalizer was started '
-            'anew, or the network lost it')
+            f'no answer within {time.monotonic() - begun_at:.0f} s: the relocalizer was '
+            'restarted, or the network lost it')
 
     def _turn(self) -> str:
         """Turn before the next look, where that is possible; return what was done."""

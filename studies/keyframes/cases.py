@@ -58,9 +58,9 @@ class Case:
     picture: tuple[str, float] | None = None  # of the mapped place: kind, share of the image
     looks: int = 1  # 2: the robot looks once more from 20 cm aside
     is_strange: bool = False  # the image is of another site: every accepted pose is false
-    focal: float = 1.0  # the robot takes the focal length for so many times the true one
+    focal: float = 1.0  # the robot takes the focal length for this many times the true one
     features: int = 2000
-    draws_classes: bool = False  # the class of each box is drawn anew
+    draws_classes: bool = False  # the class of each box is drawn again
     prior: str = ''  # known wrongly: 'height' (1 to 3 m too high) or 'vertical' (by 30 degrees)
     world: Callable[[World, Rng], World] | None = None  # changes map and layer
     truths: tuple[int, ...] = (0,)  # where the query is, in shifts of the world: the first counts

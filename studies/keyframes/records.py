@@ -154,7 +154,7 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
                  ) -> Callable[[tuple[Place, str]], None]:
     """Return what collects the records of a case at a place, or builds the place: without one.
 
-    All images are asked in the plain case, in the others at most so many queries.
+    All images are asked in the plain case, in the others at most a number of queries.
     """
     import torch
 
@@ -248,7 +248,7 @@ def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place
     model : str
         Weights of YOLO for real images.
     blocks : sequence of int
-        Besides the interleaved images and the halves, parts of so many images in turn.
+        Besides the interleaved images and the halves, parts of that number of images in turn.
     """
     path, _, unit = where.partition('@')
     folder = Path(path)

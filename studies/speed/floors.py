@@ -65,7 +65,7 @@ def make_floor(objects: int, seed: int = 0) -> Floor:
     room_centers = np.array([_grid_place(room) for room in range(rooms)]) * pitch
     places = np.repeat(np.arange(2 * rooms), np.tile([_IN_ROOM, _IN_CORRIDOR], rooms))[:objects]
     typical = np.array([TYPICAL[name] for name in CLASS_NAMES])
-    shares = 1.0 / (0.1 + typical[:, :3].max(axis=1))  # large things are rarer
+    shares = 1.0 / (0.1 + typical[:, :3].max(axis=1))  # fewer large things
     classes = rng.choice(len(CLASS_NAMES), objects, p=shares / shares.sum())
     sizes = typical[classes]
     sizes[:, :3] *= rng.uniform(0.85, 1.15, (objects, 3))

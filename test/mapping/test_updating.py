@@ -115,7 +115,7 @@ def test_what_is_kept_of_a_landmark():
 
 
 def test_the_better_position_wins():
-    """A landmark is fitted anew if the recording knows it better; else it stays where it is."""
+    """A landmark is fitted again if the recording knows it better; else it stays where it is."""
     things = make_things()
     rng = np.random.default_rng(0)
     wrong = things.centers + rng.normal(scale=0.03, size=things.centers.shape)

@@ -55,7 +55,7 @@ class Genuine(NamedTuple):
 
 
 class Attitude(NamedTuple):
-    """What an attitude says against a pose."""
+    """The evidence of an attitude against a pose."""
 
     wrong_mount: float
     not_mirrored: float

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The poses that may be right, of every source, and what the objects say of each.
+"""The poses that may be right, of every source, and the evidence of the objects for each.
 
 A mirror image, of a room in a mirror or of a flipped camera, may be explained well, too. A camera
 on the other side of a plane sees the points of the plane mirrored, at the same distances: objects
@@ -58,7 +58,7 @@ class JoinedFrames(NamedTuple):
 
     @property
     def setting(self) -> Setting:
-        """Return what the chance of a wrong pose depends on, besides the supports."""
+        """Return the setting: besides the supports, the chance of a wrong pose depends on it."""
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 

@@ -166,7 +166,7 @@ def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Candidate]
 
 
 def _missed(pose: NDArray[np.float64], seen: Recognition, recognizer: ImageRecognizer) -> float:
-    """Return what it says against a pose (4, 4) that keyframes near it do not recognize it."""
+    """Return the evidence against a pose (4, 4) that keyframes near it do not recognize."""
     if not seen.is_complete or any(SAME_ANSWER.agree(pose, one.map_from_camera)
                                    for one in seen.places):
         return 0.0

@@ -42,8 +42,8 @@ class Support:
     #: labels on average, in standard deviations, summed
     likeness: float = 0.0
     #: Summed over the objects that have a class of their landmark: the logarithm of the map's
-    #: number of landmarks for each landmark of this class. A chance match of a rare class is rarer
-    #: than one of a common class. A class that the detector takes the landmark for at times counts
+    #: number of landmarks for each landmark of this class. A rare class is matched by chance less
+    #: often than a common one. A class that the detector takes the landmark for at times counts
     #: by its share, see ClassIndex.shares.
     rarity: float = 0.0
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
@@ -93,7 +93,7 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                    map_from_camera: NDArray[np.float64], matches: Sequence[Match]
                    ) -> NDArray[np.float64]:
-    """Return what each match (m, 5) adds to a support."""
+    """Return the terms of each match (m, 5) in a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
@@ -160,7 +160,7 @@ _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 
 
 class Setting(NamedTuple):
-    """What the chance of a wrong pose depends on, besides the supports."""
+    """The setting of a pose: besides the supports, the chance of a wrong pose depends on it."""
 
     landmarks: int  #: Number of landmarks in the map
     #: Standard deviation of the known vertical [deg]; infinite where none is known
@@ -173,7 +173,7 @@ class Setting(NamedTuple):
 
     @property
     def vertical(self) -> float:
-        """Return what the vertical rules out: 0 where none is known, 3.8 for one to 1 degree."""
+        """Return the log of the attitudes that it rules out: 3.8 to 1 degree, 0 for none."""
         return math.log(_VAGUE_VERTICAL_DEG / min(max(self.vertical_deg, _BEST_VERTICAL_DEG),
                                                   _VAGUE_VERTICAL_DEG))
 
@@ -219,7 +219,7 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
 
 
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
-    """Return what the points of a place say for it: log odds, against a place by chance."""
+    """Return the evidence of its points for a place: log odds, against a place by chance."""
     terms = calibration.keyframes
     return min(terms.most, terms.none + terms.inliers * math.log(max(1, place.inliers))
                + terms.confirmed * place.confirmed)

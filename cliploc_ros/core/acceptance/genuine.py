@@ -31,7 +31,7 @@ from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
 SURE_MOTION = float(chi2.ppf(0.95, 6))
 # Distances of pictures from the first camera [m], and how many points are tried on them.
 _PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
-# A camera sees what is further ahead than this [m].
+# A camera sees points that are further ahead than this [m].
 _AHEAD_M = 0.1
 
 
@@ -93,7 +93,7 @@ def _on_picture(first: RecognizedPlace, first_from_second: NDArray[np.float64], 
     return find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
 
 
-# Errors of the intrinsics count from so many deviations on, and no further than this.
+# Errors of the intrinsics count from the first number of deviations on, up to the second.
 _SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25
 # Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
 _CENTRAL = (5.0, 95.0)
@@ -155,5 +155,5 @@ def chance_genuine(signs: Signs, motion: Motion | None = None,
 
 
 def _error(ratio: float, deviation: float) -> float:
-    """Return the logarithm of a ratio beyond what its deviation explains."""
+    """Return the logarithm of a ratio, less the part that its deviation explains."""
     return min(max(abs(math.log(ratio)) - _SURE_DEVIATIONS * deviation, 0.0), _MOST_ERROR)

@@ -26,7 +26,8 @@ from cliploc_ros.core.map.pairs import find_repeats
 
 # All constants are chosen on simulated worlds, see studies.worlds: kinds room,
 # office, shop, corridor, hall and two rooms, seeds 0 to 59.
-# A place: what a pose matched, and what is nearer to it than this; at most so many landmarks.
+# A place: landmarks that a pose matched, and those nearer to it than this; at most
+# _MOST_LANDMARKS of them.
 _PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
 # Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
 _LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
@@ -187,7 +188,7 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
 
 def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
               ) -> NDArray[np.int64]:
-    """Return the first moves that differ from those before them, so many at most."""
+    """Return the first moves that differ from those before them, up to a number."""
     same = _are_same(moves, point)
     kept = np.empty(0, dtype=np.int64)
     for row in range(len(moves)):
@@ -199,7 +200,7 @@ def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
               position: NDArray[np.float64]
               ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return moves (m, 4, 4) fitted to a place, and what they take its landmarks (m, r) to."""
+    """Return moves (m, 4, 4) fitted to a place, and its landmarks (m, r) after each."""
     centers = landmark_map.centers[rows]
     for near_m in _NEAR_M:
         ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]

@@ -235,7 +235,7 @@ class _Fit(NamedTuple):
 
     @property
     def information(self) -> NDArray[np.float64]:
-        """Return what each match tells (m, 6, 6)."""
+        """Return the information of each match (m, 6, 6)."""
         return np.asarray((self.jacobian * self.weights[:, :, None]).transpose(0, 2, 1)
                           @ self.jacobian)
 
@@ -263,7 +263,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
     information = of_objects.sum(axis=0) + verticals + prior
-    # What the edges' errors add to M, for each object (n, 6, 6).
+    # The part of the edges' errors in M, for each object (n, 6, 6).
     # an edge is as far off as its weight says, in the same direction in all frames
     pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, None, None] * fit.jacobian,
                   fit.objects, len(fit.sigmas))
@@ -285,7 +285,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of what the covariance gains if each of n objects in turn is left out."""
+    """Return the sum of the gains of the covariance with each of n objects left out in turn."""
     limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
@@ -357,21 +357,21 @@ def _mean_square(fit: _Fit) -> float:
 
 
 def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what the errors of the landmarks' positions add to M, for each object (n, 6, 6)."""
+    """Return the part of the landmarks' position errors in M, for each object (n, 6, 6)."""
     pulls = fit.sigmas[:, None, None] * of_objects[:, :, :3]
     return np.asarray(pulls @ pulls.transpose(0, 2, 1))
 
 
 def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
                   ) -> NDArray[np.float64]:
-    """Return what the errors that n objects have in common add to M (6, 6)."""
+    """Return the part of the errors that n objects have in common in M (6, 6)."""
     pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
     return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
                     stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return what the errors of odometry add to M (6, 6)."""
+    """Return the part of the errors of odometry in M (6, 6)."""
     noise = np.zeros((6, 6))
     order = np.argsort(stamps_ns, kind='stable')
     last = int(np.argmax(order == len(order) - 1))

@@ -256,7 +256,7 @@ def refine_rig(rig, rotation, translation):
     """
     found = verify_rig(rig, rotation, translation)
     best_score = found.score
-    # so many boxes fix a pose
+    # this many boxes fix a pose
     least = 3
     for vertical in rig.verticals:
         if vertical[6] > 0.0:

@@ -148,7 +148,7 @@ def camera_pose(camera, rotation, translation):
 
 
 class Verified(NamedTuple):
-    """What a pose explains: n detections, those of several frames one behind the other."""
+    """The matches of a pose: n detections, those of several frames one behind the other."""
 
     score: float  #: Sum of the IoUs
     ious: NDArray[np.float64]  #: (n,): IoU of each detection with its landmark; 0 if it has none
@@ -157,7 +157,7 @@ class Verified(NamedTuple):
 
 @compiled
 def verify_rig(rig, rotation, translation):
-    """Return what a pose of the reference (3, 3), (3,) explains in all frames: Verified."""
+    """Return the matches of a pose of the reference (3, 3), (3,) in all frames."""
     starts = rig.starts.boxes
     ious = np.full(starts[-1], rig.scene.iou_threshold)
     landmarks = np.full(starts[-1], -1)

@@ -111,7 +111,7 @@ class Tolerance(NamedTuple):
         return np.asarray(near & (traces > self.least_trace))
 
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
-        """Return a tolerance that allows so much more."""
+        """Return a tolerance that allows more by these amounts."""
         return Tolerance(self.distance_m + distance_m, min(180.0, self.angle_deg + angle_deg))
 
 

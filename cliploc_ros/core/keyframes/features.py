@@ -39,7 +39,7 @@ class Features:
 
 
 def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800) -> Features:
-    """Return the strongest features of an image (h, w, 3), at most so many.
+    """Return the strongest features of an image (h, w, 3), up to a number.
 
     A larger image is made smaller first: it bounds the time. Features of different sizes of an
     image match: those that the smaller one lacks are its finest.

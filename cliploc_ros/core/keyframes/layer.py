@@ -35,7 +35,7 @@ from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, 
 WORDS = 1024
 # Descriptors that the words are learned from, and steps of k-means.
 _MOST_LEARNED, _STEPS = 50_000, 8
-# Focal lengths, as shares of the image's width, are equal to so much.
+# Focal lengths, as shares of the image's width, count as equal within this.
 _SAME_FOCAL = 0.02
 #: Deviations a metre from a keyframe: of points from depth, whose scale and registration are never
 #: exact (chosen on the kitchen), and of triangulated ones (a guess on the safe side).
@@ -75,7 +75,7 @@ class KeyframeLayer:
         return len(self.map_from_camera)
 
     def prepare(self) -> None:
-        """Compute what the first request would wait for."""
+        """Compute the indices now, so that the first request does not wait for them."""
         _ = self._profiles, self._unit_vocabulary
 
     def camera_note(self, camera: Camera) -> str:

@@ -44,9 +44,9 @@ NOTHING_KNOWN = Prior()
 # which has half as many as a keyframe, make one comparable.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
-# Points near each other share errors, and several keyframes have the same point: so many times as
-# large as those of as many independent points are the errors of poses and focal lengths. Of 570
-# right poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
+# Points near each other share errors, and several keyframes have the same point: the errors of
+# poses and focal lengths are this many times those of as many independent points. Of 570 right
+# poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
 _MUCH_ALIKE = 4.5
 # A rolling shutter stretches the image of a camera that turns: deviations of the logarithms of the
 # focal length and its aspect.
@@ -151,7 +151,7 @@ class KeyframeLocalizer:
         return Recognition(tuple(self._recognized(one, look) for one in places))
 
     def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
-        """Return the share of an image for which the layer knows what a pose (4, 4) sees.
+        """Return the share of an image that the layer knows at a pose (4, 4).
 
         It counts the cells of the image in which keyframes near the pose expect points. Where it
         is 0, no keyframe is near: that an image is not recognized says nothing about this place.
@@ -207,7 +207,7 @@ class KeyframeLocalizer:
         """Return which cells have inliers, of those where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The values are
-        the share, the one that is expected of so many inliers, whose density varies much from
+        the share, the one that is expected of this number of inliers, whose density varies from
         cell to cell (a geometric distribution), and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)
@@ -285,7 +285,7 @@ def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
 
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the keyframes that see what a pose sees, the most similar views first."""
+    """Return the keyframes whose views overlap that of a pose, the most similar first."""
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))

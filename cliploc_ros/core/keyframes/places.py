@@ -20,7 +20,7 @@ class RecognizedPlace(NamedTuple):
     inliers: int
     #: Share of the comparable cells of the image that show what the keyframes have there
     confirmed: float
-    #: The share that so many inliers would confirm if they were spread as usual: 0 to 1
+    #: The share that this number of inliers confirms if they are spread as usual: 0 to 1
     expected: float
     #: Number of cells that confirm, and of those that are comparable: the keyframes expect points
     #: there, and the image has features

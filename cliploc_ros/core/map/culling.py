@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import project
 from cliploc_ros.core.kernels.compiled import compiled
 
-#: Up to so many landmarks, comparing with all is faster than culling.
+#: Up to this number of landmarks, comparing with all is faster than culling.
 FEW = 64
 # Children of each sphere of the tree.
 _BRANCHES = 8

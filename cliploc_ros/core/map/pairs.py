@@ -31,7 +31,7 @@ _MIDDLE_BIN = 13
 _TURN_BINS = 24
 _TURN_STEP = 2.0 * pi / _TURN_BINS
 _LEAST_VOTES = 2
-# Keys tell so many classes apart.
+# Keys tell this number of classes apart.
 _CLASSES = 1 << 20
 # Bounds of time and memory: slots of votes, a power of 2, and pairs compared.
 _SLOTS, _MOST_COMPARED = 1 << 15, 100_000

@@ -75,7 +75,7 @@ def rarest_class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit
                             ) -> Candidates:
     """Return pairs of equal class, at most limit, beginning with the rarest classes.
 
-    The fewer landmarks a class has, the likelier a pair of it is right. Parameters are those of
+    A pair is the more probable, the fewer landmarks its class has. Parameters are those of
     class_candidates.
     """
     rarest_first = np.argsort(index.sizes_of(classes), kind='stable')

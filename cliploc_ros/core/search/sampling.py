@@ -18,7 +18,7 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.search.scene import Scene
 
 SAMPLE_SIZE = 3
-# An enumeration returns after so many steps of some nanoseconds each, even without a sample.
+# An enumeration returns after this number of steps of some nanoseconds, even without a sample.
 _MAX_STEPS = 500_000
 # A draw without a valid sample in this many attempts is skipped (its row is -1): the first
 # candidates of PROSAC may not have any.

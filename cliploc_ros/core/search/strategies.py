@@ -46,7 +46,7 @@ class Leaders(NamedTuple):
 
     @staticmethod
     def none_yet(count: int = MAX_DISTINCT) -> 'Leaders':
-        """Return room for so many leaders, all unused."""
+        """Return room for a number of leaders, all unused."""
         return Leaders(np.full(count, -1.0), np.zeros(count, dtype=np.int64),
                        np.full((count, 3), -1, dtype=np.int64),
                        np.zeros((count, 3, 3)), np.zeros((count, 3)))
@@ -138,7 +138,7 @@ class Progress(NamedTuple):
 
     tried: int  #: Hypotheses tried so far
     coverage: float  #: The share of its samples that were tried, 0 to 1
-    reach: int = 0  #: A progressive search has tried all samples among so many first candidates
+    reach: int = 0  #: A progressive search tried all samples among this number of candidates
 
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
@@ -232,7 +232,7 @@ class _Pace:
         return self._memory[:int(min(self._size, self._left))]
 
     def end(self, tried: int) -> None:
-        """Finish a block with so many samples, and choose the size of the next."""
+        """Finish a block with a number of samples, and choose the size of the next."""
         self._left -= tried
         elapsed = max(time.perf_counter() - self._start, 1e-9)
         wanted = int(self._size * min(_BLOCK_S / elapsed, 4.0))

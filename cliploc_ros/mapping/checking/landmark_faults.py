@@ -26,7 +26,7 @@ _OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
 _MAX_SHARED_VIEWS = 0.15
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
-# A landmark that so many frames should show and none does is missing.
+# A landmark is missing if this number of frames should show it and none does.
 _MIN_EXPECTED = 10
 _REACH = 1.2
 # A landmark that its boxes put farther away than all of these is in the wrong place. Guesses.

@@ -20,7 +20,7 @@ from cliploc_ros.mapping.checking.systematic import Correction
 
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
-#: A pose needs so many landmarks.
+#: A pose needs this number of landmarks.
 LANDMARKS_FOR_A_POSE = 3
 
 
@@ -208,7 +208,7 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
 
 
 def _percent(value: float) -> str:
-    """Return a share with so many digits that one just below its limit looks below it."""
+    """Return a share with enough digits to show that it is below its limit."""
     return f'{100.0 * value:.4g} %'
 
 

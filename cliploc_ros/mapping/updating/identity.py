@@ -36,7 +36,7 @@ _AMBIGUOUS_GAIN = 1.0
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
 # Objects in their place from which the usual similarity of two looks is learned.
 _FEWEST_LOOKS = 8
-# A landmark in its place is doubted if its look fits worse than usual by so many deviations.
+# A landmark in its place is doubted if its look fits worse than usual by more deviations.
 _DOUBT = 1.0
 
 

@@ -34,12 +34,12 @@ class UpdateOptions:
     gone_below: float = 0.05
     gone_below_if_taken: float = 0.5  #: The same where another object was found in its place
     there_above: float = 0.95
-    #: A place must be in view from so many viewpoints before its object can be missing
+    #: Its place must be in view from this number of viewpoints before an object can be missing
     least_views: int = 5
     #: A place is in view if the frame shows another landmark this close to its direction, and not
     #: nearer: otherwise a wall may hide it
     beside_deg: float = 20.0
-    hidden_share: float = 0.4  #: A place of which landmarks or boxes hide so much is not in view
+    hidden_share: float = 0.4  #: A place is out of view if landmarks or boxes hide this share
     #: A new landmark must be detected so often, in units of how often the old ones are
     min_new_share: float = 0.4
     min_confirmed: int = 3

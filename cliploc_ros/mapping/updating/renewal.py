@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The new map: what stays, what is fitted anew, what moves, what is added and what goes.
+"""The new map: what stays, what is fitted again, what moves, what is added and what goes.
 
 A landmark keeps its id, labels and classes. In its place, it also keeps its ellipsoid, unless the
 recording knows it better: then the centre is the mean of both, each weighted by its inverse
@@ -63,7 +63,7 @@ def renew(old: LandmarkMap, known: Known, objects: Objects, fates: Fates,
 
 def _refitted(known: Known, objects: Objects, fates: Fates, options: UpdateOptions
               ) -> dict[int, float]:
-    """Return the weight of the new centre for the confirmed landmarks that are fitted anew."""
+    """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
     rows = np.array([row for row in fates.confirmed
                      if known.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)

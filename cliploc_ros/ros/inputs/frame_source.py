@@ -145,7 +145,7 @@ class ExactPairing:
         self.dropped[topic] += 1
 
 
-#: A robot that is refused retries at once: discovering its publishers anew would cost it a tenth
+#: A robot that is refused retries at once: discovering its publishers again would cost it a tenth
 #: of a second.
 LINGER_S = 1.0
 _CHECK_PERIOD_S = 0.5

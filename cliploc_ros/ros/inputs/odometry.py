@@ -224,7 +224,7 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
 def _goes_on(poses: Sequence[_Pose], pose: _Pose) -> bool:
     """Return whether a pose after a silence is where the robot was, or on its way from there.
 
-    Its driver may have begun anew at another origin, which a robot could have reached by driving.
+    Its driver may have restarted at another origin, which a robot could have reached by driving.
     So it may have gone on as before or stopped, nothing else; after a long silence, it has to
     stand where it was.
     """

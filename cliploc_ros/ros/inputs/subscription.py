@@ -128,4 +128,4 @@ class AdaptiveSubscription:
             self._renewed_at = now
             self._renew(self._subscription)
         self._node.get_logger().warning(
-            f'an empty message on {self._topic}: subscribed anew')
+            f'an empty message on {self._topic}: subscribed again')

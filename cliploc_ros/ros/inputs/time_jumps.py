@@ -16,7 +16,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.units import NS_PER_S
 
-# Stamps may be so much ahead of /clock, which comes at 10 Hz or more (a guess).
+# Stamps may be this far ahead of /clock, which comes at 10 Hz or more (a guess).
 _MAX_AHEAD_NS = NS_PER_S // 5
 # DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
 _MAX_DISORDER_NS = NS_PER_S
@@ -88,7 +88,7 @@ class StampOrder:
         self._newest_ns: dict[str, int] = {}
 
     def goes_back(self, stream: str, at_ns: int) -> bool:
-        """Take in a stamp [ns]; return whether time jumped back, and begin anew if so."""
+        """Take in a stamp [ns]; return whether time jumped back, and forget all stamps if so."""
         newest_ns = self._newest_ns.get(stream, at_ns)
         jumped = at_ns < newest_ns - _MAX_DISORDER_NS
         if jumped:

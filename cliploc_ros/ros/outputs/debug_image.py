@@ -181,7 +181,7 @@ def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
 
 
 def _lines(text: str, width: int) -> list[str]:
-    """Break a text into lines of at most so many characters."""
+    """Break a text into lines of a number of characters at most."""
     lines = ['']
     for word in text.split():
         if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
