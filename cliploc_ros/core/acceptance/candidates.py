@@ -40,6 +40,11 @@ from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.frame_search import SearchedFrame
 
 _NONE = np.empty(0, dtype=np.int64)
+_FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
+_UP = np.array([0.0, 0.0, 1.0])
+# Planes that are tried, poses that are refined, and frames that count, the last ones: a camera
+# mirrors them all. Chosen on mirrored images of TUM fr3.
+_MOST_PLANES, _REFINED, _MOST_FRAMES = 16, 2, 3
 
 
 class JoinedFrames(NamedTuple):
@@ -131,13 +136,6 @@ def refined(joined: JoinedFrames, start: Finalist) -> Finalist:
     if not joined.options.refine:
         return start
     return start._replace(**refine_rig(joined.rig, start.rotation, start.translation)._asdict())
-
-
-_FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
-_UP = np.array([0.0, 0.0, 1.0])
-# Planes that are tried, poses that are refined, and frames that count, the last ones: a camera
-# mirrors them all. Chosen on mirrored images of TUM fr3.
-_MOST_PLANES, _REFINED, _MOST_FRAMES = 16, 2, 3
 
 
 def chance_not_mirrored(joined: JoinedFrames, best: Candidate) -> float:

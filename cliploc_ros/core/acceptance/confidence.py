@@ -28,6 +28,8 @@ _SAME_BOX_IOU = 0.8
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
+# Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
+_BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,6 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
-
-
-# Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
-_BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
 
 
 class Setting(NamedTuple):
