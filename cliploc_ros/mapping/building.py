@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of mapping: posed detections in, a map and a report out."""
+"""What mapping says about its result: what it found, what it left out and why."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +13,26 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import Evidence, gather_evidence, reasons_against
+from cliploc_ros.mapping.association import associate, merge_classes, merge_duplicates
+from cliploc_ros.mapping.evidence import (
+    Evidence,
+    explained_boxes,
+    gather_evidence,
+    reasons_against,
+)
 from cliploc_ros.mapping.fitting import fit_landmarks
-from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.joint import pose_errors, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, join_landmarks, no_landmarks
-from cliploc_ros.mapping.merging import merge_classes, merge_duplicates
 from cliploc_ros.mapping.mount import MountCorrection, refine_mount
 from cliploc_ros.mapping.odometry import Steps, link_frames
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.pose_noise import estimate_pose_errors, significant_pose_errors
+from cliploc_ros.mapping.pose_noise import (
+    estimate_pose_errors,
+    left_by_poses,
+    shared_by_neighbours,
+    significant_pose_errors,
+)
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.report import MappingReport, describe_left_out, explained_boxes
-from cliploc_ros.mapping.shared_errors import left_by_poses, shared_by_neighbours
 from cliploc_ros.mapping.triangulation import (
     SUPPORT_IOU,
     add_depths,
@@ -35,10 +41,75 @@ from cliploc_ros.mapping.triangulation import (
     options_with_depth,
     triangulate,
 )
-from cliploc_ros.mapping.views import Views, make_views, map_from_cameras, thin_out
+from cliploc_ros.mapping.views import Views, check_input, make_views, map_from_cameras, thin_out
 
+_REASONS_SHOWN = 10
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A landmark that is not good enough for the map."""
+
+    class_id: str
+    center: tuple[float, float, float]  #: [m]
+    #: Frames that show it, and their viewpoints
+    support: int
+    viewpoints: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class MappingReport:
+    """The result of mapping in numbers and words."""
+
+    frames: int
+    viewpoints: int
+    boxes: int
+    landmarks: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
+    explained: float
+    #: Of these boxes. Both are measured on the frames that the map was fitted to.
+    median_iou: float
+    #: Root mean square by which joint refinement moved the poses
+    pose_change_m: float
+    pose_change_deg: float
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the report as text."""
+        rows = [f'{self.landmarks} landmarks from {self.frames} frames of {self.viewpoints} '
+                f'viewpoints with {self.boxes} boxes',
+                f'explained boxes: {self.explained:.1%}, median IoU {self.median_iou:.3f} '
+                '(on the frames used for fitting)']
+        if self.pose_change_m > 0.0:
+            rows.append(f'poses refined by {self.pose_change_m * 100:.1f} cm and '
+                        f'{self.pose_change_deg:.2f} degrees (root mean square)')
+        rows += [f'note: {note}' for note in self.notes]
+        if self.left_out:
+            rows.append(f'left out: {len(self.left_out)}')
+        rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
+                 f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
+                 for one in self.left_out[:_REASONS_SHOWN]]
+        if len(self.left_out) > _REASONS_SHOWN:
+            rows.append(f'  and {len(self.left_out) - _REASONS_SHOWN} more')
+        return rows
+
+
+def describe_left_out(detections: PosedDetections, landmarks: Landmarks, evidence: Evidence,
+                      reasons: Sequence[str]) -> tuple[LeftOut, ...]:
+    """Return what was left out, that with the greatest support first."""
+    x_y_z = landmarks.centers.round(3).tolist()
+    return tuple(
+        LeftOut(detections.class_names[landmarks.classes[row]], tuple(x_y_z[row]),
+                int(evidence.support[row]), int(evidence.viewpoints[row]), reasons[row])
+        for row in np.argsort(-evidence.support, kind='stable'))
 
 
 class NothingFoundError(MappingError):

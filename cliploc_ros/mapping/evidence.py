@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.association import find_overlaps
+from cliploc_ros.mapping.association import find_overlaps, ious_with
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.projection import box_iou, project_box
 from cliploc_ros.mapping.views import Views, camera_centers
 
 # A landmark is expected in a frame that shows this share of its box, from no farther away than
 # this times the greatest distance at which it was detected.
 _SHOWN_SHARE = 0.6
 _REACH = 1.2
+# IoU from which a landmark explains a box of its class.
+_EXPLAINED_IOU = 0.3
 
 
 class Evidence(NamedTuple):
@@ -111,17 +112,6 @@ def widest_angle_deg(directions: NDArray[np.float64]) -> float:
 
 
 @compiled
-def ious_with(views, rows, center, basis):
-    """Return the IoU of an ellipsoid with each of some boxes; 0 where it is behind."""
-    ious, box = np.zeros(len(rows)), np.empty(4)
-    for place in range(len(rows)):
-        frame = views.frames[rows[place]]
-        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
-            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds)
-    return ious
-
-
-@compiled
 def count_expected(views, cameras, center, basis, reach):
     """Return in how many frames an ellipsoid lies in the image, and no farther than reach [m]."""
     count, box = 0, np.empty(4)
@@ -172,3 +162,29 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
 def _floor(value: float) -> str:
     """Return one decimal, never rounded up: 19.97 stays below 20."""
     return f'{np.floor(10.0 * value) / 10.0:.1f}'
+
+
+def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64] | None = None
+                    ) -> tuple[float, float]:
+    """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
+
+    Parameters
+    ----------
+    shown : ndarray (n,) of int, optional
+        The landmark that each box shows, -1 for none: explains a box although the landmark's
+        class is another one.
+    """
+    ious = best_ious(views, landmarks)
+    if shown is not None:
+        for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
+            own = ious_with(views, rows, landmarks.centers[number], landmarks.bases[number])
+            ious[rows] = np.maximum(ious[rows], own)
+    return explained(ious)
+
+
+def explained(ious: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the share of boxes that landmarks explain, by their best IoUs, and the median IoU."""
+    is_explained = ious > _EXPLAINED_IOU
+    if not is_explained.any():
+        return 0.0, 0.0
+    return float(is_explained.mean()), float(np.median(ious[is_explained]))

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.landmarks import Landmarks
-from cliploc_ros.mapping.projection import (
+from cliploc_ros.mapping.landmarks import (
     LANDMARK_SIZE,
     POSE_SIZE,
+    Landmarks,
     linearize_box,
     move_ellipsoid,
 )
@@ -45,7 +45,7 @@ class Fit(NamedTuple):
     center: NDArray[np.float64]
     basis: NDArray[np.float64]
     cost: float  #: Robust cost, the prior included
-    #: (9, 9): of centre and shape, see cliploc_ros.mapping.projection
+    #: (9, 9): of centre and shape, see cliploc_ros.mapping.landmarks
     information: NDArray[np.float64]
 
 

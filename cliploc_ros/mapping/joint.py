@@ -29,15 +29,15 @@ from cliploc_ros.mapping.fitting import (
     robust_cost,
     robust_weight,
 )
-from cliploc_ros.mapping.landmarks import Landmarks
-from cliploc_ros.mapping.odometry import Steps
-from cliploc_ros.mapping.options import PoseErrors
-from cliploc_ros.mapping.projection import (
+from cliploc_ros.mapping.landmarks import (
     LANDMARK_SIZE,
     POSE_SIZE,
+    Landmarks,
     linearize_box,
     move_ellipsoid,
 )
+from cliploc_ros.mapping.odometry import Steps
+from cliploc_ros.mapping.options import PoseErrors
 from cliploc_ros.mapping.views import Views, camera_centers
 
 _BEHIND_COST = 4.0 * 20.0

@@ -16,16 +16,19 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence, reasons_against
+from cliploc_ros.mapping.association import associate, merge_pairs, pairs_of_one_class
+from cliploc_ros.mapping.evidence import (
+    Evidence,
+    count_expected,
+    explained_boxes,
+    gather_evidence,
+    reasons_against,
+)
 from cliploc_ros.mapping.fitting import fit_landmarks
-from cliploc_ros.mapping.input_checks import check_input
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
-from cliploc_ros.mapping.merging import merge_pairs, pairs_of_one_class
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.report import explained_boxes
-from cliploc_ros.mapping.views import Views, camera_centers, make_views
+from cliploc_ros.mapping.views import Views, camera_centers, check_input, make_views
 
 # Boxes overlap less with a landmark that is off than with a fitted one. The first rounds take
 # them from this IoU on.

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_towers import (
     cut_padding,
-    load_text_tower,
-    load_tower,
+    load_image_tower,
+    load_one_tower,
     quiet_root_logger,
 )
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
@@ -51,14 +51,7 @@ def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder
 
     The labels' embeddings come from the cache if it knows model, weights and labels; then the text
     tower is never loaded. Otherwise the text tower is loaded first, alone, and freed before the
-    image tower is loaded.
-
-    Parameters
-    ----------
-    options : ClipOptions
-        Which CLIP, and how to run it.
-    labels : sequence of str or WeightedLabels
-        What describes each landmark of the map; they may repeat.
+    image tower is loaded. Labels may repeat.
 
     Raises
     ------
@@ -108,13 +101,6 @@ def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[s
 class ClipEncoder:
     """An `ImageTextEncoder` that keeps the image tower alone in memory.
 
-    Parameters
-    ----------
-    weights : ClipWeights
-        What `resolve_clip_weights` found.
-    options : ClipOptions
-        Device, precision and largest batch.
-
     Raises
     ------
     ModelError
@@ -126,36 +112,20 @@ class ClipEncoder:
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
         self._weights = weights
         self._max_batch = options.max_batch
-        self._device = resolve_device(options.device)
-        self._tower = load_tower(weights, options, self._device)
+        device = resolve_device(options.device)
+        self._tower = load_image_tower(weights, options, device)
         shortens = weights.preprocess.get('image_resize_mode', 'shortest') == 'shortest'
         self._max_aspect = _MAX_ASPECT if shortens else sys.maxsize
+        #: Equal keys (model and weights) give equal label embeddings.
+        self.key = weights.key
+        self.device = str(device)
+        self.inference = self._tower.inference  #: 'pytorch' or 'openvino'
+        self.embed_dim = weights.embed_dim  #: The length d of an embedding
         # The first pass sets up kernels and memory: do it before the first request.
         self.encode_crops(np.zeros((32, 32, 3), dtype=np.uint8), np.array([[0.0, 0, 32, 32]]))
 
-    @property
-    def key(self) -> str:
-        """Identify model and weights: equal keys give equal label embeddings."""
-        return self._weights.key
-
-    @property
-    def device(self) -> str:
-        """Return where the network runs."""
-        return str(self._device)
-
-    @property
-    def inference(self) -> str:
-        """Return what runs the network: 'pytorch' or 'openvino'."""
-        return self._tower.inference
-
-    @property
-    def embed_dim(self) -> int:
-        """Return the length d of an embedding."""
-        return self._weights.embed_dim
-
-    def encode_crops(
-        self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
+                     ) -> NDArray[np.float32]:
         """Return one embedding for each box of an image.
 
         A crop holds every pixel that its box touches. open_clip's own preprocessing prepares the
@@ -164,7 +134,6 @@ class ClipEncoder:
         Parameters
         ----------
         image_rgb : ndarray (h, w, 3) uint8
-            The image, red first.
         bboxes_xyxy : ndarray (n, 4)
             Left, top, right, bottom [px]; `visible_boxes` finds those that can be cropped.
 
@@ -182,76 +151,63 @@ class ClipEncoder:
         ModelError
             When memory runs out, or the tower gives no finite numbers.
         """
-        check_image_rgb(image_rgb)
-        bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
-        embeddings = [self._encode_batch(image_rgb, bounds[start:start + self._max_batch])
-                      for start in range(0, len(bounds), self._max_batch)]
-        return _as_rows(embeddings, self.embed_dim, self._weights)
-
-    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
-        """Return the embeddings (L, d) of labels; loads the text tower and frees it again."""
-        return encode_labels(self._weights, labels, self._device)
-
-    def _encode_batch(
-        self, image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64]
-    ) -> 'torch.Tensor':
         import torch
         from PIL import Image
 
-        crops = [Image.fromarray(np.ascontiguousarray(_cut(image_rgb, row, self._max_aspect)))
-                 for row in bounds]
-        batch = torch.stack([self._tower.preprocess(crop) for crop in crops])
-        try:
-            with torch.inference_mode():
-                return _normalize(self._tower(batch))
-        except torch.cuda.OutOfMemoryError as error:
-            raise ModelError(f'the GPU has no memory left for {len(crops)} crops at once: lower '
-                             'max_batch or choose a smaller model') from error
+        check_image_rgb(image_rgb)
+        bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
+        embeddings = []
+        for start in range(0, len(bounds), self._max_batch):
+            crops = [Image.fromarray(np.ascontiguousarray(_cut(image_rgb, row, self._max_aspect)))
+                     for row in bounds[start:start + self._max_batch]]
+            batch = torch.stack([self._tower.preprocess(crop) for crop in crops])
+            try:
+                with torch.inference_mode():
+                    embeddings.append(_normalize(self._tower(batch)))
+            except torch.cuda.OutOfMemoryError as error:
+                raise ModelError(f'the GPU has no memory left for {len(crops)} crops at once: '
+                                 'lower max_batch or choose a smaller model') from error
+        return _as_rows(embeddings, self._weights)
+
+    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
+        """Return the embeddings (L, d) of labels; loads the text tower and frees it again."""
+        return encode_labels(self._weights, labels, resolve_device(self.device))
 
 
-def encode_labels(
-    weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
-) -> NDArray[np.float32]:
+def encode_labels(weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
+                  ) -> NDArray[np.float32]:
     """Return one embedding (L, d) for each label, float32 rows of unit length.
 
     This loads the text tower and frees it afterwards. The tower runs in fp32 on any device, so
     that a cache made on one machine serves another. A label longer than the model's context is
     cut, with a warning.
     """
-    if not labels:
-        return np.empty((0, weights.embed_dim), dtype=np.float32)
-    embeddings = _run_text_tower(weights, labels, device)
+    embeddings = _run_text_tower(weights, labels, device) if labels else []
     free_memory()
-    return _as_rows(embeddings, weights.embed_dim, weights)
+    return _as_rows(embeddings, weights)
 
 
-def _run_text_tower(
-    weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
-) -> 'list[torch.Tensor]':
+def _run_text_tower(weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
+                    ) -> 'list[torch.Tensor]':
     import open_clip
     import torch
 
     with quiet_root_logger():
         tokenizer = open_clip.get_tokenizer(weights.model)
-    _warn_of_long_labels(tokenizer, labels)
-    model, tokens = cut_padding(load_text_tower(weights, device), tokenizer(list(labels)))
+    room = tokenizer.context_length - 2  # between the start and end tokens
+    for label in labels:
+        if (count := len(tokenizer.encode(label))) > room:
+            logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
+                           'rest', label, count, room)
+    model, _ = load_one_tower(weights, 'text', device, 'fp32')
+    tokens = cut_padding(model, tokenizer(list(labels)))
     with torch.inference_mode():
         return [_normalize(model.encode_text(batch.to(device), normalize=False))
                 for batch in tokens.split(_LABEL_BATCH)]
 
 
-def _warn_of_long_labels(tokenizer: Any, labels: Sequence[str]) -> None:
-    room = tokenizer.context_length - 2  # between the start and end tokens
-    for label in labels:
-        tokens = len(tokenizer.encode(label))
-        if tokens > room:
-            logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
-                           'rest', label, tokens, room)
-
-
-def _cut(
-    image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64], max_aspect: int
-) -> NDArray[np.uint8]:
+def _cut(image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64], max_aspect: int
+         ) -> NDArray[np.uint8]:
     """Return a crop; cut a very long one to its middle.
 
     open_clip scales the short side up to the tower's input before it cuts a square from the
@@ -271,12 +227,9 @@ def _normalize(features: 'torch.Tensor') -> 'torch.Tensor':
     return torch.nn.functional.normalize(features.float(), dim=-1).cpu()
 
 
-def _as_rows(
-    embeddings: 'list[torch.Tensor]', embed_dim: int, weights: ClipWeights
-) -> NDArray[np.float32]:
-    if not embeddings:
-        return np.empty((0, embed_dim), dtype=np.float32)
-    rows = np.concatenate([batch.numpy() for batch in embeddings])
+def _as_rows(embeddings: 'list[torch.Tensor]', weights: ClipWeights) -> NDArray[np.float32]:
+    rows = np.concatenate([np.empty((0, weights.embed_dim), dtype=np.float32),
+                           *(batch.numpy() for batch in embeddings)])
     if not np.isfinite(rows).all():
         raise ModelError(f'{weights.file} gives embeddings that are not finite: the weights are '
                          'corrupt, or overflow in fp16 (set the precision to fp32)')

@@ -96,15 +96,18 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     tag = open_clip.get_pretrained_cfg(model, options.pretrained)
     file = Path(options.checkpoint_path or options.pretrained).expanduser().absolute()
     if not tag and (options.checkpoint_path or not file.exists()):
-        raise _unknown_pretrained(model, options)
+        name = options.pretrained
+        if os.sep in name or name.endswith(_WEIGHT_SUFFIXES):
+            raise ModelError(f'{name} does not exist: check the path of the weights')
+        tags = open_clip.list_pretrained_tags_by_model(model)
+        raise ModelError(f"unknown weights '{name}' for CLIP model '{model}'"
+                         f"{_nearest(name, tags)} (there are: {', '.join(tags) or 'none'})")
     if tag and not options.checkpoint_path:
-        file = _cached_file(tag, options) or _download(model, tag, options)
+        file = _downloaded(model, tag, options)
     check_weights_file(file)
     quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or is_torchscript(file))
     return ClipWeights(
-        model=model,
-        file=file,
-        quick_gelu=quick_gelu,
+        model=model, file=file, quick_gelu=quick_gelu,
         preprocess={f'image_{name}': tag[name] for name in
                     ('mean', 'std', 'interpolation', 'resize_mode') if name in tag},
         embed_dim=config['embed_dim'],
@@ -140,69 +143,40 @@ def is_torchscript(file: Path) -> bool:
         return any(name.endswith('/constants.pkl') for name in archive.namelist())
 
 
-def _unknown_pretrained(model: str, options: ClipOptions) -> ModelError:
-    import open_clip
-
-    name = options.pretrained
-    if os.sep in name or name.endswith(_WEIGHT_SUFFIXES):
-        return ModelError(f'{name} does not exist: check the path of the weights')
-    tags = open_clip.list_pretrained_tags_by_model(model)
-    return ModelError(f"unknown weights '{name}' for CLIP model '{model}'{_nearest(name, tags)} "
-                      f"(there are: {', '.join(tags) or 'none'})")
-
-
 def _nearest(name: str, known: Iterable[str]) -> str:
     by_lower_case = {known_name.lower(): known_name for known_name in known}
     near = difflib.get_close_matches(name.lower(), by_lower_case, n=4, cutoff=0.5)
     return f': did you mean {", ".join(by_lower_case[match] for match in near)}?' if near else ''
 
 
-def _weights_folder(options: ClipOptions) -> Path:
-    return resolve_cache_dir(options.cache_dir) / 'weights'
-
-
-def _hub_files(tag: dict[str, Any]) -> tuple[str, tuple[str, str]]:
-    """Return the repository of a tag's weights and their two possible names, safetensors first."""
-    from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
-
-    repository, name = os.path.split(tag.get('hf_hub', ''))
-    if not name:
-        return repository, (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME)
-    return repository, (str(Path(name).with_suffix('.safetensors')), name)
-
-
-def _cached_file(tag: dict[str, Any], options: ClipOptions) -> Path | None:
-    """Return the file of an earlier download, from our folder or the hub's own cache.
+def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
+    """Return the file of an earlier download, in our folder or the hub's, or download it.
 
     `hf_hub_download` would ask the network first, and a robot without one would wait at each
     start.
     """
     import huggingface_hub
+    from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
 
-    repository, names = _hub_files(tag)
-    for folder in (_weights_folder(options), None):
-        for name in names if repository else ():
-            found = huggingface_hub.try_to_load_from_cache(repository, name, folder)
-            if isinstance(found, str):
-                return Path(found)
-    return None
-
-
-def _download(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
-    import huggingface_hub
-
-    repository, (newer, older) = _hub_files(tag)
-    folder = _weights_folder(options)
     what = f"the weights '{options.pretrained}' of CLIP model '{model}'"
+    repository, name = os.path.split(tag.get('hf_hub', ''))
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
                          'clip_checkpoint_path to the file')
+    newer, older = ((str(Path(name).with_suffix('.safetensors')), name) if name
+                    else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
+    own = resolve_cache_dir(options.cache_dir) / 'weights'
+    for folder in (own, None):
+        for one in (newer, older):
+            found = huggingface_hub.try_to_load_from_cache(repository, one, folder)
+            if isinstance(found, str):
+                return Path(found)
 
     def fetch() -> str:
         # Where packets are dropped, this gives up after 10 s and hf_hub_download after 6 minutes.
-        name = newer if huggingface_hub.file_exists(repository, newer) else older
-        return str(huggingface_hub.hf_hub_download(repository, name, cache_dir=folder))
+        wanted = newer if huggingface_hub.file_exists(repository, newer) else older
+        return str(huggingface_hub.hf_hub_download(repository, wanted, cache_dir=own))
 
-    return download(what, folder, (
+    return download(what, own, (
         f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
         'on another machine and set clip_checkpoint_path to the file'), fetch)

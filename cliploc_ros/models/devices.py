@@ -73,12 +73,7 @@ def resolve_precision(precision: str, device: 'torch.device') -> str:
 def resolve_inference(inference: str, device: 'torch.device', precision: str) -> str:
     """Return 'pytorch' or 'openvino'; 'auto' means OpenVINO on a CPU, where it is installed.
 
-    Parameters
-    ----------
-    inference : str
-        One of INFERENCES.
-    precision : str
-        'fp16' or 'fp32'.
+    The precision is 'fp16' or 'fp32'.
 
     Raises
     ------

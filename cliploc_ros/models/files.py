@@ -1,13 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of weights: whether they are intact, their fingerprint."""
+"""Files of weights: whether they are intact, their fingerprint; folders of a cache."""
 
 import errno
 import hashlib
 import logging
+import shutil
 import struct
+import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from cliploc_ros.errors import ModelError
@@ -16,6 +18,9 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
+# A writer that takes longer than this was killed [s].
+_STALE_S = 24 * 3600.0
+
 logger = logging.getLogger(__name__)
 
 
@@ -75,38 +80,38 @@ def damaged(path: Path, reason: object) -> ModelError:
 
 
 def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path]) -> Path:
-    """Download a file with a library's own function.
+    """Download a file with a library's own function; ModelError: that fails.
 
-    Parameters
-    ----------
-    what : str
-        Name of the file or weights, for the log and the error.
-    folder : Path
-        Where the file goes; made if it does not exist.
-    remedy : str
-        What the user can do without a network, for the error.
-    fetch : callable
-        Downloads the file and returns its path. It must leave no partial file under that path.
-
-    Raises
-    ------
-    ModelError
-        When the download fails.
+    ``fetch`` returns the file's path and must leave no partial file there. The folder is made if
+    it does not exist. The error names ``what`` was to be downloaded, and as a remedy what the user
+    can do without a network.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return Path(fetch())
     except Exception as error:  # each library raises exceptions of its own
-        raise ModelError(f'cannot download {what}: {_reason(error, folder)}. {remedy}; or run '
-                         'prepare --cache-dir there, and set cache_dir to a copy of its folder'
-                         ) from error
+        reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            reason = f'the disk of {folder} is full: make room, or set cache_dir to another disk'
+        raise ModelError(f'cannot download {what}: {reason}. {remedy}; or run prepare --cache-dir '
+                         'there, and set cache_dir to a copy of its folder') from error
 
 
-def _reason(error: Exception, folder: Path) -> str:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f'the disk of {folder} is full: make room, or set cache_dir to another disk'
-    return f'{type(error).__name__}: {first_line(error).rstrip(".")}'
+def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
+    """Keep the entries of a cache that were used last; remove what killed writers left, too."""
+    def modified(entry: Path) -> float:
+        try:
+            return entry.stat().st_mtime
+        except OSError:  # another process has removed it
+            return -1.0
+
+    stale = [one for one in partial if 0.0 <= modified(one) < time.time() - _STALE_S]
+    for entry in sorted(entries, key=modified, reverse=True)[most:] + stale:
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
 
 
 def first_line(error: Exception) -> str:

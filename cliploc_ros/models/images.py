@@ -19,22 +19,11 @@ def check_image_rgb(image_rgb: NDArray[np.uint8]) -> None:
         raise ImageError(f'the image has no pixels: its shape is {image_rgb.shape}')
 
 
-def visible_boxes(
-    bboxes_xyxy: NDArray[np.float64], width: int, height: int
-) -> NDArray[np.bool_]:
-    """Find the boxes that can be cropped from an image.
+def visible_boxes(bboxes_xyxy: NDArray[np.float64], width: int, height: int
+                  ) -> NDArray[np.bool_]:
+    """Return which boxes (n, 4) can be cropped from an image, of left, top, right, bottom [px].
 
-    Parameters
-    ----------
-    bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px].
-    width, height : int
-        Size of the image [px].
-
-    Returns
-    -------
-    ndarray (n,) bool
-        False for boxes that are not finite, are empty or inverted, or do not overlap the image.
+    The others are not finite, are empty or inverted, or do not overlap the image.
     """
     bboxes_xyxy = _as_boxes(bboxes_xyxy)
     left, top, right, bottom = bboxes_xyxy.T
@@ -44,27 +33,12 @@ def visible_boxes(
     return np.isfinite(bboxes_xyxy).all(axis=1) & overlaps
 
 
-def crop_bounds(
-    bboxes_xyxy: NDArray[np.float64], width: int, height: int
-) -> NDArray[np.int64]:
-    """Return the pixels that each box touches: left, top and, exclusive, right, bottom.
+def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int
+                ) -> NDArray[np.int64]:
+    """Return the pixels (n, 4) that each box touches: left, top and, exclusive, right, bottom.
 
-    Parameters
-    ----------
-    bboxes_xyxy : ndarray (n, 4)
-        Left, top, right, bottom [px].
-    width, height : int
-        Size of the image [px].
-
-    Returns
-    -------
-    ndarray (n, 4) int64
-        Clamped to the image; every crop holds at least one pixel.
-
-    Raises
-    ------
-    CliplocError
-        For a box that `visible_boxes` would drop.
+    They are clamped to the image; every crop holds at least one pixel. CliplocError: for a box
+    that `visible_boxes` would drop.
     """
     bboxes_xyxy = _as_boxes(bboxes_xyxy)
     hidden = np.flatnonzero(~visible_boxes(bboxes_xyxy, width, height))

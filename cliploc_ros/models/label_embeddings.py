@@ -7,8 +7,6 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
-import time
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,11 +16,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from cliploc_ros.core.map.landmark_details import WeightedLabels
+from cliploc_ros.files.storage import replace_file
+from cliploc_ros.models.files import remove_unused
 
 _FORMAT = 1
 # A map of 1,000 labels takes 3 MB with ViT-L-14.
 _MOST_FILES = 32
-_STALE_S = 24 * 3600.0
 
 logger = logging.getLogger(__name__)
 #: The most labels that are encoded, cached and held at once: 134 MB of 512 numbers each.
@@ -38,14 +37,8 @@ class LabelCache:
     weights) and of the labels. The file holds both, which reveals a foreign or damaged one. One
     file holds the whole set, not one label: embeddings then never depend on earlier batches, and
     an edit of the map costs one cold start. Files are written under another name and renamed, so
-    that any number of processes may share the folder. A hit marks its file as used.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder; made at the first write.
-    most_files : int
-        Beyond these, the least recently used files are removed.
+    that any number of processes may share the folder. A hit marks its file as used; beyond
+    ``most_files``, the least recently used ones are removed. The first write makes the folder.
     """
 
     def __init__(self, folder: Path, most_files: int = _MOST_FILES) -> None:
@@ -78,31 +71,15 @@ class LabelCache:
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            # Remove the least recently used files, and those of writers that were killed.
-            kept = sorted(self._folder.glob('labels-*.npz'), key=_modified, reverse=True)
-            stale = [one for one in self._folder.glob('.*.tmp')
-                     if _modified(one) < time.time() - _STALE_S]
-            for old in kept[self._most_files - 1:] + stale:
-                old.unlink(missing_ok=True)
-            self._write(file, key, labels, embeddings)
+            remove_unused(self._folder.glob('labels-*.npz'),
+                          self._folder.glob('.*.labels-*.npz'), self._most_files - 1)
+            with replace_file(file) as partial:
+                np.savez(partial, embeddings=embeddings,
+                         identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
         except OSError as error:
             logger.warning('label embeddings are not cached and the next start is slow again: '
                            'cannot write %s (%s); make room, or choose a writable cache_dir',
                            file, error.strerror or error)
-
-    def _write(
-        self, file: Path, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]
-    ) -> None:
-        descriptor, name = tempfile.mkstemp(dir=self._folder, prefix='.', suffix='.tmp')
-        try:
-            with os.fdopen(descriptor, 'wb') as opened:
-                np.savez(opened, embeddings=embeddings,
-                         identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
-                opened.flush()
-                os.fsync(opened.fileno())
-            Path(name).replace(file)
-        finally:
-            Path(name).unlink(missing_ok=True)
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()
@@ -118,59 +95,35 @@ def _identity(key: str, labels: Sequence[str]) -> bytes:
     return json.dumps([_FORMAT, key, list(labels)]).encode()
 
 
-def _modified(file: Path) -> float:
-    try:
-        return file.stat().st_mtime
-    except OSError:  # another process has removed it
-        return 0.0
-
-
 def mixed_rows(descriptions: Sequence[WeightedLabels],
                encode: Callable[[Sequence[str]], NDArray[np.float32]], embed_dim: int
                ) -> NDArray[np.float32]:
     """Return one embedding (R, embed_dim) for each description.
 
     It is the weighted mean of the embeddings of the labels, scaled to unit length. A single label
-    keeps its embedding.
-
-    Parameters
-    ----------
-    encode : callable
-        Returns the embeddings (m, embed_dim) of m labels, unit rows. It is called with sorted
-        labels, at most PART at once.
+    keeps its embedding. ``encode`` returns the embeddings (m, embed_dim) of m labels, unit rows.
+    It is called with sorted labels, at most PART at once.
     """
     labels = sorted({label for one in descriptions for label, _ in one})
-    weights = _weights(descriptions, labels)
-    rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
-    for start in range(0, len(labels), PART):
-        part = slice(start, start + PART)
-        # passed on, not kept: the next part is encoded after this one is freed
-        rows = _plus(rows, weights[:, part], encode(labels[part]))
-    is_mixed = np.diff(weights.indptr) > 1
-    for block in _blocks(len(rows)):
-        lengths = np.sqrt(np.einsum('ij,ij->i', rows[block], rows[block]))
-        rows[block] /= np.where(is_mixed[block], np.maximum(lengths, 1e-12), 1.0)[:, None]
-    return rows
-
-
-def _plus(rows: NDArray[np.float32], weights: csr_matrix, embeddings: NDArray[np.float32]
-          ) -> NDArray[np.float32]:
-    """Return rows with the weighted sums of some embeddings added, in the same memory."""
-    for block in _blocks(len(rows)):
-        rows[block] += weights[block] @ embeddings
-    return rows
-
-
-def _weights(descriptions: Sequence[WeightedLabels], labels: Sequence[str]) -> csr_matrix:
-    """Return the share of each label in each description (R, U)."""
+    # the share of each label in each description, a sparse matrix (R, U)
     columns = {label: column for column, label in enumerate(labels)}
     ends = np.cumsum([0, *map(len, descriptions)])
     shares = np.array([weight for one in descriptions for _, weight in one], dtype=np.float32)
     owners = np.repeat(np.arange(len(descriptions)), np.diff(ends))
     shares /= np.bincount(owners, shares, len(descriptions)).astype(np.float32)[owners]
-    return csr_matrix((shares, [columns[label] for one in descriptions for label, _ in one], ends),
-                      shape=(len(descriptions), len(labels)))
-
-
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
+    weights = csr_matrix(
+        (shares, [columns[label] for one in descriptions for label, _ in one], ends),
+        shape=(len(descriptions), len(labels)))
+    rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
+    blocks = [slice(start, start + _BLOCK) for start in range(0, len(rows), _BLOCK)]
+    for start in range(0, len(labels), PART):
+        part = slice(start, start + PART)
+        embeddings = encode(labels[part])
+        for block in blocks:
+            rows[block] += weights[block, part] @ embeddings
+        del embeddings  # before the next part is encoded
+    is_mixed = np.diff(weights.indptr) > 1
+    for block in blocks:
+        lengths = np.sqrt(np.einsum('ij,ij->i', rows[block], rows[block]))
+        rows[block] /= np.where(is_mixed[block], np.maximum(lengths, 1e-12), 1.0)[:, None]
+    return rows

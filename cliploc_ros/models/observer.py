@@ -56,13 +56,8 @@ class CropMemory:
                ) -> dict[int, NDArray[np.float32]]:
         """Return the embedding of each box, by its row, whose crop has not changed.
 
-        A crop is compared with the one that was embedded, so slow changes do not add up.
-
-        Parameters
-        ----------
-        image_rgb : ndarray (h, w, 3) uint8
-        bboxes_xyxy : ndarray (n, 4)
-            Each overlaps the image [px].
+        A crop is compared with the one that was embedded, so slow changes do not add up. Each box
+        (n, 4) overlaps the image (h, w, 3) uint8.
         """
         if not self._known:
             return {}
@@ -72,7 +67,8 @@ class CropMemory:
         for row, (bbox, picture) in enumerate(zip(bboxes_xyxy, pictures, strict=True)):
             near = np.nonzero(np.abs(boxes - bbox).max(axis=1) <= _MOVED_PX)[0]
             for candidate in reversed(near):
-                if _is_same(picture, self._known[candidate].picture):
+                change = np.abs(picture - self._known[candidate].picture)
+                if change.mean() < _CHANGED and change.max() < _CELL_CHANGED:
                     found[row] = self._known[candidate].embedding
                     break
         return found
@@ -93,19 +89,8 @@ def _pictures(image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
             for left, top, right, bottom in crop_bounds(bboxes_xyxy, width, height).tolist()]
 
 
-def _is_same(one: NDArray[np.int16], other: NDArray[np.int16]) -> bool:
-    change = np.abs(one - other)
-    return bool(change.mean() < _CHANGED and change.max() < _CELL_CHANGED)
-
-
 class Observer:
-    """Encodes the crops of an image and compares them with labels.
-
-    Parameters
-    ----------
-    label_embeddings : LabelEmbeddings or ndarray (L, d)
-        Unit rows, one for each landmark of the map.
-    """
+    """Encodes the crops of an image and compares them with the labels of a map's landmarks."""
 
     def __init__(self, encoder: ImageTextEncoder,
                  label_embeddings: LabelEmbeddings | NDArray[np.float32]) -> None:
@@ -135,16 +120,7 @@ class Observer:
 
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:
-        """Return an observation: each detection with its similarity to every label.
-
-        Parameters
-        ----------
-        image_rgb : ndarray (h, w, 3) uint8
-        detections : Detections
-            See `Detections.usable`.
-        stamp_ns : int
-            Stamp of the image [ns].
-        """
+        """Return an observation: each usable detection with its similarity to every label."""
         crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
         return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)
 
@@ -179,21 +155,13 @@ class Observer:
 class ObservedCrops:
     """The crops of one image, each encoded once at most, when it is compared.
 
-    Parameters
-    ----------
-    image_rgb : ndarray (h, w, 3) uint8
-    bboxes_xyxy : ndarray (n, 4)
-        [px]
-    known : dict of int to ndarray (d,)
-        Embeddings of crops, by their row.
+    ``known`` has embeddings (d,) of crops by their row.
     """
 
     def __init__(self, observer: Observer, image_rgb: NDArray[np.uint8],
                  bboxes_xyxy: NDArray[np.float64], known: dict[int, NDArray[np.float32]]
                  ) -> None:
-        self._observer = observer
-        self._image_rgb = image_rgb
-        self._bboxes_xyxy = bboxes_xyxy
+        self._observer, self._image_rgb, self._bboxes_xyxy = observer, image_rgb, bboxes_xyxy
         self._known = dict(known)
 
     @property

@@ -8,12 +8,10 @@ import hashlib
 import json
 import logging
 import os
-import shutil
 import tempfile
 import threading
 import time
 import warnings
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,7 +22,7 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import free_memory, import_openvino
-from cliploc_ros.models.files import fingerprint_file, first_line
+from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
 
 if TYPE_CHECKING:
     import torch
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
 _FORMAT = 1
 # ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
 _MOST_NETWORKS = 8
-_STALE_S = 24 * 3600.0
 _XML, _WEIGHTS, _PROBE, _ABOUT = 'network.xml', 'network.bin', 'probe.npz', 'about.json'
 #: Precisions to try, the fastest first, and how far an output may be off, as a share of its
 #: length. None is the processor's own choice: bf16 where it multiplies matrices in it.
@@ -61,12 +58,7 @@ class Conversion(NamedTuple):
 class Network:
     """A compiled network with one input and one output that is used.
 
-    Parameters
-    ----------
-    about : dict
-        See Conversion.
-    precision : str, optional
-        'f32'; None is the processor's own choice.
+    ``about`` is as in Conversion, the precision 'f32'; None is the processor's own choice.
     """
 
     def __init__(self, network: Any, about: dict[str, Any], precision: str | None = 'f32'
@@ -105,9 +97,7 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
     name : str
         For people.
     identity : sequence of str
-        What the network depends on, besides OpenVINO's version.
-    convert : callable
-        Converts the network.
+        What the network depends on, other than OpenVINO's version.
     precisions : sequence of tuple
         See FP32; the first in which the network runs as in PyTorch is taken.
 
@@ -119,9 +109,8 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
         From convert.
     """
     identity = [str(_FORMAT), import_openvino().__version__, *identity]
-    parent = resolve_cache_dir(cache_dir) / 'openvino'
     digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-    folder = parent / f'{Path(name).name}-{digest[:32]}'
+    folder = resolve_cache_dir(cache_dir) / 'openvino' / f'{Path(name).name}-{digest[:32]}'
     if folder.exists():
         try:
             network = _open(folder, identity, precisions)
@@ -132,19 +121,22 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
             with contextlib.suppress(OSError):  # a read-only cache works too
                 os.utime(folder)
             return network
-    return _convert(folder, name, identity, convert, precisions)
-
-
-def _convert(folder: Path, name: str, identity: Sequence[str],
-             convert: Callable[[], Conversion], precisions: Precisions) -> Network:
-    """Convert a network, and write it so that its weights are mapped from the file."""
     started = time.monotonic()
     logger.info('converting %s for OpenVINO: once, into %s', name, folder)
-    conversion = _converted(name, convert)
     try:
-        network = _stored(folder, identity, conversion, precisions)
+        conversion = convert()
+    except ModelError:
+        raise
+    except Exception as error:  # tracing and converting raise exceptions of all kinds
+        raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
+    try:
+        network = _store(folder, identity, conversion, precisions)
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
-        network = _in_memory(name, conversion, precisions)
+        try:
+            network = _checked(conversion, precisions)
+        except Exception as failure:
+            raise ConversionError(f'OpenVINO does not run {name} as PyTorch does: '
+                                  f'{first_line(failure)}') from failure
         logger.warning('the converted network is not cached and the next start is slow again: '
                        'cannot write %s (%s); make room, or choose a writable cache_dir', folder,
                        first_line(error))
@@ -154,48 +146,29 @@ def _convert(folder: Path, name: str, identity: Sequence[str],
     return network
 
 
-def _converted(name: str, convert: Callable[[], Conversion]) -> Conversion:
-    try:
-        return convert()
-    except ModelError:
-        raise
-    except Exception as error:  # tracing and converting raise exceptions of all kinds
-        raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
-
-
-def _in_memory(name: str, conversion: Conversion, precisions: Precisions) -> Network:
-    try:
-        return _checked(conversion, precisions)
-    except Exception as error:
-        raise ConversionError(f'OpenVINO does not run {name} as PyTorch does: '
-                              f'{first_line(error)}') from error
-
-
-def _stored(folder: Path, identity: Sequence[str], conversion: Conversion,
-            precisions: Precisions) -> Network:
+def _store(folder: Path, identity: Sequence[str], conversion: Conversion, precisions: Precisions
+           ) -> Network:
+    """Write a network to the cache; return it with its weights mapped from the file."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _prune(folder.parent)
+    remove_unused([one for one in folder.parent.iterdir() if not one.name.startswith('.')],
+                  folder.parent.glob('.*.tmp'), _MOST_NETWORKS - 1)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
                                      ignore_cleanup_errors=True) as desk:
         whole = Path(desk) / folder.name
-        _write(whole, identity, conversion)
+        whole.mkdir()
+        import_openvino().save_model(conversion.network, whole / _XML, compress_to_fp16=False)
+        np.savez(whole / _PROBE, probe=conversion.probe, expected=conversion.expected)
+        prints = {name: fingerprint_file(whole / name) for name in (_XML, _WEIGHTS, _PROBE)}
+        (whole / _ABOUT).write_text(json.dumps(
+            {'identity': list(identity), 'files': prints, 'about': conversion.about}))
+        for file in whole.iterdir():
+            with file.open('rb+') as opened:
+                os.fsync(opened.fileno())
         network = _open(whole, identity, precisions)
         if folder.exists():  # damaged, or of another process
             folder.rename(Path(desk) / 'old')
         whole.rename(folder)
     return network
-
-
-def _write(folder: Path, identity: Sequence[str], conversion: Conversion) -> None:
-    folder.mkdir()
-    import_openvino().save_model(conversion.network, folder / _XML, compress_to_fp16=False)
-    np.savez(folder / _PROBE, probe=conversion.probe, expected=conversion.expected)
-    prints = {name: fingerprint_file(folder / name) for name in (_XML, _WEIGHTS, _PROBE)}
-    (folder / _ABOUT).write_text(json.dumps(
-        {'identity': list(identity), 'files': prints, 'about': conversion.about}))
-    for file in folder.iterdir():
-        with file.open('rb+') as opened:
-            os.fsync(opened.fileno())
 
 
 def _open(folder: Path, identity: Sequence[str], precisions: Precisions) -> Network:
@@ -206,11 +179,8 @@ def _open(folder: Path, identity: Sequence[str], precisions: Precisions) -> Netw
     for name in (_XML, _WEIGHTS, _PROBE):
         if fingerprint_file(folder / name) != stored['files'][name]:
             raise ValueError(f'{name} is damaged')
-    try:
-        with np.load(folder / _PROBE, allow_pickle=False) as arrays:
-            probe, expected = arrays['probe'], arrays['expected']
-    except zipfile.BadZipFile as error:
-        raise ValueError(f'{_PROBE} is damaged') from error
+    with np.load(folder / _PROBE, allow_pickle=False) as arrays:
+        probe, expected = arrays['probe'], arrays['expected']
     read = import_openvino().Core().read_model(folder / _XML)
     network = _checked(Conversion(read, probe, expected, stored['about']), precisions)
     release_pages(folder / _WEIGHTS)
@@ -252,34 +222,12 @@ def _checked(conversion: Conversion, precisions: Precisions) -> Network:
     raise ValueError(f'its output is off by {off:.2g} of its length, not by {tolerance:g} at most')
 
 
-def _prune(parent: Path) -> None:
-    """Remove the least recently used networks, and those of writers that were killed."""
-    def modified(folder: Path) -> float:
-        try:
-            return folder.stat().st_mtime
-        except OSError:  # another process has removed it
-            return 0.0
-
-    kept = sorted((folder for folder in parent.iterdir() if not folder.name.startswith('.')),
-                  key=modified, reverse=True)
-    stale = [folder for folder in parent.glob('.*.tmp')
-             if modified(folder) < time.time() - _STALE_S]
-    for folder in kept[_MOST_NETWORKS - 1:] + stale:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def convert_module(module: 'torch.nn.Module', example: 'torch.Tensor',
                    shape: Sequence[int]) -> Any:
-    """Return an openvino.Model of a PyTorch module on a CPU.
+    """Return an openvino.Model of a PyTorch module on a CPU, in evaluation mode.
 
-    Parameters
-    ----------
-    module : torch.nn.Module
-        In evaluation mode.
-    example : Tensor
-        An input to trace the module with.
-    shape : sequence of int
-        Of the inputs to come; -1 for what may vary.
+    The example is an input to trace the module with. The shape is that of the inputs to come; -1
+    stands for a size that may vary.
     """
     import torch
 

@@ -33,43 +33,33 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
         See cliploc_ros.models.clip_encoder.load_encoder.
     """
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
-    found = {name: cache.load(weights.key, texts, weights.embed_dim)
-             for name, texts in phrases.items()}
-    missing = {name: phrases[name] for name, rows in found.items() if rows is None}
-    encoded = _encode(weights, options, missing) if missing else {}
-    for name, rows in encoded.items():
-        cache.store(weights.key, phrases[name], rows)
-    return {name: rows for name, rows in (found | encoded).items() if rows is not None}
+    found, missing = {}, {}
+    for name, texts in phrases.items():
+        rows = cache.load(weights.key, texts, weights.embed_dim)
+        if rows is None:
+            missing[name] = texts
+        else:
+            found[name] = rows
+    if missing:
+        all_texts = [text for texts in missing.values() for text in texts]
+        logger.warning('CLIP reads %d phrases of %d classes; the next run finds them in the cache',
+                       len(all_texts), len(missing))
+        encoded = encode_labels(weights, all_texts, resolve_device(options.device))
+        ends = np.cumsum([len(texts) for texts in missing.values()])
+        for name, rows in zip(missing, np.split(encoded, ends[:-1]), strict=True):
+            cache.store(weights.key, missing[name], rows)
+            found[name] = rows
+    return {name: found[name] for name in phrases}
 
 
 def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
                        parts: Sequence[Mapping[str, Sequence[str]]]) -> dict[str, list[Phrases]]:
-    """Return the phrases of each class with their embeddings.
+    """Return the phrases of each class with their embeddings; errors as of embed_phrases.
 
-    Parameters
-    ----------
-    parts : sequence of mapping of str to sequence of str
-        Phrases by class. Those that change together belong into one part: the cache then keeps
-        the others.
-
-    Raises
-    ------
-    ModelError, OptionsError
-        See embed_phrases.
+    Those that change together belong into one part: the cache then keeps the others.
     """
-    embedded = [embed_phrases(weights, options, part) for part in parts]
     found: dict[str, list[Phrases]] = {}
-    for part, rows in zip(parts, embedded, strict=True):
-        for name, texts in part.items():
-            found.setdefault(name, []).append(Phrases(tuple(texts), rows[name]))
+    for part in parts:
+        for name, rows in embed_phrases(weights, options, part).items():
+            found.setdefault(name, []).append(Phrases(tuple(part[name]), rows))
     return found
-
-
-def _encode(weights: ClipWeights, options: ClipOptions, phrases: Mapping[str, Sequence[str]]
-            ) -> dict[str, NDArray[np.float32]]:
-    texts = [text for of_class in phrases.values() for text in of_class]
-    logger.warning('CLIP reads %d phrases of %d classes; the next run finds them in the cache',
-                   len(texts), len(phrases))
-    rows = encode_labels(weights, texts, resolve_device(options.device))
-    ends = np.cumsum([len(of_class) for of_class in phrases.values()])
-    return dict(zip(phrases, np.split(rows, ends[:-1]), strict=True))

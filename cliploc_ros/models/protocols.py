@@ -14,26 +14,14 @@ from cliploc_ros.core.observation import Detections
 class ImageTextEncoder(Protocol):
     """Embeds image crops and text labels in one space, where cosine means similarity."""
 
-    @property
-    def key(self) -> str:
-        """Identify model and weights: equal keys give equal embeddings."""
+    key: str  #: Identifies model and weights: equal keys give equal embeddings
 
-    def encode_crops(
-        self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
-        """Return one embedding for each box of an image.
+    def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
+                     ) -> NDArray[np.float32]:
+        """Return one embedding for each box of an image (h, w, 3) uint8, red first.
 
-        Parameters
-        ----------
-        image_rgb : ndarray (h, w, 3) uint8
-            The image, red first.
-        bboxes_xyxy : ndarray (n, 4)
-            Left, top, right, bottom [px]; each must overlap the image.
-
-        Returns
-        -------
-        ndarray (n, d) float32
-            Rows of unit length.
+        The boxes (n, 4) are left, top, right, bottom [px]; each must overlap the image. The
+        embeddings (n, d) have unit length.
         """
 
     def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:

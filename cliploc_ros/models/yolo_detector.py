@@ -37,6 +37,9 @@ from cliploc_ros.models.yolo_weights import (
     stride_of,
 )
 
+if TYPE_CHECKING:
+    import torch
+
 # Of an export, in metadata.yaml, with their types.
 _FIELDS = {'names': dict, 'stride': int, 'task': str}
 logger = logging.getLogger(__name__)
@@ -45,11 +48,8 @@ logger = logging.getLogger(__name__)
 class OpenVinoYolo:
     """A detection network in OpenVINO, with ultralytics' own steps before and after it.
 
-    Parameters
-    ----------
-    network : Network
-        Its field ``about`` holds names (by their number), stride, end2end and size: the height
-        and width of its input, None where that varies.
+    The network's field ``about`` holds names (by their number), stride, end2end and size: the
+    height and width of its input, None where that varies.
     """
 
     inference = 'openvino'
@@ -83,10 +83,7 @@ class OpenVinoYolo:
 def open_export(folder: Path, options: YoloOptions) -> OpenVinoYolo:
     """Return the network of a folder that ``yolo export format=openvino`` made.
 
-    Raises
-    ------
-    ModelError
-        For files that are missing or damaged, and a network for another task.
+    ModelError: files are missing or damaged, or the network is for another task.
     """
     about = _read_metadata(folder / 'metadata.yaml')
     file = sorted(folder.glob('*.xml'))[0]
@@ -134,12 +131,8 @@ def _read_metadata(file: Path) -> dict[str, Any]:
 def load_converted(file: Path, options: YoloOptions) -> OpenVinoYolo:
     """Return the network of a ``.pt`` file, converted once.
 
-    Raises
-    ------
-    ConversionError
-        When OpenVINO cannot run it as PyTorch does.
-    ModelError
-        For a file that is damaged or no detection model.
+    ConversionError: OpenVINO cannot run it as PyTorch does. ModelError: the file is damaged or no
+    detection model.
     """
     import torch
 
@@ -167,20 +160,8 @@ def _convert(file: Path) -> Conversion:
     return Conversion(network, probe, expected.numpy(), about)
 
 
-if TYPE_CHECKING:
-    import torch
-
-
 class TorchYolo:
-    """A detection network in PyTorch.
-
-    Parameters
-    ----------
-    file : Path
-        A ``.pt`` file.
-    precision : str
-        'fp16' or 'fp32'.
-    """
+    """A detection network in PyTorch, of a ``.pt`` file; the precision is 'fp16' or 'fp32'."""
 
     inference = 'pytorch'
 
@@ -191,8 +172,8 @@ class TorchYolo:
             from ultralytics.utils import DEFAULT_CFG_DICT
 
             # The name changed within 8.4, and the old one warns with every image.
-            half_precision = {'quantize': 16} if 'quantize' in DEFAULT_CFG_DICT else {'half': True}
-            self._settings |= half_precision
+            has_new_name = 'quantize' in DEFAULT_CFG_DICT
+            self._settings |= {'quantize': 16} if has_new_name else {'half': True}
         self.stride = stride_of(self._model.model)
         self.names: dict[int, str] = self._model.names
 
@@ -204,11 +185,6 @@ class TorchYolo:
 
 class YoloDetector:
     """An `ObjectDetector`: a detection network of ultralytics.
-
-    Parameters
-    ----------
-    options : YoloOptions
-        Which YOLO, and how to run it.
 
     Raises
     ------
@@ -223,8 +199,12 @@ class YoloDetector:
 
         threads = torch.get_num_threads()
         import_ultralytics()
-        self._device = resolve_device(options.device)
-        self._network = _load(options, self._device)
+        device = resolve_device(options.device)
+        self.device = str(device)
+        self._network = _load(options, device)
+        self.inference = self._network.inference  #: 'pytorch' or 'openvino'
+        #: All classes that the model knows
+        self.class_names = tuple(self._network.names.values())
         self.configure(options)
         # The first pass sets up the predictor: do it before the first image.
         side = self._network.stride
@@ -238,21 +218,6 @@ class YoloDetector:
         self._settings: dict[str, Any] = {
             'conf': options.conf, 'iou': options.iou, 'max_det': options.max_det,
             'imgsz': -(-options.imgsz // stride) * stride}
-
-    @property
-    def device(self) -> str:
-        """Return where the network runs."""
-        return str(self._device)
-
-    @property
-    def inference(self) -> str:
-        """Return what runs the network: 'pytorch' or 'openvino'."""
-        return self._network.inference
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """Return the names of all classes that the model knows."""
-        return tuple(self._network.names.values())
 
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.

@@ -13,7 +13,6 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -129,8 +128,10 @@ def resolve_yolo_weights(options: YoloOptions) -> Path:
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
+        near = difflib.get_close_matches(name, GITHUB_ASSETS_NAMES, n=4, cutoff=0.5)
+        hint = f': did you mean {", ".join(near)}?' if near else ''
         raise ModelError(f"'{options.model}' is neither a file here nor a published YOLO model"
-                         f'{_nearest(name, GITHUB_ASSETS_NAMES)}')
+                         f'{hint}')
 
     def fetch() -> Path:
         # Ultralytics' early versions write to the final path: only a whole file is moved there.
@@ -141,11 +142,6 @@ def resolve_yolo_weights(options: YoloOptions) -> Path:
     return download(name, folder, (
         f'Without a network: download {name} from https://github.com/ultralytics/assets/releases '
         'on another machine and set the model to the path of the file'), fetch)
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=4, cutoff=0.5)
-    return f': did you mean {", ".join(near)}?' if near else ''
 
 
 def stride_of(model: Any) -> int:

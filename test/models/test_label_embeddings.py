@@ -140,7 +140,7 @@ def test_the_longest_unused_files_go(cache):
 
 def test_what_killed_writers_left_is_cleared(cache):
     file = stored_file(cache)
-    old, young = file.with_name('.old.tmp'), file.with_name('.young.tmp')
+    old, young = file.with_name(f'.1.{file.name}'), file.with_name(f'.2.{file.name}')
     old.touch()
     young.touch()
     os.utime(old, (0, 0))

@@ -21,10 +21,9 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.mapping.checking.landmark_faults import Witness
 from cliploc_ros.mapping.checking.systematic import linearize_boxes
 from cliploc_ros.mapping.evidence import best_ious
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.projection import project_box
 from cliploc_ros.mapping.views import Views, camera_centers
 
 # A landmark is detected only if this share of its box is in the image, from no farther away than

@@ -11,11 +11,10 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.association import associate, normalized_distance
 from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
-from cliploc_ros.mapping.merging import normalized_distance
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
 

@@ -25,9 +25,14 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import edge_residual, fit_ellipsoid, robust_weight
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
+from cliploc_ros.mapping.landmarks import (
+    LANDMARK_SIZE,
+    POSE_SIZE,
+    Landmarks,
+    group_boxes,
+    linearize_box,
+)
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.projection import LANDMARK_SIZE, POSE_SIZE, linearize_box
 from cliploc_ros.mapping.views import Views
 
 _MIN_BOXES = 100

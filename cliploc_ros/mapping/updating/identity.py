@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which object of the recording is which landmark of the old map.
-
-Every landmark gets at most one object of its class, and every object at most one landmark, so that
-the sum of gains is the greatest possible (Hungarian method). A gain is a log-likelihood ratio of
-look and size, plus a bonus for an object that is where the landmark was. A landmark or an object
-stays alone if it gains nothing.
-"""
+"""The objects that a recording shows: old landmarks in their places, and finds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +12,17 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.labelling import embed_landmarks
+from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks
+from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.known import Known
-from cliploc_ros.mapping.updating.objects import Objects
+from cliploc_ros.mapping.updating.alignment import Known, Refits, has_moved, refit
+from cliploc_ros.mapping.updating.judging import Judged, close_pairs
+from cliploc_ros.mapping.updating.sight import Sight
+from cliploc_ros.mapping.views import Views
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
@@ -38,6 +38,47 @@ _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
 _FEWEST_LOOKS = 8
 # A landmark in its place is doubted if its look fits worse than usual by more deviations.
 _DOUBT = 1.0
+
+
+class Objects(NamedTuple):
+    """What the recording shows: m objects, n boxes."""
+
+    refits: Refits  #: Where they are
+    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
+    #: For each, the old landmarks that it may be although it is a little off their place
+    near: tuple[frozenset[int], ...]
+    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
+    sight: Sight
+    evidence: Evidence
+    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Return the objects as landmarks."""
+        return self.refits.landmarks
+
+
+def gather_objects(views: Views, known: Known, judged: Judged, options: UpdateOptions) -> Objects:
+    """Return the objects that the recording shows."""
+    count, finds = len(known.sigmas), judged.finds
+    in_place = np.nonzero(judged.is_there)[0]
+    places = np.concatenate([in_place, count + np.arange(len(finds.details))])
+    numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
+    numbers[places] = np.arange(len(places))
+    shown = numbers[judged.shown]
+    refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
+                   options.mapping.min_viewpoints)
+    near: list[set[int]] = [set() for _ in places]
+    named = set(zip(known.owners.tolist(), known.named.classes.tolist(), strict=True))
+    for new, row, _ in close_pairs(finds.landmarks, known.landmarks,
+                                   options.mapping.merge_distance):
+        if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in named:
+            near[len(in_place) + new].add(row)
+    return Objects(
+        refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
+        tuple(map(frozenset, near)), shown, judged.sight.select(places),
+        gather_evidence(views, refits.landmarks, shown),
+        (LandmarkDetails(),) * len(in_place) + finds.details)
 
 
 @dataclass(frozen=True)
@@ -256,3 +297,34 @@ def _assign(gains: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArra
         if close.any():
             rivals[int(columns[column])] = tuple(int(row) for row in rows[close])
     return chosen, rivals
+
+
+class Fates(NamedTuple):
+    """Rows of old landmarks by what became of them, and new objects."""
+
+    #: of int
+    confirmed: NDArray[np.int64]
+    moved: NDArray[np.int64]
+    missing: NDArray[np.int64]
+    not_observed: NDArray[np.int64]
+    new: NDArray[np.int64]  #: of int: objects that are no old landmark
+    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
+    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
+
+
+def decide_fates(known: Known, judged: Judged, objects: Objects, identities: Identities,
+                 options: UpdateOptions) -> Fates:
+    """Return what became of each old landmark."""
+    numbers = identities.objects
+    found = numbers >= 0
+    elsewhere = found.copy()
+    rows = np.nonzero(found)[0]
+    elsewhere[rows] = objects.owners[numbers[rows]] != rows
+    # an object that is a little off its place was only mapped badly
+    rows = np.nonzero(elsewhere)[0]
+    elsewhere[rows] = has_moved(known.select(rows), objects.refits.select(numbers[rows]), options)
+    missing = ~found & (judged.is_gone | judged.is_there)
+    return Fates(
+        np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
+        np.nonzero(~found & ~missing)[0],
+        np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, identities.rivals)

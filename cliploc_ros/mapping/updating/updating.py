@@ -10,23 +10,20 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.input_checks import check_input
+from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.alignment import Alignment, align
-from cliploc_ros.mapping.updating.fates import decide_fates
+from cliploc_ros.mapping.updating.alignment import Alignment, Known, align, known_landmarks
 from cliploc_ros.mapping.updating.identity import (
     compare_looks,
+    decide_fates,
+    gather_objects,
     identify,
     renew_embeddings,
     why_not_comparable,
 )
 from cliploc_ros.mapping.updating.judging import Judged, judge
-from cliploc_ros.mapping.updating.known import Known, known_landmarks
-from cliploc_ros.mapping.updating.objects import gather_objects
-from cliploc_ros.mapping.updating.options import UpdateOptions
-from cliploc_ros.mapping.updating.renewal import renew
-from cliploc_ros.mapping.updating.report import UpdateReport, describe
-from cliploc_ros.mapping.views import make_views, map_from_cameras
+from cliploc_ros.mapping.updating.renewal import UpdateReport, describe, renew
+from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
 
 @dataclass(frozen=True)
