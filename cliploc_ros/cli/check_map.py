@@ -20,7 +20,7 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:

@@ -8,15 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.landmarks import Landmarks
-from cliploc_ros.mapping.projection import box_iou, project_box
+from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.landmarks import Landmarks, box_iou, group_boxes, project_box
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views
 
 _GROUP_SIZE = 8
 # Rounding must not hide a landmark [m].
 _SLACK = 1e-6
+# Two boxes of one frame that overlap more than this are one object. A guess.
+_ONE_BOX_IOU = 0.6
 
 
 class Overlaps(NamedTuple):
@@ -139,24 +143,23 @@ def associate(views: Views, landmarks: Landmarks, min_iou: float) -> NDArray[np.
     """Return the landmark (n,) that each box shows, -1 for none.
 
     In every frame a landmark has at most one box and a box at most one landmark; the sum of
-    their IoUs is the greatest possible (Hungarian method).
-
-    Parameters
-    ----------
-    min_iou : float
-        Pairs that overlap less are no candidates.
+    their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
+    are no candidates.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
     shown = np.full(len(views.frames), -1, dtype=np.int64)
-    if len(boxes) == 0:
-        return shown
     frames = views.frames[boxes]
     sole = _is_sole(boxes) & _is_sole(frames * len(landmarks.centers) + candidates)
     shown[boxes[sole]] = candidates[sole]
     contested = np.nonzero(~sole)[0]
-    bounds = np.nonzero(np.diff(frames[contested]))[0] + 1
-    for part in np.split(contested, bounds):
-        _assign(boxes[part], candidates[part], ious[part], shown)
+    for part in np.split(contested, np.nonzero(np.diff(frames[contested]))[0] + 1):
+        rows, row_of = np.unique(boxes[part], return_inverse=True)
+        columns, column_of = np.unique(candidates[part], return_inverse=True)
+        gains = np.zeros((len(rows), len(columns)))
+        gains[row_of, column_of] = ious[part]
+        for row, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
+            if gains[row, column] > 0.0:
+                shown[rows[row]] = columns[column]
     return shown
 
 
@@ -166,13 +169,93 @@ def _is_sole(values: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(counts[inverse] == 1)
 
 
-def _assign(boxes: NDArray[np.int64], candidates: NDArray[np.int64], ious: NDArray[np.float64],
-            shown: NDArray[np.int64]) -> None:
-    """Write the landmarks of the contested boxes of one frame."""
-    rows, row_of = np.unique(boxes, return_inverse=True)
-    columns, column_of = np.unique(candidates, return_inverse=True)
-    gains = np.zeros((len(rows), len(columns)))
-    gains[row_of, column_of] = ious
-    for row, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
-        if gains[row, column] > 0.0:
-            shown[rows[row]] = columns[column]
+@compiled
+def ious_with(views, rows, center, basis):
+    """Return the IoU of an ellipsoid with each of some boxes; 0 where it is behind."""
+    ious, box = np.zeros(len(rows)), np.empty(4)
+    for place in range(len(rows)):
+        frame = views.frames[rows[place]]
+        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds)
+    return ious
+
+
+def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                     pairs: list[tuple[int, int]], options: MappingOptions
+                     ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return the landmarks left after merging those pairs that are one object, and the boxes'."""
+    landmarks, into = merge_pairs(views, landmarks, shown, pairs, options)
+    is_kept = into == np.arange(len(into))
+    numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
+    return landmarks.select(is_kept), numbers[shown]
+
+
+def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                pairs: list[tuple[int, int]], options: MappingOptions
+                ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Fit those of the pairs together that are one object, in the order given.
+
+    Of two landmarks the one with more boxes stays. Returns all landmarks, and the one (L,) that
+    each is part of.
+    """
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    rows_of = group_boxes(shown, len(centers))
+    into = np.arange(len(centers))
+    for first, second in pairs:
+        if into[first] != first or into[second] != second:
+            continue
+        keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
+                      else (second, first))
+        if seen_apart(views, rows_of[keep], rows_of[drop]) > options.max_seen_apart:
+            continue
+        rows = np.sort(np.concatenate([rows_of[keep], rows_of[drop]]))
+        fit = fit_ellipsoid(views, rows, centers[keep], bases[keep])
+        before = np.concatenate([ious_with(views, rows_of[number], centers[number], bases[number])
+                                 for number in (keep, drop)])
+        after = ious_with(views, rows, fit.center, fit.basis)
+        if len(rows) and after.mean() < before.mean() - options.merge_loss:
+            continue
+        centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, rows
+        into[into == drop] = keep
+    return Landmarks(centers, bases, landmarks.classes), into
+
+
+def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
+    """Return the pairs of one class nearer than a normalized distance, the nearest first."""
+    return [(first, second) for first, second, _ in close_pairs(landmarks, max_distance)
+            if landmarks.classes[first] == landmarks.classes[second]]
+
+
+def close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int, float]]:
+    """Return the pairs nearer than a normalized distance, with it, the nearest first."""
+    if len(landmarks.centers) < 2:
+        return []
+    reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
+    # the smaller of two touching landmarks lies within the reach of the larger one
+    tree = cKDTree(landmarks.centers)
+    pairs = {(min(first, second), max(first, second)) for first in range(len(reach))
+             for second in tree.query_ball_point(landmarks.centers[first],
+                                                 2.0 * max_distance * reach[first])
+             if second != first}
+    close = [(*pair, normalized_distance(landmarks, *pair)) for pair in sorted(pairs)]
+    return sorted((one for one in close if one[2] < max_distance), key=lambda one: one[2])
+
+
+def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:
+    """Return the distance of two centres in units of the summed shapes, about 1 if they touch."""
+    shape = (landmarks.bases[first] @ landmarks.bases[first].T
+             + landmarks.bases[second] @ landmarks.bases[second].T)
+    offset = landmarks.centers[first] - landmarks.centers[second]
+    return float(np.sqrt(offset @ np.linalg.solve(shape, offset)))
+
+
+def seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+    """Return in which share of the frames of the landmark with fewer both have a box of their own.
+
+    Two boxes that overlap well are one object under two classes.
+    """
+    _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
+                                      return_indices=True)
+    apart = sum(box_iou(views.edges[row], views.edges[other], views.bounds) < _ONE_BOX_IOU
+                for row, other in zip(rows[first], others[second], strict=True))
+    return float(apart) / max(1, min(len(rows), len(others)))

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.mapping.landmarks import POSE_SIZE
 from cliploc_ros.mapping.options import OdometryErrors, PoseErrors
-from cliploc_ros.mapping.projection import POSE_SIZE
 from cliploc_ros.mapping.views import Views, camera_centers
 
 # From this length on, in standard deviations, the loss is linear.

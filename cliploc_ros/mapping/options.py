@@ -1,11 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How to build a map: every choice that mapping leaves to its user."""
+"""The choices that building, checking and updating a map leave to their user."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import OptionsError
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class MappingOptions:
     settling_rounds: int = 3
     association_iou: float = 0.2  #: A box and a landmark that overlap less do not belong together
     #: Landmarks of one class nearer than this may be one object, see
-    #: cliploc_ros.mapping.merging.normalized_distance
+    #: cliploc_ros.mapping.association.normalized_distance
     merge_distance: float = 0.8
     class_merge_distance: float = 0.4  #: The same for landmarks of two classes
     #: Unless more than this share of the frames of the one with fewer show them as two boxes
@@ -97,3 +100,101 @@ class MappingOptions:
     frame_id: str = 'map'
     source: str = 'build_map'
     random_seed: int = 0  #: Equal seed and input give equal output
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Options of a check.
+
+    Raises
+    ------
+    OptionsError
+        Names the option and what it allows.
+    """
+
+    #: Of the relocalizer that will use the map
+    relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
+    #: How boxes belong to landmarks, and how landmarks are fitted
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    folds: int = 5  #: Cross-validation: each fold is judged with landmarks fitted to the others
+    #: Folds take blocks of this length in turn [s]; a fold is not fitted to frames this near to
+    #: one that it judges [s]
+    block_s: float = 4.0
+    gap_s: float = 1.0
+    frames: int = 100  #: The most recorded frames that are relocalized
+    #: Of the grid of camera positions [m]; larger where there would be too many positions
+    spacing_m: float = 0.5
+    #: The most positions of the grid, and the directions in which the camera looks at each
+    max_positions: int = 150
+    headings: int = 12
+    camera_height_m: float | None = None  #: Of the grid [m]; None: as in the recording
+    use_vertical: bool = False  #: The relocalizer knows the vertical
+    wrong_m: float = 1.0  #: An accepted pose farther off than this misleads a robot [m]
+    random_seed: int = 0  #: Equal seed and input give equal output
+
+    def __post_init__(self) -> None:
+        """Refuse values that an option does not allow."""
+        for name, low, high in (('folds', 2, 100), ('frames', 1, 1_000_000),
+                                ('max_positions', 1, 100_000), ('headings', 1, 360),
+                                ('spacing_m', 0.01, 1e4), ('block_s', 1e-3, 1e6)):
+            if not low <= getattr(self, name) <= high:
+                raise OptionsError(f'{name}: {getattr(self, name)} must lie within {low:g} and '
+                                   f'{high:g}')
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What a map has to reach. The values are guesses from a few maps of one office."""
+
+    #: Held-out share of the boxes that a landmark of their class explains, and their median IoU
+    min_explained: float = 0.6
+    min_iou: float = 0.6
+    min_accepted: float = 0.4  #: Share of the recorded frames that the relocalizer accepts
+    #: Share of the recorded frames and grid views in which it accepts a wrong pose
+    max_misled: float = 0.01
+    #: Share of the grid positions near the recording in which it accepts some heading
+    min_positions: float = 0.4
+    max_faulty: float = 0.15  #: Share of the landmarks with a serious fault
+    max_duplicates: int = 0  #: Pairs of landmarks that are one object
+    max_look_alikes: int = 0  #: Pairs of places that a detector cannot tell apart
+
+
+@dataclass(frozen=True)
+class UpdateOptions:
+    """Options of an update."""
+
+    #: How new landmarks are built; with its pose_errors, the poses are refined against the map
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    unknown_sigma_m: float = 0.05  #: Deviation of a centre where the map does not say it [m]
+    #: An object has moved if it is farther away than all three: [m], in units of its old and new
+    #: shape (1: they touch), and in standard deviations of both positions. A smaller change is a
+    #: better fit.
+    least_move_m: float = 0.1
+    least_move_shapes: float = 0.6
+    least_move_sigmas: float = 4.0
+    #: A larger offset of the recording's coordinate frame from the map's is noted
+    least_offset_m: float = 0.03
+    least_offset_deg: float = 1.0
+    stays: float = 0.9  #: Share of the objects that are usually still in their place
+    #: Share of the views in which an object is detected, where neither map nor recording tell
+    seen_ratio: float = 0.9
+    #: So many views the seen ratio is worth at most, as an object may be hard to see from one side
+    prior_views: float = 4.0
+    #: Share of the views in which a wrong box appears in an empty place
+    chance_ratio: float = 0.03
+    #: An object is gone, or there, if the probability of being there is so small, or large
+    gone_below: float = 0.05
+    gone_below_if_taken: float = 0.5  #: The same where another object was found in its place
+    there_above: float = 0.95
+    #: Its place must be in view from this number of viewpoints before an object can be missing
+    least_views: int = 5
+    #: A place is in view if the frame shows another landmark this close to its direction, and not
+    #: nearer: otherwise a wall may hide it
+    beside_deg: float = 20.0
+    hidden_share: float = 0.4  #: A place is out of view if landmarks or boxes hide this share
+    #: A new landmark must be detected so often, in units of how often the old ones are
+    min_new_share: float = 0.4
+    min_confirmed: int = 3
+    #: A recording that confirms fewer landmarks, or a smaller share of those whose place it shows,
+    #: does not belong to the map
+    min_confirmed_share: float = 0.3

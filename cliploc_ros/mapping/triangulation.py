@@ -18,10 +18,15 @@ from numpy.typing import NDArray
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, no_landmarks
+from cliploc_ros.mapping.landmarks import (
+    Landmarks,
+    box_iou,
+    group_boxes,
+    no_landmarks,
+    project_box,
+)
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.projection import box_iou, project_box
 from cliploc_ros.mapping.views import Views, with_depths
 
 # How far the centre lies behind the surface, in radii that the box suggests, and the standard

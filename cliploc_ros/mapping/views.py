@@ -7,12 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
 # Two frames less than this apart in both show a landmark from one viewpoint.
 _VIEWPOINT_DISTANCE_M = 0.1
 _VIEWPOINT_ANGLE_DEG = 5.0
+# No robot or person with a camera is faster.
+_MAX_SPEED_M_PER_S = 10.0
+_MAX_TURN_DEG_PER_S = 720.0
+_LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
+_MAX_EMPTY_SHARE = 0.5
 
 
 class Views(NamedTuple):
@@ -112,12 +118,13 @@ def map_from_cameras(views: Views) -> NDArray[np.float64]:
     """Return the poses map_from_camera (F, 4, 4) of all frames."""
     poses = np.tile(np.eye(4), (len(views.rotations), 1, 1))
     poses[:, :3, :3] = views.rotations.transpose(0, 2, 1)
-    poses[:, :3, 3] = camera_centers(views, np.arange(len(poses)))
+    poses[:, :3, 3] = camera_centers(views)
     return poses
 
 
-def camera_centers(views: Views, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return where the camera was in some frames (k, 3) [m]."""
+def camera_centers(views: Views, frames: NDArray[np.int64] | slice = slice(None)
+                   ) -> NDArray[np.float64]:
+    """Return where the camera was in some frames, or in all (k, 3) [m]."""
     return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
                                  views.translations[frames]))
 
@@ -138,3 +145,44 @@ def number_viewpoints(map_from_camera: NDArray[np.float64]) -> NDArray[np.int64]
             first, number = frame, number + 1
         viewpoints[frame] = number
     return viewpoints
+
+
+def check_input(detections: PosedDetections, views: Views, options: MappingOptions) -> list[str]:
+    """Return notes on the input.
+
+    Raises
+    ------
+    MappingError
+        No map can be made of it; the message says what to correct.
+    """
+    if len(detections.classes) == 0:
+        raise MappingError(f'the {len(detections)} frames have no detections; check the detector, '
+                           'its classes and its confidence threshold')
+    viewpoints = int(views.viewpoints[-1]) + 1
+    if viewpoints < options.min_viewpoints:
+        raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
+                           f'{options.min_viewpoints} are needed; move it around the objects, and '
+                           'check that the poses are those of the images')
+    notes = []
+    if jumps := _jumps(detections):
+        notes.append(f'the poses jump {len(jumps)} times, first at {jumps[0]:.2f} s; check the '
+                     'localization that they come from')
+    empty = float(np.mean(np.diff(detections.frame_offsets) == 0))
+    if empty > _MAX_EMPTY_SHARE:
+        notes.append(f'{empty:.0%} of the frames have no detections; check the detector')
+    if len(detections.class_names) == 1:
+        notes.append(f"all boxes are of the class '{detections.class_names[0]}'; maps with more "
+                     'classes relocalize better')
+    return notes
+
+
+def _jumps(detections: PosedDetections) -> list[float]:
+    """Return the times [s] at which the pose moves faster than any camera does."""
+    poses, stamps = detections.map_from_camera, detections.stamps_s
+    seconds = np.maximum(np.diff(stamps), 1e-3)
+    distances = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    traces = np.einsum('fij,fij->f', poses[1:, :3, :3], poses[:-1, :3, :3])
+    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+    far = (distances > _LEAST_JUMP_M) & (distances > _MAX_SPEED_M_PER_S * seconds)
+    far |= (angles > _LEAST_JUMP_DEG) & (angles > _MAX_TURN_DEG_PER_S * seconds)
+    return [float(stamp) for stamp in stamps[1:][far]]

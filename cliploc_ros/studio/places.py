@@ -22,12 +22,11 @@ from cliploc_ros.mapping.checking.detector_model import (
     guess_detector,
     measure_detector,
 )
-from cliploc_ros.mapping.checking.grid import Grid, make_grid
 from cliploc_ros.mapping.checking.landmark_faults import hear_witness
-from cliploc_ros.mapping.checking.look_alikes import LookAlike, find_look_alikes
-from cliploc_ros.mapping.checking.options import CheckOptions
+from cliploc_ros.mapping.checking.places import Grid, LookAlike, find_look_alikes, make_grid
 from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, each_pose
 from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.mapping.options import CheckOptions
 from cliploc_ros.studio.document import fields_of
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of

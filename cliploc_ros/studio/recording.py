@@ -208,7 +208,7 @@ def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
         scores=np.ones(count)), MappingOptions())
     # each box was drawn for itself: none shares the error of a detector that stood still
     views = views._replace(weights=np.ones(count))
-    origins = camera_centers(views, np.arange(count))
+    origins = camera_centers(views)
     start, radius = _meeting_point(views, origins)
     # a sphere, one stretched along each axis of the map, and one along a diagonal
     sphere = radius * np.eye(3)

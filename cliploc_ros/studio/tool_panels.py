@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
-from cliploc_ros.mapping.checking.look_alikes import RADIUS_M
+from cliploc_ros.mapping.checking.places import RADIUS_M
 from cliploc_ros.mapping.checking.report import GridCheck
 from cliploc_ros.studio.panels import Actions, paragraph, show_props
 from cliploc_ros.studio.places import Places, PlacesSearch

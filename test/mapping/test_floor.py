@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.mapping.association import find_overlaps
+from cliploc_ros.mapping.association import find_overlaps, ious_with
 from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.evidence import ious_with
 from cliploc_ros.mapping.landmarks import landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.pose_noise import _sample

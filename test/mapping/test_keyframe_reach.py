@@ -17,8 +17,8 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_lay
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
-from cliploc_ros.mapping.checking.options import CheckOptions
 from cliploc_ros.mapping.checking.report import check_keyframes, in_reach
+from cliploc_ros.mapping.options import CheckOptions
 
 ROOM = make_room()
 #: The camera looks along x, z is up.

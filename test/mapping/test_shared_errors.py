@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.mapping.options import PoseErrors
-from cliploc_ros.mapping.shared_errors import _BENDING, shared_by_neighbours
+from cliploc_ros.mapping.pose_noise import _BENDING, shared_by_neighbours
 from cliploc_ros.mapping.views import Views
 from studies.speed.pose_errors import draw_errors
 

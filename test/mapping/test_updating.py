@@ -14,8 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
 from cliploc_ros.mapping.updating.updating import update_map
 
 ENCODER = 'test:0'

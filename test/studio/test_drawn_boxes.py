@@ -8,11 +8,9 @@ import pytest
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.evidence import ious_with
-from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map
+from cliploc_ros.mapping.association import associate, ious_with
+from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map, project_box
 from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.projection import project_box
 from cliploc_ros.mapping.views import camera_centers, make_views
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.edits import EditError

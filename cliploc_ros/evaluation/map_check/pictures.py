@@ -29,7 +29,7 @@ from cliploc_ros.evaluation.map_check.page import (
     VERDICT_COLORS,
     grade,
 )
-from cliploc_ros.mapping.checking.look_alikes import RADIUS_M
+from cliploc_ros.mapping.checking.places import RADIUS_M
 from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
 from cliploc_ros.mapping.checking.report import CheckReport, GridCheck
 

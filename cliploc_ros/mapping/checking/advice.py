@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.mapping.checking.look_alikes import RADIUS_M, LookAlike
+from cliploc_ros.mapping.checking.places import RADIUS_M, LookAlike
 from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
 from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, GridCheck
 

@@ -12,28 +12,24 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.checking.advice import give_advice
-from cliploc_ros.mapping.checking.cross_validation import (
-    box_quality,
-    judge_boxes,
-    make_folds,
-)
 from cliploc_ros.mapping.checking.detector_model import (
     DetectorModel,
     guess_detector,
     measure_detector,
 )
-from cliploc_ros.mapping.checking.grid import Grid, make_grid
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
     check_landmarks,
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.mapping.checking.look_alikes import find_look_alikes
-from cliploc_ros.mapping.checking.options import CheckOptions, Thresholds
+from cliploc_ros.mapping.checking.places import Grid, find_look_alikes, make_grid
 from cliploc_ros.mapping.checking.relocalization import (
     PosedObservation,
     Trial,
+    box_quality,
+    judge_boxes,
+    make_folds,
     sample_frames,
     try_observations,
     try_poses,
@@ -47,10 +43,10 @@ from cliploc_ros.mapping.checking.report import (
     check_keyframes,
     find_failures,
 )
-from cliploc_ros.mapping.checking.systematic import find_corrections
-from cliploc_ros.mapping.input_checks import check_input
+from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.views import Views, make_views
+from cliploc_ros.mapping.systematic import find_corrections
+from cliploc_ros.mapping.views import Views, check_input, make_views
 
 #: Told the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]

@@ -13,11 +13,17 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.mapping.joint import Anchors, pose_errors, refine_jointly
-from cliploc_ros.mapping.updating.known import Known, Refits, find_known, refit
-from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.fitting import fit_ellipsoid
+from cliploc_ros.mapping.joint import Anchors, pose_changes, refine_jointly
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
+from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views, camera_from_map, map_from_cameras
 
+# A position is known no better than this [m]: objects are no ellipsoids. A guess.
+_LEAST_SIGMA_M = 0.01
 _ROUNDS = 4
 # The first association tolerates an offset.
 _LOOSE_IOU = 0.1
@@ -30,6 +36,91 @@ _LOSS_SCALE = 2.0
 # The median length of a normal vector of three numbers, and the square that one of six exceeds
 # once in a thousand times: a smaller offset is none.
 _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
+
+
+class Known(NamedTuple):
+    """L landmarks of the old map as the recording's classes name them."""
+
+    landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
+    sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
+    details: tuple[LandmarkDetails, ...]
+    named: Landmarks  #: The landmarks once for each of their classes
+    owners: NDArray[np.int64]  #: The landmark of each of these
+
+    @property
+    def names(self) -> set[tuple[int, int]]:
+        """Return all pairs of a landmark and one of its classes."""
+        return set(zip(self.owners.tolist(), self.named.classes.tolist(), strict=True))
+
+    def shown(self, views: Views, min_iou: float) -> NDArray[np.int64]:
+        """Return the old landmark (n,) that each box shows, -1 for none.
+
+        One landmark has at most one box in a frame, whatever its classes.
+        """
+        shown = associate(views, self.named, min_iou)
+        rows = np.nonzero(shown >= 0)[0]
+        owners = self.owners[shown[rows]]
+        _, kept = np.unique(views.frames[rows] * len(self.sigmas) + owners, return_index=True)
+        once = np.full(len(shown), -1, dtype=np.int64)
+        once[rows[kept]] = owners[kept]
+        return once
+
+
+def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...], options: UpdateOptions
+                    ) -> Known:
+    """Return the landmarks of a map for a recording with some classes."""
+    details = old.details or (LandmarkDetails(),) * len(old)
+    numbers = {name: number for number, name in enumerate(class_names)}
+    names = [(row, numbers[name]) for row, one in enumerate(details)
+             for name in dict.fromkeys((old.class_ids[row], *dict(one.class_weights or ())))
+             if name in numbers]
+    owners, classes = np.array(names, dtype=np.int64).reshape(-1, 2).T
+    landmarks = landmarks_of_map(old, class_names)
+    first = np.full(len(old), -1, dtype=np.int64)
+    first[owners[::-1]] = classes[::-1]
+    sigmas = np.array([options.unknown_sigma_m if one.position_sigma is None
+                       else one.position_sigma for one in details])
+    return Known(landmarks._replace(classes=first), np.maximum(sigmas, _LEAST_SIGMA_M), details,
+                 Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners)
+
+
+class Refits(NamedTuple):
+    """L landmarks where the recording puts them; unchanged where it does not tell."""
+
+    landmarks: Landmarks
+    #: (L, 3, 3): of the centres [m^2]; infinite where the recording does not tell
+    covariances: NDArray[np.float64]
+
+    def select(self, rows: NDArray[np.int64]) -> 'Refits':
+        """Return some of the landmarks."""
+        return Refits(self.landmarks.select(rows), self.covariances[rows])
+
+    @property
+    def is_known(self) -> NDArray[np.bool_]:
+        """Return which landmarks (L,) the recording places."""
+        return np.isfinite(self.covariances[:, 0, 0])
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """Return the deviations (L,) of the centres on the worst axis [m]."""
+        sigmas = np.full(len(self.covariances), np.inf)
+        own = self.covariances[self.is_known]
+        sigmas[self.is_known] = np.sqrt(np.linalg.eigvalsh(own)[:, -1])
+        return sigmas
+
+
+def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_viewpoints: int
+          ) -> Refits:
+    """Fit landmarks to the boxes that show them from enough viewpoints."""
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    covariances = np.full((len(centers), 3, 3), np.inf)
+    for number, rows in enumerate(group_boxes(shown, len(centers))):
+        if len(np.unique(views.viewpoints[views.frames[rows]])) >= min_viewpoints:
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            centers[number], bases[number] = fit.center, fit.basis
+            covariances[number] = (np.linalg.inv(fit.information)[:3, :3]
+                                   + _LEAST_SIGMA_M ** 2 * np.eye(3))
+    return Refits(Landmarks(centers, bases, landmarks.classes), covariances)
 
 
 class Alignment(NamedTuple):
@@ -49,25 +140,22 @@ def align(given: Views, known: Known, options: UpdateOptions) -> Alignment:
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
         min_iou = options.mapping.association_iou if number else _LOOSE_IOU
-        found = refit(views, known.landmarks, find_known(views, known, min_iou),
+        found = refit(views, known.landmarks, known.shown(views, min_iou),
                       options.mapping.min_viewpoints)
         if np.count_nonzero(found.is_known) < options.min_confirmed:
             break
         step = _offset(known, found)
         rotations, translations = camera_from_map(step @ map_from_cameras(views))
-        moved = views._replace(rotations=rotations, translations=translations)
-        views, total = moved, step @ total
+        views = views._replace(rotations=rotations, translations=translations)
+        total = step @ total
         middle = known.landmarks.centers[found.is_known].mean(axis=0)
         if np.linalg.norm(step[:3, :3] @ middle + step[:3, 3] - middle) < _SETTLED_M:
             break
     middle = known.landmarks.centers.mean(axis=0)
     offset_m = float(np.linalg.norm(total[:3, :3].T @ (middle - total[:3, 3]) - middle))
     offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
-    refined = views if options.mapping.pose_errors is None else _refine(views, known, options)
-    changes = np.square(pose_errors(views, refined))
-    return Alignment(refined, offset_m, offset_deg,
-                     float(np.sqrt(changes[:, :3].sum(axis=1).mean())),
-                     float(np.degrees(np.sqrt(changes[:, 3:].sum(axis=1).mean()))))
+    refined = _refine(views, known, options)
+    return Alignment(refined, offset_m, offset_deg, *pose_changes(views, refined))
 
 
 def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
@@ -90,49 +178,48 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     lengths, step = found.fun[:-6], np.eye(4)
     # positions err more than their deviations say: objects are no ellipsoids
     inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
-    if float(found.x @ (found.jac.T @ found.jac) @ found.x) < _SIGNIFICANT * inflation ** 2:
-        return step
-    motion = found.x
-    step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
-    step[:3, 3] = middle + motion[:3] - step[:3, :3] @ middle
+    if float(found.x @ (found.jac.T @ found.jac) @ found.x) >= _SIGNIFICANT * inflation ** 2:
+        step[:3, :3] = Rotation.from_rotvec(found.x[3:]).as_matrix()
+        step[:3, 3] = middle + found.x[:3] - step[:3, :3] @ middle
     return step
 
 
 def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
-    assert options.mapping.pose_errors is not None
-    views, min_iou = aligned, options.mapping.association_iou
+    views, errors = aligned, options.mapping.pose_errors
+    if errors is None:
+        return aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
     for _ in range(options.mapping.refinements):
-        shown = find_known(views, known, min_iou)
+        shown = known.shown(views, options.mapping.association_iou)
         found = refit(views, known.landmarks, shown, options.mapping.min_viewpoints)
-        away = has_moved(known, found, options)
+        away = has_moved(known.landmarks, known.sigmas, found, options)
         shown[np.isin(shown, np.nonzero(away)[0])] = -1
         if not (shown >= 0).any():
             return views
-        views, _ = refine_jointly(aligned, views, known.landmarks, shown,
-                                  options.mapping.pose_errors, anchors=anchors)
+        views, _ = refine_jointly(aligned, views, known.landmarks, shown, errors, anchors=anchors)
     return views
 
 
-def has_moved(known: Known, found: Refits, options: UpdateOptions) -> NDArray[np.bool_]:
+def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits, options: UpdateOptions
+              ) -> NDArray[np.bool_]:
     """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
-    offsets = found.landmarks.centers - known.landmarks.centers
+    offsets = found.landmarks.centers - old.centers
     far = found.is_known & (np.linalg.norm(offsets, axis=1) > options.least_move_m)
     rows = np.nonzero(far)[0]
-    bases, others = known.landmarks.bases[rows], found.landmarks.bases[rows]
+    bases, others = old.bases[rows], found.landmarks.bases[rows]
     shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
     far[rows] = ((_lengths(offsets[rows], shapes) > options.least_move_shapes)
-                 & (deviations(known, found, rows) > options.least_move_sigmas))
+                 & (deviations(old.select(rows), sigmas[rows], found.select(rows))
+                    > options.least_move_sigmas))
     return far
 
 
-def deviations(known: Known, found: Refits, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return by how many standard deviations (k,) old and new positions of landmarks differ."""
-    offsets = found.landmarks.centers[rows] - known.landmarks.centers[rows]
-    covariances = (found.covariances[rows]
-                   + np.square(known.sigmas[rows])[:, None, None] * np.eye(3))
-    return _lengths(offsets, covariances)
+def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits
+               ) -> NDArray[np.float64]:
+    """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
+    covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
+    return _lengths(found.landmarks.centers - old.centers, covariances)
 
 
 def _lengths(offsets: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which object of the recording is which landmark of the old map.
+"""Which object of the recording is which landmark of the old map, and what became of the others.
 
 Every landmark gets at most one object of its class, and every object at most one landmark, so that
 the sum of gains is the greatest possible (Hungarian method). A gain is a log-likelihood ratio of
@@ -9,7 +9,6 @@ stays alone if it gains nothing.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
+from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.known import Known
-from cliploc_ros.mapping.updating.objects import Objects
+from cliploc_ros.mapping.updating.alignment import Known, has_moved
+from cliploc_ros.mapping.updating.judging import Judged, Objects
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
@@ -36,12 +36,43 @@ _AMBIGUOUS_GAIN = 1.0
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
 # Objects in their place from which the usual similarity of two looks is learned.
 _FEWEST_LOOKS = 8
-# A landmark in its place is doubted if its look fits worse than usual by more deviations.
+# A landmark in its place is doubted if its look fits worse than usual by this many deviations.
 _DOUBT = 1.0
 
 
-@dataclass(frozen=True)
-class Looks:
+class Fates(NamedTuple):
+    """Rows of L old landmarks by what became of them, and new objects."""
+
+    #: of int
+    confirmed: NDArray[np.int64]
+    moved: NDArray[np.int64]
+    missing: NDArray[np.int64]
+    not_observed: NDArray[np.int64]
+    new: NDArray[np.int64]  #: of int: objects that are no old landmark
+    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
+    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
+
+
+def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None',
+                 options: UpdateOptions) -> Fates:
+    """Return what became of each old landmark."""
+    numbers, rivals = _identify(known, objects, judged.is_gone, looks)
+    found = numbers >= 0
+    elsewhere = found.copy()
+    rows = np.nonzero(found)[0]
+    elsewhere[rows] = objects.owners[numbers[rows]] != rows
+    # an object that is a little off its place was only mapped badly
+    rows = np.nonzero(elsewhere)[0]
+    elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
+                                objects.refits.select(numbers[rows]), options)
+    missing = ~found & (judged.is_gone | judged.is_there)
+    return Fates(
+        np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
+        np.nonzero(~found & ~missing)[0],
+        np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, rivals)
+
+
+class Looks(NamedTuple):
     """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown."""
 
     landmarks: NDArray[np.float32]  #: (L, d): of the old map
@@ -71,21 +102,12 @@ def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetectio
 
 
 def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
-                  detections: PosedDetections, shown: NDArray[np.int64], count: int) -> Looks:
-    """Return the looks of the old landmarks and of the recording's objects.
-
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        Of the old map.
-    shown : ndarray (n,) of int
-        The object that each box shows, -1 for none.
-    count : int
-        Number of objects.
-    """
-    objects = embed_landmarks([str(number) for number in range(count)], detections, shown)
+                  detections: PosedDetections, objects: Objects) -> Looks:
+    """Return the looks of the old landmarks, by their ids, and of the recording's objects."""
+    of_objects = embed_landmarks([str(number) for number in range(len(objects.owners))],
+                                 detections, objects.shown)
     return Looks(old.in_order(landmark_ids).means.astype(np.float32),
-                 objects.means.astype(np.float32))
+                 of_objects.means.astype(np.float32))
 
 
 def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str],
@@ -93,12 +115,7 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
                      ) -> LandmarkEmbeddings | None:
     """Return the embeddings of the new map: the old ones, and the recording's for the others.
 
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        Of the new map.
-    shown : ndarray (n,) of int
-        The landmark of the new map that each box shows, -1 for none.
+    The ids are those of the new map, shown (n,) the row there that each box shows, -1 for none.
     """
     kept = None if old is None else old.in_order(landmark_ids)
     if detections.embeddings is None or not detections.encoder_key:
@@ -119,14 +136,6 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
     ).in_order(landmark_ids)
 
 
-class Identities(NamedTuple):
-    """Who is who."""
-
-    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
-    #: Old landmarks that an object could be as well, for the objects of which this is so
-    rivals: dict[int, tuple[int, ...]]
-
-
 class _LookModel(NamedTuple):
     """How similar the looks of one object are, and those of two objects of one class."""
 
@@ -139,65 +148,56 @@ class _LookModel(NamedTuple):
         gains = (self.own - self.other) * (cosines - middle) / self.sigma ** 2
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
-    def is_doubtful(self, cosines: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(cosines < self.own - _DOUBT * self.sigma)
 
+def _identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
+              ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
+    """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
-def identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
-             ) -> Identities:
-    """Return which object each old landmark is.
-
-    Parameters
-    ----------
-    is_gone : ndarray (L,) of bool
-        Landmarks that may be any new object; others only the one in their place or near it.
+    Landmarks that are gone may be any new object; others only the one in their place or near it.
     """
     held = np.nonzero(objects.owners >= 0)[0]
+    owners = objects.owners[held]
     result = np.full(len(is_gone), -1, dtype=np.int64)
-    result[objects.owners[held]] = held
+    result[owners] = held
     groups = _class_groups(known, objects)
-    model = _learn_looks(known, objects, looks, groups)
+    model = None if looks is None else _learn_looks(objects, looks, groups)
     doubtful = np.zeros(len(held), dtype=np.bool_)
     if looks is not None and model is not None:
-        own = np.einsum('ld,ld->l', looks.landmarks[objects.owners[held]], looks.objects[held])
-        is_known = (looks.landmarks[objects.owners[held]].any(axis=1)
-                    & looks.objects[held].any(axis=1))
-        doubtful = is_known & model.is_doubtful(own.astype(np.float64))
-    near = {row for rows in objects.near for row in rows}
+        pairs = looks.landmarks[owners], looks.objects[held]
+        cosines = np.einsum('ld,ld->l', *pairs).astype(np.float64)
+        doubtful = (pairs[0].any(axis=1) & pairs[1].any(axis=1)
+                    & (cosines < model.own - _DOUBT * model.sigma))
     searched = is_gone.copy()
-    searched[list(near)] = True
-    searched[objects.owners[held]] = doubtful
+    searched[[row for rows in objects.near for row in rows]] = True
+    searched[owners] = doubtful
     offered = objects.owners < 0
     offered[held] = doubtful
     rivals: dict[int, tuple[int, ...]] = {}
-    for group in np.unique(groups[objects.landmarks.classes[offered]]):
-        rows = np.nonzero(searched & (known.landmarks.classes >= 0)
-                          & (groups[known.landmarks.classes] == group))[0]
-        columns = np.nonzero(offered & (groups[objects.landmarks.classes] == group))[0]
+    of_landmarks = np.where(known.landmarks.classes >= 0, groups[known.landmarks.classes], -1)
+    of_objects = groups[objects.landmarks.classes]
+    for group in np.unique(of_objects[offered]):
+        rows = np.nonzero(searched & (of_landmarks == group))[0]
+        columns = np.nonzero(offered & (of_objects == group))[0]
         if len(rows) and len(columns):
             gains = _gains(known, objects, is_gone, rows, columns)
             if looks is not None and model is not None:
                 gains += model.gains(looks.similarities(rows, columns))
             result[rows], close = _assign(gains, rows, columns)
             rivals |= close
-    return Identities(result, rivals)
+    return result, rivals
 
 
 def _class_groups(known: Known, objects: Objects) -> NDArray[np.int64]:
     """Return a group for each class: the classes of one landmark belong together."""
-    count = 1 + max(int(known.named.classes.max(initial=0)),
-                    int(objects.landmarks.classes.max(initial=0)),
-                    int(known.landmarks.classes.max(initial=0)))
+    count = 1 + max(int(one.classes.max(initial=0))
+                    for one in (known.named, objects.landmarks, known.landmarks))
     main = known.landmarks.classes[known.owners]
     links = coo_matrix((np.ones(len(main)), (main, known.named.classes)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _learn_looks(known: Known, objects: Objects, looks: Looks | None, groups: NDArray[np.int64]
-                 ) -> _LookModel | None:
+def _learn_looks(objects: Objects, looks: Looks, groups: NDArray[np.int64]) -> _LookModel | None:
     """Return how looks compare, learned from the landmarks in their place; None if too few."""
-    if looks is None:
-        return None
     held = np.nonzero(objects.owners >= 0)[0]
     own, other = [np.empty(0)], [np.empty(0)]
     classes = groups[objects.landmarks.classes[held]]
@@ -227,7 +227,7 @@ def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDA
     ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
                             - objects.landmarks.centers[columns][None], axis=2)
     gains = _ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA) - _GAIN_PER_M * ways_m
-    named = set(zip(known.owners.tolist(), known.named.classes.tolist(), strict=True))
+    names = known.names
     for place, row in enumerate(rows):
         for column, number in enumerate(columns):
             if objects.owners[number] == row:
@@ -236,7 +236,7 @@ def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDA
                 gains[place, column] += _NEAR_GAIN - _ELSEWHERE_GAIN
             elif (change[place, column] > _MAX_SIZE_CHANGE
                   or not (is_gone[row] or row in objects.owners)
-                  or (int(row), int(objects.landmarks.classes[number])) not in named):
+                  or (int(row), int(objects.landmarks.classes[number])) not in names):
                 gains[place, column] = -np.inf
     return gains
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.landmarks import Landmarks
-from cliploc_ros.mapping.projection import project_box
-from cliploc_ros.mapping.updating.options import UpdateOptions
+from cliploc_ros.mapping.landmarks import Landmarks, project_box
+from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views
 
 # Share of a place's box that must lie in the image.
