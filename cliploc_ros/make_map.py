@@ -16,9 +16,9 @@ from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.errors import ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
 from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
-from cliploc_ros.mapping.mount import MountCorrection
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.systematic import MountCorrection
 from cliploc_ros.mapping.updating.renewal import UpdateReport
 from cliploc_ros.mapping.updating.updating import update_map as update_landmarks
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights

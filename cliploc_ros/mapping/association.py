@@ -143,24 +143,23 @@ def associate(views: Views, landmarks: Landmarks, min_iou: float) -> NDArray[np.
     """Return the landmark (n,) that each box shows, -1 for none.
 
     In every frame a landmark has at most one box and a box at most one landmark; the sum of
-    their IoUs is the greatest possible (Hungarian method).
-
-    Parameters
-    ----------
-    min_iou : float
-        Pairs that overlap less are no candidates.
+    their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
+    are no candidates.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
     shown = np.full(len(views.frames), -1, dtype=np.int64)
-    if len(boxes) == 0:
-        return shown
     frames = views.frames[boxes]
     sole = _is_sole(boxes) & _is_sole(frames * len(landmarks.centers) + candidates)
     shown[boxes[sole]] = candidates[sole]
     contested = np.nonzero(~sole)[0]
-    bounds = np.nonzero(np.diff(frames[contested]))[0] + 1
-    for part in np.split(contested, bounds):
-        _assign(boxes[part], candidates[part], ious[part], shown)
+    for part in np.split(contested, np.nonzero(np.diff(frames[contested]))[0] + 1):
+        rows, row_of = np.unique(boxes[part], return_inverse=True)
+        columns, column_of = np.unique(candidates[part], return_inverse=True)
+        gains = np.zeros((len(rows), len(columns)))
+        gains[row_of, column_of] = ious[part]
+        for row, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
+            if gains[row, column] > 0.0:
+                shown[rows[row]] = columns[column]
     return shown
 
 
@@ -168,18 +167,6 @@ def _is_sole(values: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Tell which values occur once."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray(counts[inverse] == 1)
-
-
-def _assign(boxes: NDArray[np.int64], candidates: NDArray[np.int64], ious: NDArray[np.float64],
-            shown: NDArray[np.int64]) -> None:
-    """Write the landmarks of the contested boxes of one frame."""
-    rows, row_of = np.unique(boxes, return_inverse=True)
-    columns, column_of = np.unique(candidates, return_inverse=True)
-    gains = np.zeros((len(rows), len(columns)))
-    gains[row_of, column_of] = ious
-    for row, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
-        if gains[row, column] > 0.0:
-            shown[rows[row]] = columns[column]
 
 
 @compiled
@@ -193,51 +180,24 @@ def ious_with(views, rows, center, basis):
     return ious
 
 
-class Merged(NamedTuple):
-    """Landmarks after merging: K of L are left."""
-
-    landmarks: Landmarks  #: The K that are left, in their order
-    #: (n,): the landmark, of those that are left, that each box shows, -1 for none
-    shown: NDArray[np.int64]
-    #: (L,): the landmark, of those before merging, that each one is part of now
-    into: NDArray[np.int64]
-
-
 def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                     options: MappingOptions) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks with duplicates merged, and which of them each box shows.
-
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    """
-    merged = merge_pairs(views, landmarks, shown,
-                         pairs_of_one_class(landmarks, options.merge_distance), options)
-    return merged.landmarks, merged.shown
-
-
-def merge_classes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                  options: MappingOptions) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks with those merged that are one object under two classes.
-
-    The class that the more boxes have stays. Parameters as in merge_duplicates.
-    """
-    pairs = [pair for pair in _close_pairs(landmarks, options.class_merge_distance)
-             if landmarks.classes[pair[0]] != landmarks.classes[pair[1]]]
-    merged = merge_pairs(views, landmarks, shown, pairs, options)
-    return merged.landmarks, merged.shown
-
-
-def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
-    """Return the pairs of one class nearer than a normalized distance, the nearest first."""
-    return [pair for pair in _close_pairs(landmarks, max_distance)
-            if landmarks.classes[pair[0]] == landmarks.classes[pair[1]]]
+                     pairs: list[tuple[int, int]], options: MappingOptions
+                     ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return the landmarks left after merging those pairs that are one object, and the boxes'."""
+    landmarks, into = merge_pairs(views, landmarks, shown, pairs, options)
+    is_kept = into == np.arange(len(into))
+    numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
+    return landmarks.select(is_kept), numbers[shown]
 
 
 def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                pairs: list[tuple[int, int]], options: MappingOptions) -> Merged:
-    """Merge those of the pairs that are one object, in the order given."""
+                pairs: list[tuple[int, int]], options: MappingOptions
+                ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Fit those of the pairs together that are one object, in the order given.
+
+    Of two landmarks the one with more boxes stays. Returns all landmarks, and the one (L,) that
+    each is part of.
+    """
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     rows_of = group_boxes(shown, len(centers))
     into = np.arange(len(centers))
@@ -257,16 +217,17 @@ def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
             continue
         centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, rows
         into[into == drop] = keep
-    is_kept = into == np.arange(len(into))
-    numbers = np.cumsum(is_kept) - 1
-    merged = np.full(len(shown), -1, dtype=np.int64)
-    for number in np.nonzero(is_kept)[0]:
-        merged[rows_of[number]] = numbers[number]
-    return Merged(Landmarks(centers, bases, landmarks.classes).select(is_kept), merged, into)
+    return Landmarks(centers, bases, landmarks.classes), into
 
 
-def _close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
-    """Return the pairs nearer than a normalized distance, the nearest first."""
+def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
+    """Return the pairs of one class nearer than a normalized distance, the nearest first."""
+    return [(first, second) for first, second, _ in close_pairs(landmarks, max_distance)
+            if landmarks.classes[first] == landmarks.classes[second]]
+
+
+def close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int, float]]:
+    """Return the pairs nearer than a normalized distance, with it, the nearest first."""
     if len(landmarks.centers) < 2:
         return []
     reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
@@ -276,8 +237,8 @@ def _close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, i
              for second in tree.query_ball_point(landmarks.centers[first],
                                                  2.0 * max_distance * reach[first])
              if second != first}
-    close = [(normalized_distance(landmarks, *pair), pair) for pair in sorted(pairs)]
-    return [pair for distance, pair in sorted(close) if distance < max_distance]
+    close = [(*pair, normalized_distance(landmarks, *pair)) for pair in sorted(pairs)]
+    return sorted((one for one in close if one[2] < max_distance), key=lambda one: one[2])
 
 
 def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:

@@ -2,28 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well the frames support each landmark."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps, ious_with
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
 
-# A landmark is expected in a frame that shows this share of its box, from no farther away than
-# this times the greatest distance at which it was detected.
-_SHOWN_SHARE = 0.6
-_REACH = 1.2
+#: A landmark is expected in a frame that shows this share of its box, from no farther away than
+#: this times the greatest distance at which it was detected.
+SHOWN_SHARE = 0.6
+REACH = 1.2
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
 
 
 class Evidence(NamedTuple):
-    """What is known of each of L landmarks."""
+    """The support of each of L landmarks."""
 
     #: (L,): frames that show it, their viewpoints, and frames that should show it
     support: NDArray[np.int64]
@@ -47,40 +49,35 @@ class Evidence(NamedTuple):
                         self.baseline_deg[rows], self.position_sigma[rows],
                         self.median_iou[rows], self.last_seen[rows])
 
+    def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
+        """Return the details of a landmark in a map with this evidence in place of the given."""
+        return replace(
+            given, position_sigma=float(self.position_sigma[row]), support=int(self.support[row]),
+            seen_ratio=float(self.seen_ratio[row]), baseline_deg=float(self.baseline_deg[row]),
+            last_seen=float(self.last_seen[row]))
+
 
 def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
-    """Return the evidence for each landmark.
-
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    """
-    rows_of = group_boxes(shown, len(landmarks.centers))
-    cameras = camera_centers(views, np.arange(len(views.rotations)))
-    per_landmark = [_evidence_of(views, cameras, landmarks.centers[number],
-                                 landmarks.bases[number], rows)
-                    for number, rows in enumerate(rows_of)]
-    columns = np.array(per_landmark, dtype=np.float64).reshape(-1, 7).T
-    counts = columns[:3].astype(np.int64)
-    return Evidence(*counts, *columns[3:])
-
-
-def _evidence_of(views: Views, cameras: NDArray[np.float64], center: NDArray[np.float64],
-                 basis: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[float, ...]:
-    if len(rows) == 0:
-        return 0, 0, 0, 0.0, np.inf, 0.0, np.nan
-    frames = views.frames[rows]
-    offsets = center - cameras[frames]
-    distances = np.linalg.norm(offsets, axis=1)
-    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-    return (len(rows), len(np.unique(views.viewpoints[frames])),
-            count_expected(views, cameras, center, basis, _REACH * distances.max()),
-            widest_angle_deg(offsets / distances[:, None]),
-            _position_sigma(information),
-            float(np.median(ious_with(views, rows, center, basis))),
-            float(views.stamps_s[frames].max()))
+    """Return the evidence for each landmark from the boxes that show it."""
+    cameras = camera_centers(views)
+    columns: list[tuple[float, ...]] = []
+    for center, basis, rows in zip(landmarks.centers, landmarks.bases,
+                                   group_boxes(shown, len(landmarks.centers)), strict=True):
+        if len(rows) == 0:
+            columns.append((0, 0, 0, 0.0, np.inf, 0.0, np.nan))
+            continue
+        frames = views.frames[rows]
+        offsets = center - cameras[frames]
+        distances = np.linalg.norm(offsets, axis=1)
+        information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+        accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+        columns.append((
+            len(rows), len(np.unique(views.viewpoints[frames])),
+            is_expected(views, cameras, center, basis, REACH * distances.max()).sum(),
+            widest_angle_deg(offsets / distances[:, None]), _position_sigma(information),
+            np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max()))
+    values = np.array(columns, dtype=np.float64).reshape(-1, 7).T
+    return Evidence(*values[:3].astype(np.int64), *values[3:])
 
 
 def _position_sigma(information: NDArray[np.float64]) -> float:
@@ -112,9 +109,9 @@ def widest_angle_deg(directions: NDArray[np.float64]) -> float:
 
 
 @compiled
-def count_expected(views, cameras, center, basis, reach):
-    """Return in how many frames an ellipsoid lies in the image, and no farther than reach [m]."""
-    count, box = 0, np.empty(4)
+def is_expected(views, cameras, center, basis, reach):
+    """Return the frames (F,) that show an ellipsoid, from no farther away than reach [m]."""
+    expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
     left, top, right, bottom = views.bounds
     for frame in range(len(cameras)):
         distance_2 = 0.0
@@ -126,10 +123,9 @@ def count_expected(views, cameras, center, basis, reach):
             continue
         width = min(box[2], right) - max(box[0], left)
         height = min(box[3], bottom) - max(box[1], top)
-        if width > 0.0 and height > 0.0 and width * height > (
-                _SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1])):
-            count += 1
-    return count
+        expected[frame] = width > 0.0 and height > 0.0 and width * height > (
+            SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
+    return expected
 
 
 def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOptions

@@ -49,21 +49,13 @@ class Fit(NamedTuple):
     information: NDArray[np.float64]
 
 
-def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np.int64]]
-                  ) -> Landmarks:
-    """Return landmarks, each fitted to its boxes; one without boxes stays as it is.
-
-    Parameters
-    ----------
-    landmarks : Landmarks
-        L of them.
-    boxes : sequence of ndarray of int
-        The rows of the boxes of each of the L landmarks.
-    """
+def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np.int64]],
+                  iterations: int = 30) -> Landmarks:
+    """Return landmarks, each fitted to its boxes; one without boxes stays as it is."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     for number, rows in enumerate(boxes):
         if len(rows):
-            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number], iterations)
             centers[number], bases[number] = fit.center, fit.basis
     return Landmarks(centers, bases, landmarks.classes)
 
@@ -72,14 +64,7 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
                   basis: NDArray[np.float64], iterations: int = 30) -> Fit:
     """Fit an ellipsoid to the boxes of some rows, from a start.
 
-    Parameters
-    ----------
-    rows : ndarray (m,) of int
-        Boxes of the landmark.
-    center, basis : ndarray (3,), (3, 3)
-        Where to start.
-    iterations : int
-        The most steps of Levenberg and Marquardt.
+    It takes at most this number of steps of Levenberg and Marquardt.
     """
     center, basis = center.copy(), basis.copy()
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))

@@ -174,10 +174,16 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
 
 def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
     """Return by how much given poses are off (F, 6): x, y, z [m], rotation vector [rad]."""
-    every = np.arange(len(given.rotations))
-    offsets = camera_centers(present, every) - camera_centers(given, every)
+    offsets = camera_centers(present) - camera_centers(given)
     turns = np.einsum('fji,fjk->fik', present.rotations, given.rotations)
     return np.concatenate([offsets, Rotation.from_matrix(turns).as_rotvec()], axis=1)
+
+
+def pose_changes(given: Views, present: Views) -> tuple[float, float]:
+    """Return the root mean square by which poses changed: [m], [deg]."""
+    squares = np.square(pose_errors(given, present))
+    return (float(np.sqrt(squares[:, :3].sum(axis=1).mean())),
+            float(np.degrees(np.sqrt(squares[:, 3:].sum(axis=1).mean()))))
 
 
 class State(NamedTuple):
@@ -194,7 +200,7 @@ class State(NamedTuple):
         bases = np.empty_like(self.landmarks.bases)
         _move_all(self.landmarks.centers, self.landmarks.bases, landmark_steps, centers, bases)
         turned = Rotation.from_rotvec(pose_steps[:, 3:]).as_matrix().transpose(0, 2, 1)
-        origins = camera_centers(self.views, np.arange(len(self.errors)))
+        origins = camera_centers(self.views)
         rotations = np.ascontiguousarray(self.views.rotations @ turned)
         translations = -np.einsum('fij,fj->fi', rotations, origins + pose_steps[:, :3])
         return State(self.views._replace(rotations=rotations, translations=translations),

@@ -13,7 +13,8 @@ free of the singularities of angles (a sphere has no orientation), and whose dia
 logarithms of the semi-axes.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from math import sqrt
 from typing import NamedTuple
 
@@ -224,3 +225,25 @@ def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]
     order = np.argsort(shown, kind='stable')
     bounds = np.searchsorted(shown[order], np.arange(count + 1))
     return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
+
+
+def ellipsoid_numbers(bases: NDArray[np.float64]
+                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return semi-axes (L, 3) and quaternions x, y, z, w (L, 4) of bases (L, 3, 3)."""
+    semi_axes = np.linalg.norm(bases, axis=1)
+    rotations = bases / semi_axes[:, None, :]
+    rotations[np.linalg.det(rotations) < 0.0] *= -1.0
+    return semi_axes, Rotation.from_matrix(rotations).as_quat()
+
+
+def unused_ids(class_names: Sequence[str], used: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return an id for each landmark, its class and a number, that is not among those used."""
+    taken, counts, ids = set(used), Counter[str](), list[str]()
+    for name in class_names:
+        word = ''.join(char if char.isalnum() else '_' for char in name)
+        counts[word] += 1
+        while f'{word}_{counts[word]}' in taken:
+            counts[word] += 1
+        ids.append(f'{word}_{counts[word]}')
+        taken.add(ids[-1])
+    return tuple(ids)

@@ -118,12 +118,13 @@ def map_from_cameras(views: Views) -> NDArray[np.float64]:
     """Return the poses map_from_camera (F, 4, 4) of all frames."""
     poses = np.tile(np.eye(4), (len(views.rotations), 1, 1))
     poses[:, :3, :3] = views.rotations.transpose(0, 2, 1)
-    poses[:, :3, 3] = camera_centers(views, np.arange(len(poses)))
+    poses[:, :3, 3] = camera_centers(views)
     return poses
 
 
-def camera_centers(views: Views, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return where the camera was in some frames (k, 3) [m]."""
+def camera_centers(views: Views, frames: NDArray[np.int64] | slice = slice(None)
+                   ) -> NDArray[np.float64]:
+    """Return where the camera was in some frames, or in all (k, 3) [m]."""
     return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
                                  views.translations[frames]))
 

@@ -22,8 +22,8 @@ from cliploc_ros.mapping.checking.detector_model import measure_detector
 from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
 from cliploc_ros.mapping.checking.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.mapping.checking.relocalization import make_folds, try_recording
-from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.options import CheckOptions, MappingOptions, Thresholds
+from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import make_views
 from cliploc_ros.simulation.labels import LabelModel
 

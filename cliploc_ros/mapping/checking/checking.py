@@ -43,9 +43,9 @@ from cliploc_ros.mapping.checking.report import (
     check_keyframes,
     find_failures,
 )
-from cliploc_ros.mapping.checking.systematic import find_corrections
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import Views, check_input, make_views
 
 #: Told the name of a stage and the share of it that is done.

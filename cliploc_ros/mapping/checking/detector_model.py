@@ -15,21 +15,16 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.mapping.checking.landmark_faults import Witness
-from cliploc_ros.mapping.checking.systematic import linearize_boxes
-from cliploc_ros.mapping.evidence import best_ious
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
+from cliploc_ros.mapping.evidence import REACH, SHOWN_SHARE, best_ious, is_expected
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.systematic import linearize_boxes
 from cliploc_ros.mapping.views import Views, camera_centers
 
-# A landmark is detected only if this share of its box is in the image, from no farther away than
-# this times the greatest distance at which it was detected.
-_SHOWN_SHARE = 0.6
-_REACH = 1.2
 # Frames count for a pose if they saw the landmark from within this angle of its direction.
 _NEAR_COSINE = np.cos(np.radians(30.0))
 # Frames that the landmark's overall ratio stands for, where few frames are near.
@@ -80,7 +75,7 @@ class DetectorModel:
             clipped = np.clip(boxes, 0.0, size)
             extent, shown = boxes[:, 2:] - boxes[:, :2], clipped[:, 2:] - clipped[:, :2]
             distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
-            visible = (shown.prod(axis=1) > _SHOWN_SHARE * extent.prod(axis=1)) \
+            visible = (shown.prod(axis=1) > SHOWN_SHARE * extent.prod(axis=1)) \
                 & (shown.min(axis=1) >= self.min_side_px) & (distances <= self.reach_m)
         rows = np.nonzero(visible)[0]
         return rows, clipped[rows]
@@ -140,48 +135,33 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
 
     A landmark that was never detected does not exist: the model never detects it.
     """
-    landmarks, shown = witness.landmarks, witness.shown
-    boxes_of = group_boxes(shown, len(landmarks.centers))
-    reach = np.zeros(len(boxes_of))
-    for row, rows in enumerate(boxes_of):
+    landmarks, cameras = witness.landmarks, camera_centers(views)
+    frames = np.arange(0, len(detections), -(-len(detections) // _MAX_SAMPLED_FRAMES))
+    reach, sightings = np.zeros(len(landmark_map)), []
+    for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
+        center, basis = landmarks.centers[row], landmarks.bases[row]
         if len(rows):
-            offsets = landmarks.centers[row] - camera_centers(views, views.frames[rows])
-            reach[row] = _REACH * np.linalg.norm(offsets, axis=1).max()
-    step = -(-len(detections) // _MAX_SAMPLED_FRAMES)
-    frames = np.arange(0, len(detections), step)
-    sightings = tuple(_sightings(views, frames, landmarks, row, reach[row], rows)
-                      for row, rows in enumerate(boxes_of))
+            offsets = center - cameras[views.frames[rows]]
+            reach[row] = REACH * np.linalg.norm(offsets, axis=1).max()
+        offsets = center - cameras
+        distances = np.linalg.norm(offsets, axis=1)
+        expected = frames[(is_expected(views, cameras, center, basis, reach[row])
+                           & (distances > 0.0))[frames]]
+        sightings.append(_Sightings(offsets[expected] / distances[expected, None],
+                                    np.isin(expected, views.frames[rows])))
     sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
     min_side = float(np.quantile(sides, 0.01)) if len(sides) else _GUESSED_MIN_SIDE_PX
+    # the boxes that no landmark explains, by frame
+    is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
+    clutter = []
+    for frame in frames:
+        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
+        rows = rows[is_clutter[rows]]
+        clutter.append((detections.bboxes_xyxy[rows],
+                        tuple(detections.class_names[one] for one in detections.classes[rows])))
     return DetectorModel(
-        landmark_map, detections.camera, sightings, witness.evidence.seen_ratio, reach,
-        _edge_scale(views, landmarks, shown), min_side,
-        _clutter(detections, best_ious(views, landmarks), frames), options)
-
-
-def _sightings(views: Views, frames: NDArray[np.int64], landmarks: Landmarks, row: int,
-               reach: float, boxes: NDArray[np.int64]) -> _Sightings:
-    offsets = landmarks.centers[row] - camera_centers(views, frames)
-    distances = np.linalg.norm(offsets, axis=1)
-    shares = _shown_shares(views, frames, landmarks.centers[row], landmarks.bases[row])
-    is_expected = (shares > _SHOWN_SHARE) & (distances <= reach) & (distances > 0.0)
-    return _Sightings(offsets[is_expected] / distances[is_expected, None],
-                      np.isin(frames[is_expected], views.frames[boxes]))
-
-
-@compiled
-def _shown_shares(views, frames, center, basis):
-    """Return the share (k,) of an ellipsoid's box that lies in the image of each frame."""
-    shares, box = np.zeros(len(frames)), np.empty(4)
-    left, top, right, bottom = views.bounds
-    for place in range(len(frames)):
-        frame = frames[place]
-        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
-            width = min(box[2], right) - max(box[0], left)
-            height = min(box[3], bottom) - max(box[1], top)
-            if width > 0.0 and height > 0.0:
-                shares[place] = width * height / ((box[2] - box[0]) * (box[3] - box[1]))
-    return shares
+        landmark_map, detections.camera, tuple(sightings), witness.evidence.seen_ratio, reach,
+        _edge_scale(views, landmarks, witness.shown), min_side, tuple(clutter), options)
 
 
 def _edge_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
@@ -192,16 +172,3 @@ def _edge_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) ->
     linear = linearize_boxes(views, rows, shown[rows], landmarks)
     residuals = np.abs(linear.residuals[linear.weights > 0.0])  # those of closed edges
     return float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
-
-
-def _clutter(detections: PosedDetections, ious: NDArray[np.float64], frames: NDArray[np.int64]
-             ) -> tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]:
-    """Return the boxes that no landmark explains, by frame."""
-    is_clutter = ious < _CLUTTER_IOU
-    found = []
-    for frame in frames:
-        rows = np.arange(detections.frame_offsets[frame], detections.frame_offsets[frame + 1])
-        rows = rows[is_clutter[rows]]
-        found.append((detections.bboxes_xyxy[rows],
-                      tuple(detections.class_names[detections.classes[row]] for row in rows)))
-    return tuple(found)

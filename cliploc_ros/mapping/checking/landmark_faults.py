@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.association import associate, normalized_distance
-from cliploc_ros.mapping.evidence import Evidence, count_expected, gather_evidence
+from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
+from cliploc_ros.mapping.evidence import REACH, Evidence, gather_evidence, is_expected
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions
@@ -22,12 +21,11 @@ from cliploc_ros.mapping.views import Views, camera_centers
 # object, unless they are farther apart than the second distance and frames show both at once.
 # Guesses: build_map merges below 0.8 if the boxes agree.
 _OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
-_MAX_SHARED_VIEWS = 0.15
+_MAX_SEEN_APART = 0.15
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
 _MIN_EXPECTED = 10
-_REACH = 1.2
 # A landmark that its boxes put farther away than all of these is in the wrong place. Guesses.
 _MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
 
@@ -89,11 +87,11 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
                                axis=1).max()
                 for row, rows in enumerate(group_boxes(shown, len(landmarks.centers)))
                 if len(rows)]
-    reach = _REACH * float(np.median(farthest)) if farthest else 0.0
-    cameras = camera_centers(views, np.arange(len(views.rotations)))
+    reach = REACH * float(np.median(farthest)) if farthest else 0.0
+    cameras = camera_centers(views)
     for row in np.nonzero(evidence.support == 0)[0]:
-        expected[row] = count_expected(views, cameras, landmarks.centers[row],
-                                       landmarks.bases[row], reach)
+        expected[row] = is_expected(views, cameras, landmarks.centers[row], landmarks.bases[row],
+                                    reach).sum()
     fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
     return Witness(landmarks, shown, evidence, expected, fitted)
 
@@ -102,31 +100,14 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
                       ) -> list[Overlap]:
     """Return the landmarks of a map that lie in one another, the nearest first."""
     landmarks = landmarks_of_map(landmark_map, sorted(set(landmark_map.class_ids)))
-    reach = landmark_map.semi_axes.max(axis=1)
-    tree = cKDTree(landmark_map.centers)
-    largest = float(reach.max())
+    boxes = None if witness is None else group_boxes(witness.shown, len(landmark_map))
     found = []
-    for first in range(len(landmark_map)):
-        near = tree.query_ball_point(landmark_map.centers[first],
-                                     _OVERLAP_DISTANCE * 1.5 * (reach[first] + largest))
-        for second in near:
-            if second <= first:
-                continue
-            distance = normalized_distance(landmarks, first, second)
-            if distance < _OVERLAP_DISTANCE:
-                is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
-                    distance < _SAME_PLACE_DISTANCE
-                    or not _seen_together(witness, views, first, second))
-                found.append(Overlap(first, second, distance, bool(is_duplicate)))
+    for first, second, distance in close_pairs(landmarks, _OVERLAP_DISTANCE):
+        is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
+            distance < _SAME_PLACE_DISTANCE or boxes is None or views is None
+            or seen_apart(views, boxes[first], boxes[second]) <= _MAX_SEEN_APART)
+        found.append(Overlap(first, second, distance, bool(is_duplicate)))
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
-
-
-def _seen_together(witness: Witness | None, views: Views | None, first: int, second: int) -> bool:
-    if witness is None or views is None:
-        return False
-    frames = [views.frames[witness.shown == row] for row in (first, second)]
-    shared = len(np.intersect1d(*frames))
-    return shared > _MAX_SHARED_VIEWS * max(1, min(map(len, frames)))
 
 
 def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,

@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -19,7 +18,7 @@ from cliploc_ros.mapping.checking.detector_model import DetectorModel
 from cliploc_ros.mapping.checking.landmark_faults import Witness
 from cliploc_ros.mapping.evidence import best_ious, explained
 from cliploc_ros.mapping.fitting import fit_landmarks
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
+from cliploc_ros.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes
 from cliploc_ros.mapping.options import CheckOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import Views
@@ -114,18 +113,9 @@ def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
 
 def fold_map(landmark_map: LandmarkMap, fold: Fold) -> LandmarkMap:
     """Return the map of a fold, with the ids and labels of the whole map."""
-    rows = fold.rows
-    semi_axes = np.linalg.norm(fold.landmarks.bases, axis=1)
-    rotations = fold.landmarks.bases / semi_axes[:, None, :]
-    rotations[np.linalg.det(rotations) < 0.0] *= -1.0
-    details = landmark_map.details
-    return replace(
-        landmark_map, centers=fold.landmarks.centers, semi_axes=semi_axes,
-        quats_xyzw=Rotation.from_matrix(rotations).as_quat(),
-        landmark_ids=tuple(landmark_map.landmark_ids[row] for row in rows),
-        labels=tuple(landmark_map.labels[row] for row in rows),
-        class_ids=tuple(landmark_map.class_ids[row] for row in rows),
-        details=tuple(details[row] for row in rows) if details else ())
+    semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
+    return replace(landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
+                   semi_axes=semi_axes, quats_xyzw=quats_xyzw)
 
 
 class PosedObservation(NamedTuple):

@@ -14,8 +14,8 @@ from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
 from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck, Overlap
 from cliploc_ros.mapping.checking.places import LookAlike
 from cliploc_ros.mapping.checking.relocalization import BoxQuality, Trial, count_verdicts
-from cliploc_ros.mapping.checking.systematic import Correction
 from cliploc_ros.mapping.options import Thresholds
+from cliploc_ros.mapping.systematic import Correction
 
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The landmarks of the old map as the recording's classes name them, and which boxes show them."""
+"""Bring the recording's poses into the coordinate frame of the old map.
+
+The recording may have a coordinate frame of its own, a little off, and its poses may have errors:
+they may come from the relocalizer. The landmarks that are still in their places tell both.
+"""
 
 from typing import NamedTuple
 
@@ -13,7 +17,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.joint import Anchors, pose_errors, refine_jointly
+from cliploc_ros.mapping.joint import Anchors, pose_changes, refine_jointly
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views, camera_from_map, map_from_cameras
@@ -35,7 +39,7 @@ _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 
 
 class Known(NamedTuple):
-    """L landmarks of the old map."""
+    """L landmarks of the old map as the recording's classes name them."""
 
     landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
     sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
@@ -43,11 +47,23 @@ class Known(NamedTuple):
     named: Landmarks  #: The landmarks once for each of their classes
     owners: NDArray[np.int64]  #: The landmark of each of these
 
-    def select(self, rows: NDArray[np.int64]) -> 'Known':
-        """Return some of the landmarks, by their main classes only."""
-        landmarks = self.landmarks.select(rows)
-        return Known(landmarks, self.sigmas[rows], tuple(self.details[row] for row in rows),
-                     landmarks, np.arange(len(rows)))
+    @property
+    def names(self) -> set[tuple[int, int]]:
+        """Return all pairs of a landmark and one of its classes."""
+        return set(zip(self.owners.tolist(), self.named.classes.tolist(), strict=True))
+
+    def shown(self, views: Views, min_iou: float) -> NDArray[np.int64]:
+        """Return the old landmark (n,) that each box shows, -1 for none.
+
+        One landmark has at most one box in a frame, whatever its classes.
+        """
+        shown = associate(views, self.named, min_iou)
+        rows = np.nonzero(shown >= 0)[0]
+        owners = self.owners[shown[rows]]
+        _, kept = np.unique(views.frames[rows] * len(self.sigmas) + owners, return_index=True)
+        once = np.full(len(shown), -1, dtype=np.int64)
+        once[rows[kept]] = owners[kept]
+        return once
 
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...], options: UpdateOptions
@@ -66,21 +82,6 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...], options: Upd
                        else one.position_sigma for one in details])
     return Known(landmarks._replace(classes=first), np.maximum(sigmas, _LEAST_SIGMA_M), details,
                  Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners)
-
-
-def find_known(views: Views, known: Known, min_iou: float) -> NDArray[np.int64]:
-    """Return the old landmark (n,) that each box shows, -1 for none.
-
-    One landmark has at most one box in a frame, whatever its classes.
-    """
-    shown = associate(views, known.named, min_iou)
-    shown[shown >= 0] = known.owners[shown[shown >= 0]]
-    rows = np.nonzero(shown >= 0)[0]
-    keys = views.frames[rows] * len(known.landmarks.centers) + shown[rows]
-    _, kept = np.unique(keys, return_index=True)
-    once = np.full(len(shown), -1, dtype=np.int64)
-    once[rows[kept]] = shown[rows[kept]]
-    return once
 
 
 class Refits(NamedTuple):
@@ -122,15 +123,6 @@ def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_view
     return Refits(Landmarks(centers, bases, landmarks.classes), covariances)
 
 
-def ellipsoid_numbers(bases: NDArray[np.float64]
-                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return semi-axes (L, 3) and quaternions x, y, z, w (L, 4) of bases (L, 3, 3)."""
-    semi_axes = np.linalg.norm(bases, axis=1)
-    rotations = bases / semi_axes[:, None, :]
-    rotations[np.linalg.det(rotations) < 0.0] *= -1.0
-    return semi_axes, Rotation.from_matrix(rotations).as_quat()
-
-
 class Alignment(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
@@ -148,25 +140,22 @@ def align(given: Views, known: Known, options: UpdateOptions) -> Alignment:
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
         min_iou = options.mapping.association_iou if number else _LOOSE_IOU
-        found = refit(views, known.landmarks, find_known(views, known, min_iou),
+        found = refit(views, known.landmarks, known.shown(views, min_iou),
                       options.mapping.min_viewpoints)
         if np.count_nonzero(found.is_known) < options.min_confirmed:
             break
         step = _offset(known, found)
         rotations, translations = camera_from_map(step @ map_from_cameras(views))
-        moved = views._replace(rotations=rotations, translations=translations)
-        views, total = moved, step @ total
+        views = views._replace(rotations=rotations, translations=translations)
+        total = step @ total
         middle = known.landmarks.centers[found.is_known].mean(axis=0)
         if np.linalg.norm(step[:3, :3] @ middle + step[:3, 3] - middle) < _SETTLED_M:
             break
     middle = known.landmarks.centers.mean(axis=0)
     offset_m = float(np.linalg.norm(total[:3, :3].T @ (middle - total[:3, 3]) - middle))
     offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
-    refined = views if options.mapping.pose_errors is None else _refine(views, known, options)
-    changes = np.square(pose_errors(views, refined))
-    return Alignment(refined, offset_m, offset_deg,
-                     float(np.sqrt(changes[:, :3].sum(axis=1).mean())),
-                     float(np.degrees(np.sqrt(changes[:, 3:].sum(axis=1).mean()))))
+    refined = _refine(views, known, options)
+    return Alignment(refined, offset_m, offset_deg, *pose_changes(views, refined))
 
 
 def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
@@ -189,49 +178,48 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     lengths, step = found.fun[:-6], np.eye(4)
     # positions err more than their deviations say: objects are no ellipsoids
     inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
-    if float(found.x @ (found.jac.T @ found.jac) @ found.x) < _SIGNIFICANT * inflation ** 2:
-        return step
-    motion = found.x
-    step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
-    step[:3, 3] = middle + motion[:3] - step[:3, :3] @ middle
+    if float(found.x @ (found.jac.T @ found.jac) @ found.x) >= _SIGNIFICANT * inflation ** 2:
+        step[:3, :3] = Rotation.from_rotvec(found.x[3:]).as_matrix()
+        step[:3, 3] = middle + found.x[:3] - step[:3, :3] @ middle
     return step
 
 
 def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
-    assert options.mapping.pose_errors is not None
-    views, min_iou = aligned, options.mapping.association_iou
+    views, errors = aligned, options.mapping.pose_errors
+    if errors is None:
+        return aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
     for _ in range(options.mapping.refinements):
-        shown = find_known(views, known, min_iou)
+        shown = known.shown(views, options.mapping.association_iou)
         found = refit(views, known.landmarks, shown, options.mapping.min_viewpoints)
-        away = has_moved(known, found, options)
+        away = has_moved(known.landmarks, known.sigmas, found, options)
         shown[np.isin(shown, np.nonzero(away)[0])] = -1
         if not (shown >= 0).any():
             return views
-        views, _ = refine_jointly(aligned, views, known.landmarks, shown,
-                                  options.mapping.pose_errors, anchors=anchors)
+        views, _ = refine_jointly(aligned, views, known.landmarks, shown, errors, anchors=anchors)
     return views
 
 
-def has_moved(known: Known, found: Refits, options: UpdateOptions) -> NDArray[np.bool_]:
+def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits, options: UpdateOptions
+              ) -> NDArray[np.bool_]:
     """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
-    offsets = found.landmarks.centers - known.landmarks.centers
+    offsets = found.landmarks.centers - old.centers
     far = found.is_known & (np.linalg.norm(offsets, axis=1) > options.least_move_m)
     rows = np.nonzero(far)[0]
-    bases, others = known.landmarks.bases[rows], found.landmarks.bases[rows]
+    bases, others = old.bases[rows], found.landmarks.bases[rows]
     shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
     far[rows] = ((_lengths(offsets[rows], shapes) > options.least_move_shapes)
-                 & (deviations(known, found, rows) > options.least_move_sigmas))
+                 & (deviations(old.select(rows), sigmas[rows], found.select(rows))
+                    > options.least_move_sigmas))
     return far
 
 
-def deviations(known: Known, found: Refits, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return by how many standard deviations (k,) old and new positions of landmarks differ."""
-    offsets = found.landmarks.centers[rows] - known.landmarks.centers[rows]
-    covariances = (found.covariances[rows]
-                   + np.square(known.sigmas[rows])[:, None, None] * np.eye(3))
-    return _lengths(offsets, covariances)
+def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits
+               ) -> NDArray[np.float64]:
+    """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
+    covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
+    return _lengths(found.landmarks.centers - old.centers, covariances)
 
 
 def _lengths(offsets: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:

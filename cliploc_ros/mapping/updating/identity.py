@@ -1,9 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The objects that a recording shows: old landmarks in their places, and finds."""
+"""Which object of the recording is which landmark of the old map, and what became of the others.
+
+Every landmark gets at most one object of its class, and every object at most one landmark, so that
+the sum of gains is the greatest possible (Hungarian method). A gain is a log-likelihood ratio of
+look and size, plus a bonus for an object that is where the landmark was. A landmark or an object
+stays alone if it gains nothing.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,17 +17,12 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
-from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.labelling import embed_landmarks
-from cliploc_ros.mapping.landmarks import Landmarks, join_landmarks
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.alignment import Known, Refits, has_moved, refit
-from cliploc_ros.mapping.updating.judging import Judged, close_pairs
-from cliploc_ros.mapping.updating.sight import Sight
-from cliploc_ros.mapping.views import Views
+from cliploc_ros.mapping.updating.alignment import Known, has_moved
+from cliploc_ros.mapping.updating.judging import Judged, Objects
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
@@ -36,53 +36,43 @@ _AMBIGUOUS_GAIN = 1.0
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
 # Objects in their place from which the usual similarity of two looks is learned.
 _FEWEST_LOOKS = 8
-# A landmark in its place is doubted if its look fits worse than usual by more deviations.
+# A landmark in its place is doubted if its look fits worse than usual by this many deviations.
 _DOUBT = 1.0
 
 
-class Objects(NamedTuple):
-    """What the recording shows: m objects, n boxes."""
+class Fates(NamedTuple):
+    """Rows of L old landmarks by what became of them, and new objects."""
 
-    refits: Refits  #: Where they are
-    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
-    #: For each, the old landmarks that it may be although it is a little off their place
-    near: tuple[frozenset[int], ...]
-    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
-    sight: Sight
-    evidence: Evidence
-    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
-
-    @property
-    def landmarks(self) -> Landmarks:
-        """Return the objects as landmarks."""
-        return self.refits.landmarks
+    #: of int
+    confirmed: NDArray[np.int64]
+    moved: NDArray[np.int64]
+    missing: NDArray[np.int64]
+    not_observed: NDArray[np.int64]
+    new: NDArray[np.int64]  #: of int: objects that are no old landmark
+    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
+    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
 
 
-def gather_objects(views: Views, known: Known, judged: Judged, options: UpdateOptions) -> Objects:
-    """Return the objects that the recording shows."""
-    count, finds = len(known.sigmas), judged.finds
-    in_place = np.nonzero(judged.is_there)[0]
-    places = np.concatenate([in_place, count + np.arange(len(finds.details))])
-    numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
-    numbers[places] = np.arange(len(places))
-    shown = numbers[judged.shown]
-    refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
-                   options.mapping.min_viewpoints)
-    near: list[set[int]] = [set() for _ in places]
-    named = set(zip(known.owners.tolist(), known.named.classes.tolist(), strict=True))
-    for new, row, _ in close_pairs(finds.landmarks, known.landmarks,
-                                   options.mapping.merge_distance):
-        if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in named:
-            near[len(in_place) + new].add(row)
-    return Objects(
-        refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
-        tuple(map(frozenset, near)), shown, judged.sight.select(places),
-        gather_evidence(views, refits.landmarks, shown),
-        (LandmarkDetails(),) * len(in_place) + finds.details)
+def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None',
+                 options: UpdateOptions) -> Fates:
+    """Return what became of each old landmark."""
+    numbers, rivals = _identify(known, objects, judged.is_gone, looks)
+    found = numbers >= 0
+    elsewhere = found.copy()
+    rows = np.nonzero(found)[0]
+    elsewhere[rows] = objects.owners[numbers[rows]] != rows
+    # an object that is a little off its place was only mapped badly
+    rows = np.nonzero(elsewhere)[0]
+    elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
+                                objects.refits.select(numbers[rows]), options)
+    missing = ~found & (judged.is_gone | judged.is_there)
+    return Fates(
+        np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
+        np.nonzero(~found & ~missing)[0],
+        np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, rivals)
 
 
-@dataclass(frozen=True)
-class Looks:
+class Looks(NamedTuple):
     """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown."""
 
     landmarks: NDArray[np.float32]  #: (L, d): of the old map
@@ -112,21 +102,12 @@ def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetectio
 
 
 def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
-                  detections: PosedDetections, shown: NDArray[np.int64], count: int) -> Looks:
-    """Return the looks of the old landmarks and of the recording's objects.
-
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        Of the old map.
-    shown : ndarray (n,) of int
-        The object that each box shows, -1 for none.
-    count : int
-        Number of objects.
-    """
-    objects = embed_landmarks([str(number) for number in range(count)], detections, shown)
+                  detections: PosedDetections, objects: Objects) -> Looks:
+    """Return the looks of the old landmarks, by their ids, and of the recording's objects."""
+    of_objects = embed_landmarks([str(number) for number in range(len(objects.owners))],
+                                 detections, objects.shown)
     return Looks(old.in_order(landmark_ids).means.astype(np.float32),
-                 objects.means.astype(np.float32))
+                 of_objects.means.astype(np.float32))
 
 
 def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str],
@@ -134,12 +115,7 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
                      ) -> LandmarkEmbeddings | None:
     """Return the embeddings of the new map: the old ones, and the recording's for the others.
 
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        Of the new map.
-    shown : ndarray (n,) of int
-        The landmark of the new map that each box shows, -1 for none.
+    The ids are those of the new map, shown (n,) the row there that each box shows, -1 for none.
     """
     kept = None if old is None else old.in_order(landmark_ids)
     if detections.embeddings is None or not detections.encoder_key:
@@ -160,14 +136,6 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
     ).in_order(landmark_ids)
 
 
-class Identities(NamedTuple):
-    """Who is who."""
-
-    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
-    #: Old landmarks that an object could be as well, for the objects of which this is so
-    rivals: dict[int, tuple[int, ...]]
-
-
 class _LookModel(NamedTuple):
     """How similar the looks of one object are, and those of two objects of one class."""
 
@@ -180,65 +148,56 @@ class _LookModel(NamedTuple):
         gains = (self.own - self.other) * (cosines - middle) / self.sigma ** 2
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
-    def is_doubtful(self, cosines: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(cosines < self.own - _DOUBT * self.sigma)
 
+def _identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
+              ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
+    """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
-def identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
-             ) -> Identities:
-    """Return which object each old landmark is.
-
-    Parameters
-    ----------
-    is_gone : ndarray (L,) of bool
-        Landmarks that may be any new object; others only the one in their place or near it.
+    Landmarks that are gone may be any new object; others only the one in their place or near it.
     """
     held = np.nonzero(objects.owners >= 0)[0]
+    owners = objects.owners[held]
     result = np.full(len(is_gone), -1, dtype=np.int64)
-    result[objects.owners[held]] = held
+    result[owners] = held
     groups = _class_groups(known, objects)
-    model = _learn_looks(known, objects, looks, groups)
+    model = None if looks is None else _learn_looks(objects, looks, groups)
     doubtful = np.zeros(len(held), dtype=np.bool_)
     if looks is not None and model is not None:
-        own = np.einsum('ld,ld->l', looks.landmarks[objects.owners[held]], looks.objects[held])
-        is_known = (looks.landmarks[objects.owners[held]].any(axis=1)
-                    & looks.objects[held].any(axis=1))
-        doubtful = is_known & model.is_doubtful(own.astype(np.float64))
-    near = {row for rows in objects.near for row in rows}
+        pairs = looks.landmarks[owners], looks.objects[held]
+        cosines = np.einsum('ld,ld->l', *pairs).astype(np.float64)
+        doubtful = (pairs[0].any(axis=1) & pairs[1].any(axis=1)
+                    & (cosines < model.own - _DOUBT * model.sigma))
     searched = is_gone.copy()
-    searched[list(near)] = True
-    searched[objects.owners[held]] = doubtful
+    searched[[row for rows in objects.near for row in rows]] = True
+    searched[owners] = doubtful
     offered = objects.owners < 0
     offered[held] = doubtful
     rivals: dict[int, tuple[int, ...]] = {}
-    for group in np.unique(groups[objects.landmarks.classes[offered]]):
-        rows = np.nonzero(searched & (known.landmarks.classes >= 0)
-                          & (groups[known.landmarks.classes] == group))[0]
-        columns = np.nonzero(offered & (groups[objects.landmarks.classes] == group))[0]
+    of_landmarks = np.where(known.landmarks.classes >= 0, groups[known.landmarks.classes], -1)
+    of_objects = groups[objects.landmarks.classes]
+    for group in np.unique(of_objects[offered]):
+        rows = np.nonzero(searched & (of_landmarks == group))[0]
+        columns = np.nonzero(offered & (of_objects == group))[0]
         if len(rows) and len(columns):
             gains = _gains(known, objects, is_gone, rows, columns)
             if looks is not None and model is not None:
                 gains += model.gains(looks.similarities(rows, columns))
             result[rows], close = _assign(gains, rows, columns)
             rivals |= close
-    return Identities(result, rivals)
+    return result, rivals
 
 
 def _class_groups(known: Known, objects: Objects) -> NDArray[np.int64]:
     """Return a group for each class: the classes of one landmark belong together."""
-    count = 1 + max(int(known.named.classes.max(initial=0)),
-                    int(objects.landmarks.classes.max(initial=0)),
-                    int(known.landmarks.classes.max(initial=0)))
+    count = 1 + max(int(one.classes.max(initial=0))
+                    for one in (known.named, objects.landmarks, known.landmarks))
     main = known.landmarks.classes[known.owners]
     links = coo_matrix((np.ones(len(main)), (main, known.named.classes)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _learn_looks(known: Known, objects: Objects, looks: Looks | None, groups: NDArray[np.int64]
-                 ) -> _LookModel | None:
+def _learn_looks(objects: Objects, looks: Looks, groups: NDArray[np.int64]) -> _LookModel | None:
     """Return how looks compare, learned from the landmarks in their place; None if too few."""
-    if looks is None:
-        return None
     held = np.nonzero(objects.owners >= 0)[0]
     own, other = [np.empty(0)], [np.empty(0)]
     classes = groups[objects.landmarks.classes[held]]
@@ -268,7 +227,7 @@ def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDA
     ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
                             - objects.landmarks.centers[columns][None], axis=2)
     gains = _ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA) - _GAIN_PER_M * ways_m
-    named = set(zip(known.owners.tolist(), known.named.classes.tolist(), strict=True))
+    names = known.names
     for place, row in enumerate(rows):
         for column, number in enumerate(columns):
             if objects.owners[number] == row:
@@ -277,7 +236,7 @@ def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDA
                 gains[place, column] += _NEAR_GAIN - _ELSEWHERE_GAIN
             elif (change[place, column] > _MAX_SIZE_CHANGE
                   or not (is_gone[row] or row in objects.owners)
-                  or (int(row), int(objects.landmarks.classes[number])) not in named):
+                  or (int(row), int(objects.landmarks.classes[number])) not in names):
                 gains[place, column] = -np.inf
     return gains
 
@@ -297,34 +256,3 @@ def _assign(gains: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArra
         if close.any():
             rivals[int(columns[column])] = tuple(int(row) for row in rows[close])
     return chosen, rivals
-
-
-class Fates(NamedTuple):
-    """Rows of old landmarks by what became of them, and new objects."""
-
-    #: of int
-    confirmed: NDArray[np.int64]
-    moved: NDArray[np.int64]
-    missing: NDArray[np.int64]
-    not_observed: NDArray[np.int64]
-    new: NDArray[np.int64]  #: of int: objects that are no old landmark
-    objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
-    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
-
-
-def decide_fates(known: Known, judged: Judged, objects: Objects, identities: Identities,
-                 options: UpdateOptions) -> Fates:
-    """Return what became of each old landmark."""
-    numbers = identities.objects
-    found = numbers >= 0
-    elsewhere = found.copy()
-    rows = np.nonzero(found)[0]
-    elsewhere[rows] = objects.owners[numbers[rows]] != rows
-    # an object that is a little off its place was only mapped badly
-    rows = np.nonzero(elsewhere)[0]
-    elsewhere[rows] = has_moved(known.select(rows), objects.refits.select(numbers[rows]), options)
-    missing = ~found & (judged.is_gone | judged.is_there)
-    return Fates(
-        np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
-        np.nonzero(~found & ~missing)[0],
-        np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, identities.rivals)

@@ -8,7 +8,6 @@ variance, and the shape is the new one. A centre that differs significantly was 
 counts alone. An ellipsoid without position_sigma was made by hand, and stays.
 """
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -18,46 +17,49 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.building import LeftOut
+from cliploc_ros.mapping.evidence import Evidence, gather_evidence
+from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
 from cliploc_ros.mapping.options import UpdateOptions
-from cliploc_ros.mapping.updating.alignment import Known, deviations, ellipsoid_numbers
-from cliploc_ros.mapping.updating.identity import Fates, Objects
-from cliploc_ros.mapping.updating.judging import Judged
+from cliploc_ros.mapping.updating.alignment import Known, deviations
+from cliploc_ros.mapping.updating.identity import Fates
+from cliploc_ros.mapping.updating.judging import Judged, Objects
+from cliploc_ros.mapping.updating.sight import Sight
+from cliploc_ros.mapping.views import Views
 
 _ROWS_SHOWN = 40
 
 
-def renew(old: LandmarkMap, known: Known, objects: Objects, fates: Fates,
+def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates: Fates,
           class_names: tuple[str, ...], options: UpdateOptions) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
-    Parameters
-    ----------
-    class_names : tuple of str
-        Of the recording.
+    The class names are those of the recording; the views have its poses in the map.
     """
+    evidence = gather_evidence(views, objects.landmarks, objects.shown)
     centers, details = old.centers.copy(), list(known.details)
     semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()
     new_axes, new_quats = ellipsoid_numbers(objects.landmarks.bases)
-    placed = _refitted(known, objects, fates, options)
-    sigmas = objects.refits.sigmas
-    for row in np.concatenate([fates.confirmed, fates.moved]):
-        number = fates.objects[row]
-        details[row] = _with_views(details[row], objects, number)
-        weight = 1.0 if row in fates.moved else placed.get(int(row), 0.0)
-        if weight > 0.0:
-            centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
-            semi_axes[row], quats[row] = new_axes[number], new_quats[number]
-            sigma = sigmas[number] if weight == 1.0 else np.sqrt(weight) * sigmas[number]
-            details[row] = replace(details[row], position_sigma=float(sigma))
+    for row in fates.confirmed:
+        details[row] = _in_place(details[row], objects.sight, evidence, fates.objects[row])
     for row in fates.moved:
-        details[row] = _of_object(details[row], objects, fates.objects[row])
+        details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
+    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates, options)
+    for row, weight in placed.items():
+        number = fates.objects[row]
+        centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
+        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
+        if row not in fates.moved:
+            sigma = objects.refits.sigmas[number]
+            details[row] = replace(details[row], position_sigma=float(
+                sigma if weight == 1.0 else np.sqrt(weight) * sigma))
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     names = tuple(class_names[number] for number in objects.landmarks.classes[fates.new])
     every = [details[row] for row in kept] + [
-        _of_object(objects.given[number], objects, number) for number in fates.new]
+        _in_new_place(objects.given[number], objects.sight, evidence, number)
+        for number in fates.new]
     return LandmarkMap(
         old.frame_id,
-        tuple(old.landmark_ids[row] for row in kept) + _unused_ids(names, old.landmark_ids),
+        tuple(old.landmark_ids[row] for row in kept) + unused_ids(names, old.landmark_ids),
         tuple(old.labels[row] for row in kept) + names,
         tuple(old.class_ids[row] for row in kept) + names,
         np.concatenate([centers[kept], objects.landmarks.centers[fates.new]]),
@@ -72,50 +74,33 @@ def _refitted(known: Known, objects: Objects, fates: Fates, options: UpdateOptio
     rows = np.array([row for row in fates.confirmed
                      if known.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
-    numbers = fates.objects[rows]
-    nudged = deviations(known.select(rows), objects.refits.select(numbers),
-                        np.arange(len(rows))) > options.least_move_sigmas
-    old_sigmas, new_sigmas = known.sigmas[rows], objects.refits.sigmas[numbers]
-    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + new_sigmas ** 2))
-    better = nudged | (new_sigmas < old_sigmas)
+    refits, old_sigmas = objects.refits.select(fates.objects[rows]), known.sigmas[rows]
+    nudged = deviations(known.landmarks.select(rows), old_sigmas, refits
+                        ) > options.least_move_sigmas
+    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + refits.sigmas ** 2))
+    better = nudged | (refits.sigmas < old_sigmas)
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
 
 
-def _with_views(details: LandmarkDetails, objects: Objects, number: int) -> LandmarkDetails:
+def _in_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
+              ) -> LandmarkDetails:
     """Return what is known of a landmark in its place with what the recording adds."""
-    sight, evidence = objects.sight, objects.evidence
-    seen, expected = int(sight.seen_frames[number]), int(sight.expected_frames[number])
-    support, ratio = details.support or 0, details.seen_ratio
-    if support and ratio:
-        expected += round(support / ratio)
+    support, expected = details.support or 0, int(sight.expected_frames[number])
+    if support and details.seen_ratio:
+        expected += round(support / details.seen_ratio)
+    support += int(sight.seen_frames[number])
     return replace(
-        details, support=support + seen, seen_ratio=min(1.0, (support + seen) / max(1, expected)),
+        details, support=support, seen_ratio=min(1.0, support / max(1, expected)),
         baseline_deg=max(details.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
         last_seen=max(details.last_seen or 0.0, float(evidence.last_seen[number])))
 
 
-def _of_object(details: LandmarkDetails, objects: Objects, number: int) -> LandmarkDetails:
+def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
+                  ) -> LandmarkDetails:
     """Return what is known of a landmark in a new place: what the recording says."""
-    sight, evidence = objects.sight, objects.evidence
-    return replace(
-        details, position_sigma=float(evidence.position_sigma[number]),
-        support=int(evidence.support[number]),
-        seen_ratio=float(min(1.0, sight.seen_ratio[number])),
-        baseline_deg=float(evidence.baseline_deg[number]),
-        last_seen=max(0.0, float(evidence.last_seen[number])))
-
-
-def _unused_ids(names: tuple[str, ...], used: tuple[str, ...]) -> tuple[str, ...]:
-    """Return an id for each class name that no landmark of the old map has."""
-    taken, ids = set(used), []
-    for name in names:
-        word = ''.join(char if char.isalnum() else '_' for char in name)
-        number = 1
-        while f'{word}_{number}' in taken:
-            number += 1
-        ids.append(f'{word}_{number}')
-        taken.add(ids[-1])
-    return tuple(ids)
+    return replace(evidence.details(number, details),
+                   seen_ratio=float(min(1.0, sight.seen_ratio[number])),
+                   last_seen=max(0.0, float(evidence.last_seen[number])))
 
 
 @dataclass(frozen=True)
@@ -182,49 +167,41 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
              judged: Judged) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
-    seen_of, expected_of = judged.sight.seen_frames, judged.sight.expected_frames
+
+    def seen_in(sight: Sight, number: int) -> str:
+        return f'expected in {sight.expected_frames[number]} frames, seen in ' \
+               f'{sight.seen_frames[number]}'
 
     def item(row: int, evidence: str) -> UpdatedLandmark:
         """Return one landmark of the old map."""
         name, center = old.landmark_ids[row], old.centers[row]
         now = updated.centers[places[name]] if name in places else center
-        last_seen = old.details[row].last_seen if old.details else None
         rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
         return UpdatedLandmark(name, old.labels[row], old.class_ids[row], _rounded(now),
-                               round(float(np.linalg.norm(now - center)), 3), evidence, last_seen,
+                               round(float(np.linalg.norm(now - center)), 3), evidence,
+                               old.details[row].last_seen if old.details else None,
                                tuple(old.landmark_ids[rival] for rival in rivals))
-
-    def in_place(row: int) -> str:
-        return f'expected in {expected_of[row]} frames, seen in {seen_of[row]}'
 
     def moved(row: int) -> str:
         number = fates.objects[row]
         way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
         left = ('an object of another look is in its old place' if judged.is_there[row]
-                else f'old place {in_place(row)}')
+                else f'old place {seen_in(judged.sight, row)}')
         return (f'moved by {way:.2f} m: {left}; new place seen in '
                 f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
 
     return {
-        'confirmed': tuple(item(row, _seen(objects, fates.objects[row]))
+        'confirmed': tuple(item(row, seen_in(objects.sight, fates.objects[row]))
                            for row in fates.confirmed),
         'moved': tuple(item(row, moved(row)) for row in fates.moved),
-        'missing': tuple(item(row, in_place(row)) for row in fates.missing),
-        'not_observed': tuple(item(row, in_place(row)) for row in fates.not_observed),
-        'new': tuple(_new(updated, objects, fates)),
-    }
-
-
-def _seen(objects: Objects, number: int) -> str:
-    return (f'expected in {objects.sight.expected_frames[number]} frames, seen in '
-            f'{objects.sight.seen_frames[number]}')
-
-
-def _new(updated: LandmarkMap, objects: Objects, fates: Fates) -> Iterable[UpdatedLandmark]:
-    for place, number in enumerate(fates.new, len(updated) - len(fates.new)):
-        yield UpdatedLandmark(updated.landmark_ids[place], updated.labels[place],
-                              updated.class_ids[place], _rounded(updated.centers[place]), 0.0,
-                              _seen(objects, int(number)), updated.details[place].last_seen)
+        'missing': tuple(item(row, seen_in(judged.sight, row)) for row in fates.missing),
+        'not_observed': tuple(item(row, seen_in(judged.sight, row))
+                              for row in fates.not_observed),
+        'new': tuple(UpdatedLandmark(
+            updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
+            _rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
+            updated.details[place].last_seen)
+            for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
 
 
 def _rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:

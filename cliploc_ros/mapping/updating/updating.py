@@ -16,12 +16,10 @@ from cliploc_ros.mapping.updating.alignment import Alignment, Known, align, know
 from cliploc_ros.mapping.updating.identity import (
     compare_looks,
     decide_fates,
-    gather_objects,
-    identify,
     renew_embeddings,
     why_not_comparable,
 )
-from cliploc_ros.mapping.updating.judging import Judged, judge
+from cliploc_ros.mapping.updating.judging import Judged, gather_objects, judge
 from cliploc_ros.mapping.updating.renewal import UpdateReport, describe, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
@@ -66,14 +64,13 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     _check_belongs(judged, options)
     objects = gather_objects(aligned.views, known, judged, options)
     unlike = why_not_comparable(embeddings, detections)
-    looks = None if embeddings is None or unlike else compare_looks(
-        embeddings, old.landmark_ids, detections, objects.shown, len(objects.owners))
-    fates = decide_fates(known, judged, objects,
-                         identify(known, objects, judged.is_gone, looks), options)
-    updated = renew(old, known, objects, fates, detections.class_names, options)
-    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
+    looks = None
     if unlike:
         notes.append(f'looks are not compared: {unlike}')
+    elif embeddings is not None:
+        looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
+    fates = decide_fates(known, judged, objects, looks, options)
+    updated = renew(old, known, aligned.views, objects, fates, detections.class_names, options)
     notes += _notes(old, known, aligned, detections, options)
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints[-1]) + 1,
@@ -81,6 +78,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **describe(old, updated, objects, fates, judged), left_out=judged.finds.left_out,
         notes=tuple(notes))
+    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
@@ -91,22 +89,14 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
 
 
 def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
-    """Refuse a recording that shows hardly any of the landmarks in their places.
-
-    Raises
-    ------
-    MappingError
-        Names the numbers.
-    """
+    """Refuse a recording that shows hardly any of the landmarks in their places."""
     count, there = len(judged.is_there), int(judged.is_there.sum())
     in_view = int((judged.is_there | (judged.sight.expected[:count] >= options.least_views)).sum())
-    if there >= min(options.min_confirmed, count) and \
-            there >= options.min_confirmed_share * in_view:
-        return
-    raise MappingError(
-        f'the recording does not belong to this map: of {in_view} landmarks in view, {there} are '
-        'where the map says; check the map, the coordinate frame of the poses and the detector, '
-        'give --pose-noise if the poses have errors, or build a new map')
+    if there < min(options.min_confirmed, count) or there < options.min_confirmed_share * in_view:
+        raise MappingError(
+            f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
+            'are where the map says; check the map, the coordinate frame of the poses and the '
+            'detector, give --pose-noise if the poses have errors, or build a new map')
 
 
 def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections,

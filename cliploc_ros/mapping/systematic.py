@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Systematic residuals of box edges.
-
-Do other intrinsics, another mount or another clock fit better?
+"""Corrections that all boxes share: other intrinsics, another mount or another clock.
 
 Each cause is a small correction x that all boxes share, fitted on its own next to a free
 correction of each landmark, which would hide it. With J the derivatives of the edges by x, those
@@ -23,8 +21,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.fitting import edge_residual, fit_ellipsoid, robust_weight
+from cliploc_ros.mapping.fitting import LOSS_SCALE, edge_residual, fit_landmarks, robust_weight
 from cliploc_ros.mapping.landmarks import (
     LANDMARK_SIZE,
     POSE_SIZE,
@@ -45,6 +44,11 @@ _NOTABLE_PX = 1.0
 _MIN_EXPLAINED = 0.015
 # Beyond this, a change of the focal length is no small correction.
 _MAX_STRETCH = 0.5
+# Standard deviations of a mount that somebody measured with a ruler: 5 cm, 3 degrees. A guess.
+_MOUNT_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
+# A part that the boxes leave more uncertain than this share of the prior is not observable.
+_OBSERVABLE = 0.5
+_MOUNT_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -90,15 +94,9 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
                      shown: NDArray[np.int64]) -> list[Correction]:
     """Return the corrections that fit the edges best; none with too few boxes.
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        Fitted to these boxes.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
+    The landmarks are fitted to these boxes.
     """
-    rows = np.nonzero(shown >= 0)[0]
-    rows = rows[::max(1, -(-len(rows) // _MAX_BOXES))]
+    rows = _sample(shown)
     if len(rows) < _MIN_BOXES:
         return []
     return [one for cause in (_intrinsics(detections.camera), _mount(detections.camera),
@@ -144,7 +142,7 @@ def _mount(camera: Camera) -> _Cause:
                   (focal / 200.0, focal / 200.0, 1.5, degree_px, degree_px,
                    300.0 * degree_px / focal),
                   lambda views, rows, linear: linear.by_pose,
-                  lambda views, values: move_map(
+                  lambda views, values: _move_map(
                       views, np.tile(values, (len(views.rotations), 1))))
 
 
@@ -165,10 +163,10 @@ def _stamps(camera: Camera, views: Views) -> _Cause:
     return _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,), (pixels_per_ms,),
                   lambda views, rows, linear: np.einsum(
                       'mep,mp->me', linear.by_pose, twists[views.frames[rows]])[:, :, None],
-                  lambda views, values: move_map(views, values[0] * twists))
+                  lambda views, values: _move_map(views, values[0] * twists))
 
 
-def move_map(views: Views, motions: NDArray[np.float64]) -> Views:
+def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
     """Return the views with the map moved in the cameras by (F, 6): translation, rotation."""
     turns = Rotation.from_rotvec(motions[:, 3:]).as_matrix()
     return views._replace(
@@ -181,14 +179,14 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
     """Yield the numbers of a cause that fit best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
-    cost_before = cost = cost_of(linearize_boxes(views, rows, numbers, landmarks))
+    cost_before = cost = _cost_of(linearize_boxes(views, rows, numbers, landmarks))
     for _ in range(_STEPS):
         linear = linearize_boxes(views, rows, numbers, landmarks)
         step, deviations = _solve(cause.differentiate(views, rows, linear), linear, numbers,
                                   viewpoints)
         moved = cause.apply(given, values + step)
-        refitted = refit_landmarks(moved, landmarks, rows, numbers)
-        trial_cost = cost_of(linearize_boxes(moved, rows, numbers, refitted))
+        refitted = _refit(moved, landmarks, rows, numbers)
+        trial_cost = _cost_of(linearize_boxes(moved, rows, numbers, refitted))
         if trial_cost >= cost:
             break
         values, views, landmarks, cost = values + step, moved, refitted, trial_cost
@@ -205,18 +203,14 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
                             and explained > _MIN_EXPLAINED), explained)
 
 
-def refit_landmarks(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
-                    numbers: NDArray[np.int64]) -> Landmarks:
+def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
+           numbers: NDArray[np.int64]) -> Landmarks:
     """Return the landmarks fitted to some rows, whose landmarks are numbers."""
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    for number, places in enumerate(group_boxes(numbers, len(centers))):
-        if len(places):
-            fit = fit_ellipsoid(views, rows[places], centers[number], bases[number], _REFIT_STEPS)
-            centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, landmarks.classes)
+    boxes = [rows[places] for places in group_boxes(numbers, len(landmarks.centers))]
+    return fit_landmarks(views, landmarks, boxes, _REFIT_STEPS)
 
 
-def cost_of(linear: Linear) -> float:
+def _cost_of(linear: Linear) -> float:
     """Return the robust cost of residuals; their weight is 1 / (1 + r^2 / c^2)."""
     known = linear.weights > 0.0
     return float(-np.log(linear.weights[known]).sum())
@@ -255,7 +249,7 @@ def _linearize_all(views, rows, numbers, centers, bases, residuals, weights, by_
 def _solve(derivatives: NDArray[np.float64], linear: Linear, numbers: NDArray[np.int64],
            viewpoints: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the step (G,) of a cause's numbers, and their standard deviations (G,)."""
-    free, residuals = without_landmarks(derivatives, linear, numbers)
+    free, residuals = _without_landmarks(derivatives, linear, numbers)
     weights = linear.weights
     information = np.einsum('meg,me,meh->gh', free, weights, free)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12))
@@ -268,9 +262,9 @@ def _solve(derivatives: NDArray[np.float64], linear: Linear, numbers: NDArray[np
     return step, np.sqrt(np.maximum(np.diag(inverse @ gradients.T @ gradients @ inverse), 1e-24))
 
 
-def without_landmarks(derivatives: NDArray[np.float64], linear: Linear,
-                      numbers: NDArray[np.int64]
-                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear,
+                       numbers: NDArray[np.int64]
+                       ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return derivatives and residuals, less what corrections of the landmarks explain."""
     free, residuals = derivatives.copy(), linear.residuals.copy()
     for rows in group_boxes(numbers, int(numbers.max()) + 1):
@@ -284,3 +278,90 @@ def without_landmarks(derivatives: NDArray[np.float64], linear: Linear,
         free[rows] -= by_landmark @ np.linalg.solve(normal, mixed)
         residuals[rows] -= by_landmark @ np.linalg.solve(normal, pull)
     return free, residuals
+
+
+class MountCorrection(NamedTuple):
+    """A correction of the mount of the camera: one small motion that all frames share.
+
+    It has a prior about zero. Some motions do not show every part of it: a robot that turns about
+    the vertical only cannot tell a higher camera from a lower floor. Such a part stays with the
+    prior, near zero, and the report names it.
+    """
+
+    views: Views  #: With the correction applied
+    #: (4, 4): pose of the corrected camera in the camera that the given poses describe
+    given_from_corrected: NDArray[np.float64]
+    #: (6,): standard deviations of x, y, z [m] and of the rotations about them [rad]
+    deviations: NDArray[np.float64]
+
+    def lines(self) -> list[str]:
+        """Return the corrections, and the parts that this motion does not show."""
+        turn = Rotation.from_matrix(self.given_from_corrected[:3, :3]).as_rotvec()
+        factors = np.repeat([100.0, np.degrees(1.0)], 3)
+        values = np.concatenate([self.given_from_corrected[:3, 3], turn]) * factors
+        names = ('x (right)', 'y (down)', 'z (forward)', 'rotation about x', 'rotation about y',
+                 'rotation about z')
+        seen = self.deviations < _OBSERVABLE * _MOUNT_PRIOR
+        rows = [f'mount corrected: {name} {value:+.2f} +- {deviation:.2f} {unit}'
+                for name, value, deviation, unit, is_seen
+                in zip(names, values, self.deviations * factors,
+                       ('cm',) * 3 + ('degrees',) * 3, seen, strict=True) if is_seen]
+        if hidden := [name for name, is_seen in zip(names, seen, strict=True) if not is_seen]:
+            rows.append(f'mount not observable from this motion: {", ".join(hidden)}; turn the '
+                        'camera about another axis')
+        return rows
+
+
+def refine_mount(given: Views, landmarks: Landmarks, shown: NDArray[np.int64], start: Views
+                 ) -> MountCorrection:
+    """Return the correction of the mount that fits the boxes best.
+
+    The landmarks are fitted to the poses of start: the given views, or those of an earlier
+    correction.
+    """
+    rows = _sample(shown)
+    numbers, views, weights = shown[rows], start, _MOUNT_PRIOR ** -2
+    viewpoints = given.viewpoints[given.frames[rows]]
+    # by how much the map was moved in the cameras (6,): translation, rotation
+    turn = start.rotations[0] @ given.rotations[0].T
+    values = np.concatenate([start.translations[0] - turn @ given.translations[0],
+                             Rotation.from_matrix(turn).as_rotvec()])
+
+    def cost_at(views: Views, landmarks: Landmarks, values: NDArray[np.float64]) -> float:
+        # the prior's cost on the scale of _cost_of, whose residuals have LOSS_SCALE
+        return (_cost_of(linearize_boxes(views, rows, numbers, landmarks))
+                + float((weights * values ** 2).sum()) / LOSS_SCALE ** 2)
+
+    def equations(views: Views, landmarks: Landmarks
+                  ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return information (6, 6), and the gradients of single viewpoints."""
+        linear = linearize_boxes(views, rows, numbers, landmarks)
+        free, residuals = _without_landmarks(linear.by_pose, linear, numbers)
+        gradients = np.zeros((viewpoints.max() + 1, 6))
+        np.add.at(gradients, viewpoints,
+                  np.einsum('meg,me->mg', free, linear.weights * residuals))
+        return np.einsum('meg,me,meh->gh', free, linear.weights, free), gradients
+
+    cost = cost_at(views, landmarks, values)
+    for _ in range(_MOUNT_STEPS):
+        information, gradients = equations(views, landmarks)
+        trial = values - np.linalg.solve(information + np.diag(weights),
+                                         gradients.sum(axis=0) + weights * values)
+        moved = _move_map(given, np.tile(trial, (len(given.rotations), 1)))
+        refitted = _refit(moved, landmarks, rows, numbers)
+        trial_cost = cost_at(moved, refitted, trial)
+        if trial_cost >= cost:
+            break
+        values, views, landmarks, cost = trial, moved, refitted, trial_cost
+    information, gradients = equations(views, landmarks)
+    inverse = np.linalg.inv(information + np.diag(weights))
+    deviations = np.sqrt(np.diag(inverse @ (gradients.T @ gradients + np.diag(weights))
+                                 @ inverse))
+    motion = make_transform(Rotation.from_rotvec(values[3:]).as_matrix(), values[:3])
+    return MountCorrection(views, invert_transform(motion), deviations)
+
+
+def _sample(shown: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the boxes that show landmarks, evenly chosen where they are many."""
+    rows = np.nonzero(shown >= 0)[0]
+    return rows[::max(1, -(-len(rows) // _MAX_BOXES))]
