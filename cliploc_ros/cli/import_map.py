@@ -155,9 +155,8 @@ def _placement(options: argparse.Namespace) -> 'Placement':
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
     from cliploc_ros.datasets.map_formats.given_map import COCO, read_class_names
-    from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
     from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
-    from cliploc_ros.datasets.map_formats.oaslam import read_oaslam
+    from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
     from cliploc_ros.datasets.map_formats.table import read_table
 
     if options.format == 'csv':

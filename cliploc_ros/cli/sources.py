@@ -3,6 +3,7 @@
 """Options that name a recording and say how to look at it, and what comes of them."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -198,8 +199,8 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
 def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
     """Return what reads the poses of a bag."""
     from cliploc_ros.datasets.bag_frames import pose_sources, poses_of_topic
-    from cliploc_ros.datasets.poses import TrajectoryPoses, mount_from_numbers
-    from cliploc_ros.datasets.transforms import read_transforms
+    from cliploc_ros.datasets.bag_poses import read_transforms
+    from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum_trajectory
 
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
@@ -213,8 +214,9 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
     if options.pose_topic is not None:
         return poses_of_topic(options.pose_topic, max_gap_ns, mount)
     if options.trajectory is not None:
-        trajectory = read_tum_trajectory(options.trajectory)
-        return lambda reader, camera_frame: TrajectoryPoses(trajectory, max_gap_ns, mount)
+        poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
+                        body_from_camera=mount)
+        return lambda reader, camera_frame: poses
     if mount is not None:
         raise OptionsError('--mount is not for --map-frame: tf knows the mount')
     return lambda reader, camera_frame: read_transforms(
@@ -225,8 +227,8 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
 def _odometry(options: argparse.Namespace) -> 'Poses | None':
     """Return the camera of a bag by odometry; None where none is asked for."""
     from cliploc_ros.datasets.bag_frames import bag_odometry, poses_of_topic
+    from cliploc_ros.datasets.bag_poses import read_transforms
     from cliploc_ros.datasets.poses import mount_from_numbers
-    from cliploc_ros.datasets.transforms import read_transforms
 
     max_gap_ns = round(options.max_gap * _NS_PER_S)
     if options.odometry_frame is not None:

@@ -5,28 +5,21 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.datasets.bag_messages import stamp_ns
+from cliploc_ros.datasets.bag_messages import deserialize, stamp_ns
+from cliploc_ros.datasets.bag_poses import POSE_TYPES, read_pose_topic
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
-from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
-from cliploc_ros.datasets.poses import (
-    POSE_TYPES,
-    Poses,
-    TrajectoryPoses,
-    check_clock,
-    read_pose_topic,
-)
+from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import CliplocError, DatasetError, ImageError
 from cliploc_ros.messages import (
     CompressedImageMessage,
@@ -128,10 +121,9 @@ class BagTopics:
 
 def poses_of_topic(name: str, max_gap_ns: int = 0,
                    body_from_camera: NDArray[np.float64] | None = None) -> ReadPoses:
-    """Return what reads the poses of a topic, see TrajectoryPoses."""
-    def read(reader: BagReader, camera_frame: str) -> Poses:
-        return TrajectoryPoses(read_pose_topic(reader, name), max_gap_ns, body_from_camera)
-    return read
+    """Return what reads the poses of a topic, see TimedPoses."""
+    return lambda reader, camera_frame: replace(
+        read_pose_topic(reader, name), max_gap_ns=max_gap_ns, body_from_camera=body_from_camera)
 
 
 def pose_sources(bag: Path) -> list[str]:
@@ -303,27 +295,20 @@ def _peek_stamp_ns(recorded: BagMessage) -> int:
 
 def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: bytes
                   ) -> tuple[NDArray[np.uint8], Camera]:
-    message = _deserialize(data, msgtype, where)
+    message = deserialize(data, msgtype, where)
     try:
         image = image_from_msg(message)
         size = (image.shape[1], image.shape[0])
-        return image, camera_from_msg(_deserialize(info, _CAMERA_INFO, where), size, rectified)
+        return image, camera_from_msg(deserialize(info, _CAMERA_INFO, where), size, rectified)
     except CliplocError as error:
         raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
 
 
 def _decode_depth(where: str, msgtype: str, form: DepthFormat, data: bytes) -> DepthImage:
-    message = _deserialize(data, msgtype, where)
+    message = deserialize(data, msgtype, where)
     where = f'{where} at {stamp_ns(message) / NS_PER_S:.6f}'
     try:
         counts = depth_counts_from_msg(message)
     except CliplocError as error:
         raise DatasetError(f'{where}: {error}') from error
     return DepthImage(depth_from_counts(counts, form.unit_m, where), form.camera)
-
-
-def _deserialize(data: bytes, msgtype: str, where: str) -> Any:
-    try:
-        return typestore().deserialize_cdr(data, msgtype)
-    except Exception as error:  # the library raises what the bytes happen to cause
-        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error

@@ -1,19 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Convert messages of a recording to and from the package's types, without a sourced ROS.
+"""Messages of recordings, to and from the package's types, without a sourced ROS.
 
 The message objects are those of the rosbags library; their fields have rclpy's names.
 """
 
-from typing import Any, Protocol
+from functools import cache
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -21,120 +25,94 @@ COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 DETECTIONS = 'vision_msgs/msg/Detection2DArray'
 POSE = 'geometry_msgs/msg/PoseStamped'
+_VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
+                'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
 
 
-class Stamped(Protocol):
-    """A message with a std_msgs/Header."""
+@cache
+def typestore() -> Typestore:
+    """Return the types of ROS 2 Jazzy's common interfaces and the seven of vision_msgs.
 
-    header: Any
+    All callers share it: do not register types in it.
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder = files('cliploc_ros.datasets') / 'vision_msgs' / 'msg'
+    for name in _VISION_MSGS:
+        definition = (folder / f'{name}.msg').read_text(encoding='utf-8')
+        store.register(get_types_from_msg(definition, f'vision_msgs/msg/{name}'))
+    return store
 
 
-def stamp_ns(message: Stamped) -> int:
+def deserialize(data: bytes, msgtype: str, where: str) -> Any:
+    """Return a message of its bytes; DatasetError: they are no such message."""
+    try:
+        return typestore().deserialize_cdr(data, msgtype)
+    except Exception as error:  # the library raises what the bytes happen to cause
+        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error
+
+
+def stamp_ns(message: Any) -> int:
     """Return a message's header stamp [ns]."""
     stamp = message.header.stamp
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def image_message(stamp: int, frame_id: str, pixels_rgb: NDArray[np.uint8]) -> Any:
-    """Make a sensor_msgs/Image.
-
-    Parameters
-    ----------
-    stamp : int
-        Header stamp [ns].
-    frame_id : str
-        The camera's coordinate frame.
-    pixels_rgb : ndarray (height, width, 3) of uint8
-        The image, red first.
-    """
+    """Make a sensor_msgs/Image of pixels (height, width, 3), red first; the stamp is in ns."""
     height, width, channels = pixels_rgb.shape
-    return _type(IMAGE)(
-        header=_header(stamp, frame_id),
-        height=height,
-        width=width,
-        encoding='rgb8',
-        is_bigendian=0,
-        step=width * channels,
-        data=np.ascontiguousarray(pixels_rgb).reshape(-1),
-    )
+    return _make(IMAGE, header=_header(stamp, frame_id), height=height, width=width,
+                 encoding='rgb8', is_bigendian=0, step=width * channels,
+                 data=np.ascontiguousarray(pixels_rgb).reshape(-1))
 
 
 def compressed_image_message(stamp: int, frame_id: str, data: bytes, codec: str) -> Any:
-    """Make a sensor_msgs/CompressedImage from a file's own bytes.
-
-    Parameters
-    ----------
-    stamp : int
-        Header stamp [ns].
-    frame_id : str
-        The camera's coordinate frame.
-    data : bytes
-        The encoded image.
-    codec : str
-        ``png`` or ``jpeg``.
-    """
-    return _type(COMPRESSED_IMAGE)(
-        header=_header(stamp, frame_id),
-        # As image_transport writes it: the image was rgb8, its decoder yields bgr8.
-        format=f'rgb8; {codec} compressed bgr8',
-        data=np.frombuffer(data, dtype=np.uint8),
-    )
+    """Make a sensor_msgs/CompressedImage of a file's own bytes, a ``png`` or ``jpeg``."""
+    # As image_transport writes it: the image was rgb8, its decoder yields bgr8.
+    return _make(COMPRESSED_IMAGE, header=_header(stamp, frame_id),
+                 format=f'rgb8; {codec} compressed bgr8', data=np.frombuffer(data, dtype=np.uint8))
 
 
 def camera_info_message(stamp: int, frame_id: str, camera: Camera) -> Any:
     """Make a sensor_msgs/CameraInfo of an unrectified monocular camera."""
-    projection = np.hstack([camera.matrix, np.zeros((3, 1))])
-    return _type(CAMERA_INFO)(
-        header=_header(stamp, frame_id),
-        height=camera.height,
-        width=camera.width,
-        distortion_model=camera.distortion_model or 'plumb_bob',
-        d=np.array(camera.distortion, dtype=np.float64),
-        k=camera.matrix.reshape(-1),
-        r=np.eye(3).reshape(-1),
-        p=projection.reshape(-1),
-        binning_x=0,
-        binning_y=0,
-        roi=_type('sensor_msgs/msg/RegionOfInterest')(
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        ),
-    )
+    roi = _make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
+                do_rectify=False)
+    return _make(CAMERA_INFO, header=_header(stamp, frame_id), height=camera.height,
+                 width=camera.width, distortion_model=camera.distortion_model or 'plumb_bob',
+                 d=np.array(camera.distortion, dtype=np.float64), k=camera.matrix.reshape(-1),
+                 r=np.eye(3).reshape(-1),
+                 p=np.hstack([camera.matrix, np.zeros((3, 1))]).reshape(-1),
+                 binning_x=0, binning_y=0, roi=roi)
 
 
 def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any:
     """Make a vision_msgs/Detection2DArray; all headers equal the image's."""
     header = _header(stamp, frame_id)
-    return _type(DETECTIONS)(
-        header=header,
-        detections=[
-            _detection(header, box_xyxy, class_id, float(score))
-            for box_xyxy, class_id, score in zip(
-                detections.bboxes_xyxy, detections.class_ids, detections.scores, strict=True
-            )
-        ],
-    )
+    no_pose = _make('geometry_msgs/msg/PoseWithCovariance', pose=_pose(np.eye(4)),
+                    covariance=np.zeros(36))
+    made = []
+    for box, class_id, score in zip(detections.bboxes_xyxy.tolist(), detections.class_ids,
+                                    detections.scores.tolist(), strict=True):
+        left, top, right, bottom = box
+        centre = _make('vision_msgs/msg/Point2D', x=(left + right) / 2, y=(top + bottom) / 2)
+        hypothesis = _make('vision_msgs/msg/ObjectHypothesis', class_id=class_id, score=score)
+        made.append(_make(
+            'vision_msgs/msg/Detection2D', header=header, id='',
+            results=[_make('vision_msgs/msg/ObjectHypothesisWithPose', hypothesis=hypothesis,
+                           pose=no_pose)],
+            bbox=_make('vision_msgs/msg/BoundingBox2D', size_x=right - left, size_y=bottom - top,
+                       center=_make('vision_msgs/msg/Pose2D', position=centre, theta=0.0))))
+    return _make(DETECTIONS, header=header, detections=made)
 
 
 def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]) -> Any:
     """Make a geometry_msgs/PoseStamped of the camera (4, 4) in the map's coordinate frame."""
-    return _type(POSE)(
-        header=_header(stamp, frame_id),
-        pose=_pose(map_from_camera[:3, 3], quaternion_from_transform(map_from_camera)),
-    )
+    return _make(POSE, header=_header(stamp, frame_id), pose=_pose(map_from_camera))
 
 
 def detections_of(message: Any) -> Detections:
-    """Read a vision_msgs/Detection2DArray; the best hypothesis of each detection counts.
+    """Read a vision_msgs/Detection2DArray, as rosbags or rclpy deserializes it.
 
-    Parameters
-    ----------
-    message : vision_msgs/Detection2DArray
-        As rosbags or rclpy deserializes it.
-
-    Returns
-    -------
-    Detections
-        A detection without hypotheses has class '' and score 0.
+    The best hypothesis of each detection counts; one without has class '' and score 0.
     """
     boxes, class_ids, scores = [], [], []
     for detection in message.detections:
@@ -162,41 +140,18 @@ def map_from_camera_of(message: Any) -> NDArray[np.float64]:
     )
 
 
-def _type(name: str) -> Any:
-    return typestore().types[name]
+def _make(msgtype: str, **fields: Any) -> Any:
+    return typestore().types[msgtype](**fields)
 
 
 def _header(stamp: int, frame_id: str) -> Any:
-    time = _type('builtin_interfaces/msg/Time')(sec=stamp // NS_PER_S, nanosec=stamp % NS_PER_S)
-    return _type('std_msgs/msg/Header')(stamp=time, frame_id=frame_id)
+    time = _make('builtin_interfaces/msg/Time', sec=stamp // NS_PER_S, nanosec=stamp % NS_PER_S)
+    return _make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
 
 
-def _pose(position_xyz: NDArray[np.float64], quat_xyzw: NDArray[np.float64]) -> Any:
-    x, y, z, w = (float(value) for value in quat_xyzw)
-    return _type('geometry_msgs/msg/Pose')(
-        position=_type('geometry_msgs/msg/Point')(*(float(value) for value in position_xyz)),
-        orientation=_type('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w),
-    )
-
-
-def _detection(
-    header: Any, box_xyxy: NDArray[np.float64], class_id: str, score: float
-) -> Any:
-    left, top, right, bottom = (float(value) for value in box_xyxy)
-    centre = _type('vision_msgs/msg/Point2D')(x=(left + right) / 2, y=(top + bottom) / 2)
-    no_pose = _type('geometry_msgs/msg/PoseWithCovariance')(
-        pose=_pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), covariance=np.zeros(36)
-    )
-    hypothesis = _type('vision_msgs/msg/ObjectHypothesis')(class_id=class_id, score=score)
-    return _type('vision_msgs/msg/Detection2D')(
-        header=header,
-        results=[
-            _type('vision_msgs/msg/ObjectHypothesisWithPose')(hypothesis=hypothesis, pose=no_pose)
-        ],
-        bbox=_type('vision_msgs/msg/BoundingBox2D')(
-            center=_type('vision_msgs/msg/Pose2D')(position=centre, theta=0.0),
-            size_x=right - left,
-            size_y=bottom - top,
-        ),
-        id='',
-    )
+def _pose(transform: NDArray[np.float64]) -> Any:
+    position = dict(zip('xyz', transform[:3, 3].tolist(), strict=True))
+    orientation = dict(zip('xyzw', quaternion_from_transform(transform).tolist(), strict=True))
+    return _make('geometry_msgs/msg/Pose',
+                 position=_make('geometry_msgs/msg/Point', **position),
+                 orientation=_make('geometry_msgs/msg/Quaternion', **orientation))

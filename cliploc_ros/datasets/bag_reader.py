@@ -14,7 +14,7 @@ from typing import Any, Self
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos
 from rosbags.rosbag2 import Reader, ReaderError
 
-from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.datasets.bag_messages import deserialize, typestore
 from cliploc_ros.errors import DatasetError
 
 
@@ -45,11 +45,6 @@ class BagReader:
 
     A context manager. It streams messages: memory does not grow with the recording. It unpacks
     compressed files (zstd) into the temporary folder while it is open.
-
-    Parameters
-    ----------
-    path : str or Path
-        The recording.
 
     Raises
     ------
@@ -84,12 +79,8 @@ class BagReader:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
         """Close the recording."""
         if self._reader is not None:
             self._reader.close()
@@ -125,18 +116,12 @@ class BagReader:
             If the recording has no topic of that name; the message lists its topics.
         """
         if name not in self._topics:
-            recorded = ', '.join(
-                f'{topic.name} ({topic.msgtype})' for topic in self._topics.values()
-            )
+            recorded = ', '.join(f'{one.name} ({one.msgtype})' for one in self._topics.values())
             raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
         return self._topics[name]
 
-    def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> Iterator[BagMessage]:
+    def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
+                 stop_ns: int | None = None) -> Iterator[BagMessage]:
         """Yield messages in the order of their stamps.
 
         Parameters
@@ -145,10 +130,6 @@ class BagReader:
             Names of topics; all of them by default.
         start_ns, stop_ns : int, optional
             Yield only messages at or after start_ns and before stop_ns [ns].
-
-        Yields
-        ------
-        BagMessage
 
         Raises
         ------
@@ -185,15 +166,9 @@ class BagReader:
         if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
             raise DatasetError(
                 f'{self.path}: {topic.name} was recorded with another definition of '
-                f'{topic.msgtype} than the one of Jazzy'
-            )
-        try:
-            return store.deserialize_cdr(message.data, topic.msgtype)
-        except Exception as error:  # the library does not check the bytes before it unpacks them
-            raise DatasetError(
-                f'{self.path}: the message of {topic.name} at {message.stamp_ns} is no valid '
-                f'{topic.msgtype}: {error}'
-            ) from error
+                f'{topic.msgtype} than the one of Jazzy')
+        return deserialize(message.data, topic.msgtype,
+                           f'{self.path}: {topic.name} at {message.stamp_ns}')
 
     @property
     def _open_reader(self) -> Reader:
@@ -203,22 +178,16 @@ class BagReader:
 
     def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
         topics: dict[str, BagTopic] = {}
-        for connection in connections:
-            topic = _topic_of(connection)
-            known = topics.setdefault(topic.name, topic)
-            if known is topic:
-                continue
-            if known.msgtype != topic.msgtype:
+        for one in connections:
+            assert isinstance(one.ext, ConnectionExtRosbag2)
+            known = topics.get(one.topic, BagTopic(one.topic, one.msgtype, 0))
+            if known.msgtype != one.msgtype:
                 raise DatasetError(
-                    f'{self.path}: {topic.name} has two types, {known.msgtype} and {topic.msgtype}'
-                )
-            topics[topic.name] = BagTopic(
-                topic.name,
-                topic.msgtype,
-                known.message_count + topic.message_count,
-                known.offered_qos + topic.offered_qos,
-                known.type_hash or topic.type_hash,
-            )
+                    f'{self.path}: {one.topic} has two types, {known.msgtype} and {one.msgtype}')
+            topics[one.topic] = BagTopic(
+                one.topic, one.msgtype, known.message_count + one.msgcount,
+                known.offered_qos + tuple(one.ext.offered_qos_profiles),
+                known.type_hash or one.digest)
         return topics
 
     def _connections(self, names: Collection[str]) -> list[Connection]:
@@ -235,14 +204,3 @@ class BagReader:
     def _unreadable(self, error: Exception) -> DatasetError:
         name = '' if isinstance(error, ReaderError) else f'{type(error).__name__}: '
         return DatasetError(f'{self.path}: cannot be read as a rosbag2 recording: {name}{error}')
-
-
-def _topic_of(connection: Connection) -> BagTopic:
-    assert isinstance(connection.ext, ConnectionExtRosbag2)
-    return BagTopic(
-        connection.topic,
-        connection.msgtype,
-        connection.msgcount,
-        tuple(connection.ext.offered_qos_profiles),
-        connection.digest,
-    )

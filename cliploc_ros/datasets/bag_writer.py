@@ -25,29 +25,18 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
-from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.datasets.bag_messages import typestore
 from cliploc_ros.errors import DatasetError
 
-STORAGES: Mapping[str, StoragePlugin] = {
-    'sqlite3': StoragePlugin.SQLITE3,
-    'mcap': StoragePlugin.MCAP,
-}
+STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,
+                                         'mcap': StoragePlugin.MCAP}
 
 _INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 #: The default of rclcpp, as camera drivers and detectors offer it; matches best-effort and
 #: reliable subscribers.
-RELIABLE_QOS = Qos(
-    QosHistory.KEEP_LAST,
-    10,
-    QosReliability.RELIABLE,
-    QosDurability.VOLATILE,
-    _INFINITE,
-    _INFINITE,
-    QosLiveliness.AUTOMATIC,
-    _INFINITE,
-    False,
-)
+RELIABLE_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
+                   _INFINITE, _INFINITE, QosLiveliness.AUTOMATIC, _INFINITE, False)
 #: For maps and static transforms: a late subscriber receives the last message.
 LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 
@@ -83,37 +72,37 @@ class BagWriter:
     def __enter__(self) -> Self:
         """Begin the recording beside its final path."""
         self._check_free()
-        prefix = f'.{self.path.name}.'
         try:
-            staging = tempfile.mkdtemp(prefix=prefix, suffix='.partial', dir=self.path.parent)
-            self._staging = Path(staging)
-            writer = Writer(
-                self._staging / self.path.name, version=9, storage_plugin=self._storage
-            )
+            self._staging = Path(tempfile.mkdtemp(
+                prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
+            writer = Writer(self._staging / self.path.name, version=9,
+                            storage_plugin=self._storage)
             writer.open()
-        except (OSError, sqlite3.Error, WriterError) as error:
+        except BaseException as error:  # Ctrl-C, too
             self._discard()
-            raise self._unwritable(error) from error
-        except BaseException:  # Ctrl-C
-            self._discard()
+            if isinstance(error, OSError | sqlite3.Error | WriterError):
+                raise self._unwritable(error) from error
             raise
         self._writer = writer
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
         """Complete the recording and move it to its final path, or remove it."""
         writer, self._writer = self._writer, None
+        assert writer is not None and self._staging is not None
         try:
-            if writer is not None and kind is None:
-                self._finish(writer)
-            elif writer is not None:
+            if kind is None:
+                writer.close()
+                self._check_free()  # another process may have written it meanwhile
+                (self._staging / self.path.name).rename(self.path)
+            else:
                 with suppress(Exception):  # the block's own exception is the one to report
                     writer.abort()
+        except (OSError, sqlite3.Error) as problem:
+            with suppress(Exception):
+                writer.abort()
+            raise self._unwritable(problem) from problem
         finally:
             self._discard()
 
@@ -129,29 +118,15 @@ class BagWriter:
         """
         try:
             self._connections[name] = self._open_writer.add_connection(
-                name, msgtype, typestore=typestore(), offered_qos_profiles=[qos]
-            )
+                name, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
         except (OSError, sqlite3.Error) as error:
             raise self._unwritable(error) from error
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message.
-
-        Parameters
-        ----------
-        topic : str
-            A declared topic.
-        stamp_ns : int
-            Time at which it counts as recorded [ns].
-        message : object
-            An object of a type of the typestore, or its bytes.
-        """
+        """Append a message of a declared topic, or its bytes, as recorded at a stamp [ns]."""
         connection = self._connections[topic]
-        data = (
-            message
-            if isinstance(message, bytes)
-            else typestore().serialize_cdr(message, connection.msgtype)
-        )
+        data = (message if isinstance(message, bytes)
+                else typestore().serialize_cdr(message, connection.msgtype))
         try:
             self._open_writer.write(connection, stamp_ns, data)
         except (OSError, sqlite3.Error) as error:
@@ -168,17 +143,6 @@ class BagWriter:
             raise DatasetError(f'{self.path}: exists already and is not overwritten')
         if not self.path.parent.is_dir():
             raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
-
-    def _finish(self, writer: Writer) -> None:
-        assert self._staging is not None
-        try:
-            writer.close()
-            self._check_free()  # another process may have written it meanwhile
-            (self._staging / self.path.name).rename(self.path)
-        except (OSError, sqlite3.Error) as error:
-            with suppress(Exception):
-                writer.abort()
-            raise self._unwritable(error) from error
 
     def _discard(self) -> None:
         if self._staging is not None:

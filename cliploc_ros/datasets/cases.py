@@ -16,12 +16,12 @@ from cliploc_ros.datasets.bag_messages import (
     DETECTIONS,
     IMAGE,
     POSE,
+    deserialize,
     map_from_camera_of,
     pose_message,
-    stamp_ns,
+    typestore,
 )
 from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.errors import DatasetError
 
@@ -55,7 +55,7 @@ class CaseFrame:
         """
         msgtype = {'image': self.image_type, 'camera_info': CAMERA_INFO,
                    'detections': DETECTIONS}[name]
-        return _deserialized(getattr(self, name), msgtype, name)
+        return deserialize(getattr(self, name), msgtype, name)
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def read_case(path: Path) -> Case:
         if not (stamp in others[_CAMERA_INFO] and stamp in others[_DETECTIONS]):
             raise DatasetError(f'{path}: the image of {stamp} ns has no camera_info or detections')
         data = others[_CAMERA].get(stamp)
-        pose_of = None if data is None else map_from_camera_of(_deserialized(data, POSE, _CAMERA))
+        pose_of = None if data is None else map_from_camera_of(deserialize(data, POSE, _CAMERA))
         frames.append(CaseFrame(
             stamp, image_type, image, others[_CAMERA_INFO][stamp], others[_DETECTIONS][stamp],
             _up_of(others[_UP].get(stamp)), pose_of))
@@ -162,14 +162,5 @@ def _parsed(text: str, path: Path) -> Mapping[str, Any]:
 def _up_of(data: bytes | None) -> NDArray[np.float64] | None:
     if data is None:
         return None
-    vector = _deserialized(data, _VECTOR, _UP).vector
+    vector = deserialize(data, _VECTOR, _UP).vector
     return np.array([vector.x, vector.y, vector.z])
-
-
-def _deserialized(data: bytes, msgtype: str, where: str) -> Any:
-    try:
-        message = typestore().deserialize_cdr(data, msgtype)
-        stamp_ns(message)
-        return message
-    except Exception as error:  # the library raises what the bytes happen to cause
-        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error

@@ -14,8 +14,7 @@ from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.datasets.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
 from cliploc_ros.datasets.intrinsics import find_camera, read_camera
-from cliploc_ros.datasets.poses import Poses, TrajectoryPoses
-from cliploc_ros.datasets.trajectory import Trajectory
+from cliploc_ros.datasets.poses import Poses, TimedPoses
 from cliploc_ros.datasets.tum import TumSequence, read_image_list, read_tum
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
@@ -35,7 +34,7 @@ class FolderOptions:
     """What a folder does not say itself."""
 
     intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
-    trajectory: Trajectory | None = None  #: Poses instead of the folder's own
+    trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
     max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
     #: (4, 4): how the camera is mounted on what the poses are of
     body_from_camera: NDArray[np.float64] | None = None
@@ -149,4 +148,5 @@ def _poses(sequence: TumSequence, options: FolderOptions) -> Poses:
     if len(trajectory) == 0:
         raise DatasetError(f'{sequence.folder}: there are no poses: no groundtruth.txt here; give '
                            '--trajectory FILE')
-    return TrajectoryPoses(trajectory, options.max_gap_ns, options.body_from_camera)
+    return replace(trajectory, max_gap_ns=options.max_gap_ns,
+                   body_from_camera=options.body_from_camera)

@@ -29,7 +29,7 @@ _SEQUENCE_NAME = re.compile(r'(?<![a-z])(?:freiburg|fr)([123])(?![0-9])', re.IGN
 
 
 def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
-    """Find the camera of a sequence.
+    """Return the camera of a sequence, and for the user where its intrinsics are from.
 
     Parameters
     ----------
@@ -39,16 +39,10 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     folder : Path
         The sequence's folder.
 
-    Returns
-    -------
-    camera : Camera
-    origin : str
-        The source of the intrinsics, for the user.
-
     Raises
     ------
     DatasetError
-        If neither choice nor folder determines the camera, or the file is invalid.
+        Neither choice nor folder determines the camera, or the file is invalid.
     """
     if choice is not None and choice in PRESETS:
         return PRESETS[choice], f'preset {choice}'
@@ -58,10 +52,8 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
         return read_camera(folder / 'camera.json'), str(folder / 'camera.json')
     match = _SEQUENCE_NAME.search(folder.resolve().name)
     if match is None:
-        raise DatasetError(
-            f'{folder}: the name of the folder contains no TUM camera; give '
-            '--intrinsics fr1, fr2, fr3 or a camera.json'
-        )
+        raise DatasetError(f'{folder}: the name of the folder contains no TUM camera; give '
+                           '--intrinsics fr1, fr2, fr3 or a camera.json')
     return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
 
 
@@ -71,72 +63,38 @@ def read_camera(path: str | Path) -> Camera:
     The file holds a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and,
     for a lens with distortion, ``distortion_model`` and its coefficients ``d``.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    Camera
-
     Raises
     ------
     DatasetError
-        If a field is missing, unknown or invalid; the message names file and field.
+        A field is missing, unknown or invalid; the message names file and field.
     """
     path = Path(path)
-    values = _load_mapping(path)
-    if unknown := sorted(set(values) - {*_REQUIRED, *_OPTIONAL}):
-        raise DatasetError(f'{path}: unknown field {unknown[0]!r}')
-    if missing := [name for name in _REQUIRED if name not in values]:
-        raise DatasetError(f'{path}: field {missing[0]!r} is missing')
-    numbers = {name: _number(values[name], name, path) for name in _REQUIRED[2:]}
-    try:
-        return Camera(
-            width=_pixels(values['width'], 'width', path),
-            height=_pixels(values['height'], 'height', path),
-            distortion_model=_model(values.get('distortion_model', 'plumb_bob'), path),
-            distortion=_coefficients(values.get('d', []), path),
-            **numbers,
-        )
-    except CameraError as error:
-        raise DatasetError(f'{path}: {error}') from error
-
-
-def _load_mapping(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding='utf-8'))
     except FileNotFoundError:
         raise DatasetError(
-            f'{path}: no such camera file; give fr1, fr2, fr3 or a camera.json'
-        ) from None
+            f'{path}: no such camera file; give fr1, fr2, fr3 or a camera.json') from None
     except (OSError, ValueError) as error:
         raise DatasetError(f'{path}: cannot be read as JSON: {error}') from error
     if not isinstance(values, dict):
         raise DatasetError(f'{path}: expected a mapping with {", ".join(_REQUIRED)}')
-    return values
+    if unknown := sorted(set(values) - {*_REQUIRED, *_OPTIONAL}):
+        raise DatasetError(f'{path}: unknown field {unknown[0]!r}')
+    if missing := [name for name in _REQUIRED if name not in values]:
+        raise DatasetError(f'{path}: field {missing[0]!r} is missing')
 
-
-def _number(value: Any, name: str, path: Path) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DatasetError(f'{path}: {name} is {value!r}, not a number')
-    return float(value)
-
-
-def _pixels(value: Any, name: str, path: Path) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise DatasetError(f'{path}: {name} is {value!r}, not a number of pixels')
-    return value
-
-
-def _model(value: Any, path: Path) -> str:
-    if not isinstance(value, str):
-        raise DatasetError(f'{path}: distortion_model is {value!r}, not a name')
-    return value
-
-
-def _coefficients(values: Any, path: Path) -> tuple[float, ...]:
-    if not isinstance(values, list):
-        raise DatasetError(f'{path}: d is {values!r}, not a list of numbers')
-    return tuple(_number(value, 'd', path) for value in values)
+    def check(name: str, value: Any, kind: Any, what: str) -> Any:
+        if isinstance(value, bool) or not isinstance(value, kind):
+            raise DatasetError(f'{path}: {name} is {value!r}, not {what}')
+        return value
+    width, height = (check(name, values[name], int, 'a number of pixels')
+                     for name in _REQUIRED[:2])
+    fx, fy, cx, cy = (float(check(name, values[name], int | float, 'a number'))
+                      for name in _REQUIRED[2:])
+    model = check('distortion_model', values.get('distortion_model', 'plumb_bob'), str, 'a name')
+    coefficients = check('d', values.get('d', []), list, 'a list of numbers')
+    distortion = tuple(float(check('d', value, int | float, 'a number')) for value in coefficients)
+    try:
+        return Camera(width, height, fx, fy, cx, cy, model, distortion)
+    except CameraError as error:
+        raise DatasetError(f'{path}: {error}') from error

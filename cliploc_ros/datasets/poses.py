@@ -1,27 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera was: poses of a recording's topic, of its tf, or of a trajectory file."""
+"""Where a camera was: poses over time, with interpolation between them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.trajectory import Trajectory
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
-#: Where each type of message has its pose.
-POSE_TYPES: dict[str, Callable[[Any], Any]] = {
-    'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
-    'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
-    'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
-}
+# A stamp has a pose only if a sample lies this close to it.
+_MAX_SAMPLE_DISTANCE_NS = 20_000_000
 _MAX_NORM_ERROR = 0.01
 # A clock that is off by less than this is a late start of the recording, not another clock.
 _OTHER_CLOCK_S = 60.0
@@ -39,74 +32,88 @@ class Poses(Protocol):
 
 
 @dataclass(frozen=True)
-class TrajectoryPoses:
-    """Poses of a body on which the camera is mounted."""
+class TimedPoses:
+    """Samples of the pose of a camera, or of a body on which it is mounted, in order of time."""
 
-    trajectory: Trajectory
+    #: (t,) of int64: time of each sample [ns], strictly increasing. May be empty.
+    stamps_ns: NDArray[np.int64]
+    positions_xyz: NDArray[np.float64]  #: (t, 3): in the map [m]
+    quats_xyzw: NDArray[np.float64]  #: (t, 4): rotation into map axes, unit norm
     #: Greatest gap between two samples to interpolate over [ns]. One sample within 20 ms is always
     #: enough.
     max_gap_ns: int = 0
-    #: (4, 4): the mount of the camera; None: the trajectory is the camera's own
+    #: (4, 4): the mount of the camera; None: the poses are the camera's own
     body_from_camera: NDArray[np.float64] | None = None
+
+    @classmethod
+    def from_samples(cls, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str
+                     ) -> 'TimedPoses':
+        """Return the poses of unsorted samples (x, y, z, qx, qy, qz, qw).
+
+        Of equal stamps the first counts.
+
+        Raises
+        ------
+        DatasetError
+            A sample is not finite or has no unit quaternion.
+        """
+        stamps, order = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
+        samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
+        norms = np.linalg.norm(samples[:, 3:], axis=1)
+        with np.errstate(invalid='ignore'):
+            sound = np.isfinite(samples).all(axis=1) & (np.abs(norms - 1.0) < _MAX_NORM_ERROR)
+        if not sound.all():
+            raise DatasetError(f'{where}: {int((~sound).sum())} of {len(sound)} poses are not '
+                               'finite or have no unit quaternion')
+        return cls(stamps, samples[:, :3], samples[:, 3:] / norms[:, None])
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.stamps_ns)
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
         """Return the first and last stamp with a pose [ns]; None without any."""
-        stamps = self.trajectory.stamps_ns
-        return (int(stamps[0]), int(stamps[-1])) if len(stamps) else None
+        return (int(self.stamps_ns[0]), int(self.stamps_ns[-1])) if len(self) else None
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
-        pose = self.trajectory.pose_at(stamp_ns, self.max_gap_ns)
-        if pose is None or self.body_from_camera is None:
-            return pose
-        return np.asarray(pose @ self.body_from_camera)
+        """Return ``map_from_camera`` (4, 4) at a stamp; None if no sample is near enough.
+
+        Positions are interpolated linearly, rotations by slerp. Just outside the samples it is
+        the first or last one, without extrapolation.
+        """
+        if len(self) == 0:
+            return None
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        low, high = max(after - 1, 0), min(after, len(self) - 1)
+        gap_before = abs(stamp_ns - int(self.stamps_ns[low]))
+        gap_after = abs(int(self.stamps_ns[high]) - stamp_ns)
+        is_between = self.stamps_ns[low] <= stamp_ns <= self.stamps_ns[high]
+        if (min(gap_before, gap_after) > _MAX_SAMPLE_DISTANCE_NS
+                and not (is_between and gap_before + gap_after <= self.max_gap_ns)):
+            return None
+        fraction = 0.0 if low == high else gap_before / (gap_before + gap_after)
+        start, end = self.positions_xyz[low], self.positions_xyz[high]
+        pose = transform_from_pose(start + fraction * (end - start), slerp(
+            self.quats_xyzw[low], self.quats_xyzw[high], fraction))
+        return pose if self.body_from_camera is None else np.asarray(pose @ self.body_from_camera)
 
 
-def read_pose_topic(reader: BagReader, name: str) -> Trajectory:
-    """Return the poses of a topic of type PoseStamped, PoseWithCovarianceStamped or Odometry.
+def slerp(start_xyzw: NDArray[np.float64], end_xyzw: NDArray[np.float64], fraction: float
+          ) -> NDArray[np.float64]:
+    """Interpolate between two unit quaternions along the shorter great arc (Shoemake 1985).
 
-    Raises
-    ------
-    DatasetError
-        The topic is missing, of another type, or a pose is invalid.
+    SciPy's Slerp differs from it in the last digits, and maps of recordings with it.
     """
-    pose_of = POSE_TYPES.get(reader.topic(name).msgtype)
-    if pose_of is None:
-        raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, not '
-                           f'{" or ".join(POSE_TYPES)}')
-    stamps, rows = [], []
-    for recorded in reader.messages([name]):
-        message = reader.deserialize(recorded)
-        pose = pose_of(message)
-        stamps.append(stamp_ns(message))
-        position = pose.position
-        orientation = pose.orientation
-        numbers = (position.x, position.y, position.z,
-                   orientation.x, orientation.y, orientation.z, orientation.w)
-        rows.append(numbers)
-    return make_trajectory(stamps, rows, f'{reader.path}: {name}')
-
-
-def make_trajectory(stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str
-                    ) -> Trajectory:
-    """Return a trajectory of unsorted samples (x, y, z, qx, qy, qz, qw).
-
-    Raises
-    ------
-    DatasetError
-        A sample is not finite or has no unit quaternion.
-    """
-    order = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)[1]
-    samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
-    norms = np.linalg.norm(samples[:, 3:], axis=1)
-    with np.errstate(invalid='ignore'):
-        sound = np.isfinite(samples).all(axis=1) & (np.abs(norms - 1.0) < _MAX_NORM_ERROR)
-    if not sound.all():
-        raise DatasetError(f'{where}: {int((~sound).sum())} of {len(sound)} poses are not finite '
-                           'or have no unit quaternion')
-    return Trajectory(np.array(stamps_ns, dtype=np.int64)[order], samples[:, :3],
-                      samples[:, 3:] / norms[:, None])
+    cosine = float(start_xyzw @ end_xyzw)
+    if cosine < 0:  # q and -q are the same rotation: take the nearer one
+        end_xyzw, cosine = -end_xyzw, -cosine
+    if cosine > 0.9995:  # dividing by the sine would lose precision
+        mixed = (1 - fraction) * start_xyzw + fraction * end_xyzw
+        return np.asarray(mixed / np.linalg.norm(mixed))
+    angle = np.arccos(cosine)
+    weights = np.sin([(1 - fraction) * angle, fraction * angle]) / np.sin(angle)
+    return np.asarray(weights[0] * start_xyzw + weights[1] * end_xyzw)
 
 
 def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:

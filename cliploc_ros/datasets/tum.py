@@ -10,24 +10,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.datasets.trajectory import Trajectory
+from cliploc_ros.datasets.poses import TimedPoses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
 #: builtin_interfaces/Time holds seconds in an int32.
 MAX_STAMP_S = 2**31 - 1
+# Files of the dataset round their quaternions to four decimals.
+_MAX_NORM_ERROR = 0.05
 
 
 @dataclass(frozen=True)
 class TumSequence:
     """A TUM RGB-D folder: colour images with stamps, and the camera's trajectory."""
 
-    folder: Path  #: The folder
+    folder: Path
     #: Stamp of each image [ns], exact to the last decimal, strictly increasing
     stamps_ns: tuple[int, ...]
     image_paths: tuple[Path, ...]  #: The existing image file of each stamp
     #: Ground truth, map from camera; empty if the folder has no groundtruth.txt
-    trajectory: Trajectory
+    trajectory: TimedPoses
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -40,80 +42,65 @@ class TumSequence:
     def every(self, step: int) -> 'TumSequence':
         """Return the sequence with every ``step``-th image only, beginning with the first.
 
-        Raises
-        ------
-        DatasetError
-            If ``step`` is less than 1.
+        DatasetError: the step is less than 1.
         """
         if step < 1:
             raise DatasetError(f'every {step}th image is no selection: give 1 or more')
         return replace(
-            self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step]
-        )
+            self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step])
 
 
 def read_tum(folder: str | Path) -> TumSequence:
     """Read a TUM RGB-D folder, except for the pixels of its images.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Holds ``rgb.txt``, the images that it lists, and optionally ``groundtruth.txt``.
-
-    Returns
-    -------
-    TumSequence
+    It holds ``rgb.txt``, the images that this lists, and optionally ``groundtruth.txt``.
 
     Raises
     ------
     DatasetError
-        If the folder is invalid; the message names file and line.
+        Names the file and the line that is invalid.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f'{folder}: no such folder')
-    stamps_ns, image_paths = read_image_list(folder / 'rgb.txt')
     truth = folder / 'groundtruth.txt'
-    trajectory = read_tum_trajectory(truth) if truth.exists() else _empty_trajectory()
-    return TumSequence(folder, stamps_ns, image_paths, trajectory)
+    trajectory = (read_tum_trajectory(truth) if truth.exists()
+                  else TimedPoses.from_samples([], [], str(folder)))
+    return TumSequence(folder, *read_image_list(folder / 'rgb.txt'), trajectory)
 
 
-def read_tum_trajectory(path: str | Path) -> Trajectory:
+def read_tum_trajectory(path: str | Path) -> TimedPoses:
     """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
 
-    Lines may have any order; of equal stamps the first counts.
-
-    Parameters
-    ----------
-    path : str or Path
-        The text file; ``#`` begins a comment.
-
-    Returns
-    -------
-    Trajectory
-        Quaternions normalized.
+    Lines may have any order; of equal stamps the first counts. ``#`` begins a comment.
 
     Raises
     ------
     DatasetError
-        If a line does not hold eight numbers, or its quaternion is far from unit norm; the
-        message names file and line.
+        A line does not hold eight numbers, or its quaternion is far from unit norm; the message
+        names file and line.
     """
-    path = Path(path)
     samples: dict[int, list[float]] = {}
-    for where, line in _data_lines(path):
+    for where, line in _data_lines(Path(path)):
         fields = line.replace(',', ' ').split()
         if len(fields) != 8:
             raise DatasetError(
-                f'{where}: expected timestamp tx ty tz qx qy qz qw, got {len(fields)} fields'
-            )
-        samples.setdefault(parse_stamp_ns(fields[0], where), _parse_pose(fields[1:], where))
-    if not samples:
-        return _empty_trajectory()
+                f'{where}: expected timestamp tx ty tz qx qy qz qw, got {len(fields)} fields')
+        shown = f'pose {" ".join(fields[1:])!r}'
+        try:
+            values = [float(field) for field in fields[1:]]
+        except ValueError:
+            raise DatasetError(f'{where}: {shown} is not seven numbers') from None
+        if not np.all(np.isfinite(values)):
+            raise DatasetError(f'{where}: {shown} is not finite')
+        norm = float(np.linalg.norm(values[3:]))
+        if abs(norm - 1) > _MAX_NORM_ERROR:
+            raise DatasetError(f'{where}: quaternion qx qy qz qw has norm {norm:.3f}, not 1')
+        samples.setdefault(parse_stamp_ns(fields[0], where), values)
     stamps = sorted(samples)
-    rows = np.array([samples[stamp] for stamp in stamps])
+    rows = np.array([samples[stamp] for stamp in stamps]).reshape(-1, 7)
     quats_xyzw = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-    return Trajectory(np.array(stamps, dtype=np.int64), rows[:, :3], quats_xyzw)
+    return TimedPoses(np.array(stamps, dtype=np.int64), rows[:, :3], quats_xyzw)
 
 
 def parse_stamp_ns(text: str, where: str) -> int:
@@ -126,15 +113,10 @@ def parse_stamp_ns(text: str, where: str) -> int:
     where : str
         File and line, for the message.
 
-    Returns
-    -------
-    int
-        Nanoseconds.
-
     Raises
     ------
     DatasetError
-        If the text is no number, or outside the range of a ROS time.
+        The text is no number, or outside the range of a ROS time.
     """
     try:
         seconds = Decimal(text)
@@ -174,19 +156,6 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
     return tuple(stamps_ns), tuple(image_paths)
 
 
-def _parse_pose(fields: list[str], where: str) -> list[float]:
-    try:
-        values = [float(field) for field in fields]
-    except ValueError:
-        raise DatasetError(f'{where}: pose {" ".join(fields)!r} is not seven numbers') from None
-    if not np.all(np.isfinite(values)):
-        raise DatasetError(f'{where}: pose {" ".join(fields)!r} is not finite')
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1) > 0.05:
-        raise DatasetError(f'{where}: quaternion qx qy qz qw has norm {norm:.3f}, not 1')
-    return values
-
-
 def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield 'file:line' and the text of each line that is neither blank nor a comment."""
     try:
@@ -197,7 +166,3 @@ def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
         stripped = line.strip()
         if stripped and not stripped.startswith('#'):
             yield f'{path}:{number}', stripped
-
-
-def _empty_trajectory() -> Trajectory:
-    return Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 4)))

@@ -6,10 +6,10 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
@@ -60,14 +60,9 @@ class ConversionResult:
     detections: int  #: Images with an entry of recorded detections, which may be empty
 
 
-def convert_tum(
-    sequence: TumSequence,
-    camera: Camera,
-    output: str | Path,
-    options: ConversionOptions,
-    detections: Mapping[int, Detections] | None = None,
-    progress: Progress = iter,
-) -> ConversionResult:
+def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
+                options: ConversionOptions, detections: Mapping[int, Detections] | None = None,
+                progress: Progress = iter) -> ConversionResult:
     """Write a sequence as a rosbag2 recording.
 
     Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth`` and, if
@@ -76,113 +71,62 @@ def convert_tum(
 
     Parameters
     ----------
-    sequence : TumSequence
-        Images and ground truth.
     camera : Camera
         Intrinsics; the images must have its size.
     output : str or Path
         The folder to make.
-    options : ConversionOptions
-        Format, topics and coordinate frames.
     detections : mapping of int to Detections, optional
         Recorded detections by stamp [ns].
     progress : callable
         Wraps the iterable of images, to show progress.
 
-    Returns
-    -------
-    ConversionResult
-
     Raises
     ------
     DatasetError
-        If an image is invalid, no image has detections, or the output cannot be written.
-        No partial recording remains.
+        An image is invalid, no image has detections, or the output cannot be written. No partial
+        recording remains.
     """
+    recorded = detections or {}
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
         raise DatasetError(
             f'{sequence.folder}: the recorded detections have the stamps of none of its images; '
-            'are they of another sequence?'
-        )
+            'are they of another sequence?')
+    is_compressed = options.image_format == 'compressed'
+    image_topic = options.topic('image/compressed' if is_compressed else 'image')
+    info_topic, pose_topic = options.topic('camera_info'), options.topic('ground_truth')
+    boxes_topic = options.topic('detections')
+    frame, poses, boxes = options.camera_frame, 0, 0
     with BagWriter(output, options.storage) as bag:
-        recorder = _FrameRecorder(bag, camera, options, detections)
-        for stamp_ns, path in progress(
-            list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))
-        ):
-            recorder.add(stamp_ns, path, sequence.pose_at(stamp_ns))
-    return ConversionResult(recorder.images, recorder.poses, recorder.detections)
-
-
-class _FrameRecorder:
-    """Writes the messages of one frame after another."""
-
-    def __init__(
-        self,
-        bag: BagWriter,
-        camera: Camera,
-        options: ConversionOptions,
-        detections: Mapping[int, Detections] | None,
-    ) -> None:
-        self.images = self.poses = self.detections = 0
-        self._bag, self._camera, self._options = bag, camera, options
-        self._recorded: Mapping[int, Detections] = detections or {}
-        self._compressed = options.image_format == 'compressed'
-        self._image_topic = options.topic('image/compressed' if self._compressed else 'image')
-        self._info_topic = options.topic('camera_info')
-        self._pose_topic = options.topic('ground_truth')
-        self._detections_topic = options.topic('detections')
-        image_type = (
-            bag_messages.COMPRESSED_IMAGE if self._compressed else bag_messages.IMAGE
-        )
-        bag.add_topic(self._image_topic, image_type)
-        bag.add_topic(self._info_topic, bag_messages.CAMERA_INFO)
-        bag.add_topic(self._pose_topic, bag_messages.POSE)
+        bag.add_topic(image_topic, bag_messages.COMPRESSED_IMAGE if is_compressed
+                      else bag_messages.IMAGE)
+        bag.add_topic(info_topic, bag_messages.CAMERA_INFO)
+        bag.add_topic(pose_topic, bag_messages.POSE)
         if detections is not None:
-            bag.add_topic(self._detections_topic, bag_messages.DETECTIONS)
-
-    def add(self, stamp_ns: int, path: Path, map_from_camera: NDArray[np.float64] | None) -> None:
-        """Write one frame."""
-        frame = self._options.camera_frame
-        self._write_image(stamp_ns, path)
-        info = bag_messages.camera_info_message(stamp_ns, frame, self._camera)
-        self._bag.write(self._info_topic, stamp_ns, info)
-        if stamp_ns in self._recorded:
-            boxes = bag_messages.detections_message(stamp_ns, frame, self._recorded[stamp_ns])
-            self._bag.write(self._detections_topic, stamp_ns, boxes)
-            self.detections += 1
-        if map_from_camera is not None:
-            pose = bag_messages.pose_message(stamp_ns, self._options.world_frame, map_from_camera)
-            self._bag.write(self._pose_topic, stamp_ns, pose)
-            self.poses += 1
-
-    def _write_image(self, stamp_ns: int, path: Path) -> None:
-        data = _read_bytes(path)
-        pixels_bgr = _decode(data, path)
-        height, width = pixels_bgr.shape[:2]
-        if (width, height) != (self._camera.width, self._camera.height):
-            raise DatasetError(
-                f'{path}: has {width}x{height} px, but the intrinsics are for '
-                f'{self._camera.width}x{self._camera.height} px'
-            )
-        frame = self._options.camera_frame
-        if self._compressed:
-            codec = _codec(data, path)
-            message = bag_messages.compressed_image_message(stamp_ns, frame, data, codec)
-        else:
-            pixels_rgb = np.asarray(cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            message = bag_messages.image_message(stamp_ns, frame, pixels_rgb)
-        self._bag.write(self._image_topic, stamp_ns, message)
-        self.images += 1
+            bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
+        for stamp_ns, path in progress(
+                list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
+            bag.write(image_topic, stamp_ns,
+                      _image_message(stamp_ns, frame, path, camera, is_compressed))
+            bag.write(info_topic, stamp_ns,
+                      bag_messages.camera_info_message(stamp_ns, frame, camera))
+            if stamp_ns in recorded:
+                bag.write(boxes_topic, stamp_ns, bag_messages.detections_message(
+                    stamp_ns, frame, recorded[stamp_ns]))
+                boxes += 1
+            if (map_from_camera := sequence.pose_at(stamp_ns)) is not None:
+                bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
+                    stamp_ns, options.world_frame, map_from_camera))
+                poses += 1
+    return ConversionResult(len(sequence), poses, boxes)
 
 
-def _read_bytes(path: Path) -> bytes:
+def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
+                   ) -> Any:
+    """Return an image file as message; DatasetError: it is damaged, or of another size."""
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
-
-
-def _decode(data: bytes, path: Path) -> NDArray[np.uint8]:
     # Compressed images are decoded too: this refuses a damaged file before a node receives it.
     try:
         pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -190,11 +134,14 @@ def _decode(data: bytes, path: Path) -> NDArray[np.uint8]:
         pixels_bgr = None  # OpenCV raises for an empty buffer and returns None for a damaged one
     if pixels_bgr is None:
         raise DatasetError(f'{path}: cannot be decoded as an image')
-    return np.asarray(pixels_bgr, dtype=np.uint8)
-
-
-def _codec(data: bytes, path: Path) -> str:
+    height, width = pixels_bgr.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DatasetError(f'{path}: has {width}x{height} px, but the intrinsics are for '
+                           f'{camera.width}x{camera.height} px')
+    if not is_compressed:
+        return bag_messages.image_message(stamp_ns, frame_id, np.asarray(
+            cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8))
     for magic, codec in _CODECS.items():
         if data.startswith(magic):
-            return codec
+            return bag_messages.compressed_image_message(stamp_ns, frame_id, data, codec)
     raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images instead (--raw)')

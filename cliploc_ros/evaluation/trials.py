@@ -25,7 +25,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.datasets.queries import Queries, QueryFrame
+from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.units import NS_PER_S
@@ -115,59 +115,55 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
     # the file does not hold the size of the image, and localizing does not use it
     camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
-    return tuple(Query(number, _observation(frame, camera, columns), frame.map_from_camera)
-                 for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
-
-
-def _observation(frame: QueryFrame, camera: Camera, columns: list[int]) -> Observation:
-    similarities = np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32)
-    return Observation(camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
-                       similarities, frame.stamp_ns)
+    return tuple(
+        Query(number, Observation(
+            camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
+            np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
+            frame.stamp_ns), frame.map_from_camera)
+        for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
 
 
 def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query],
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
-    """Run one trial of a method on some queries.
+    """Run one trial of a method, numbered from 0, on some queries.
 
     Parameters
     ----------
-    trial : int
-        From 0.
     keyframes : KeyframeLocalizer, optional
         Of the map's layer, for methods that use keyframes and queries with features.
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
     on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
-    localize = _localize_on_demand if on_demand else _localize
     results = []
     for query in queries:
         recognizer, spent_ms = None, 0.0
+        observations = [*query.neighbours, query.observation]
         if keyframes is not None and query.image is not None and method.keyframes:
             recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
-        found, crops_share = localize(relocalizer, query, recognizer)
+        if on_demand:
+            found, crops_share = _localize_on_demand(relocalizer, observations, recognizer)
+        else:
+            found = relocalizer.relocalize(observations, recognizer)
+            crops_share = float(method.options.needs_similarities)
         if recognizer is not None and query.image is not None:
             spent_ms = query.image.spent_ms + recognizer.spent_ms
-        results.append(replace(_judge(landmark_map, method.name, trial, query, found, crops_share),
-                               keyframes_ms=spent_ms))
+        results.append(_judge(landmark_map, method.name, trial, query, found, crops_share,
+                              spent_ms))
     return results
 
 
-def _localize(relocalizer: Relocalizer, query: Query, recognizer: ImageRecognizer | None
-              ) -> tuple[Relocalization, float]:
-    """Localize with all crops; return the result and the share of crops compared."""
-    found = relocalizer.relocalize([*query.neighbours, query.observation], recognizer)
-    return found, float(relocalizer.options.needs_similarities)
-
-
-def _localize_on_demand(relocalizer: Relocalizer, query: Query,
+def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
                         recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
-    """Localize as the node does: with each frame after those before it, crops on demand."""
+    """Localize as the node does: with each frame after those before it, crops on demand.
+
+    Return the result and the share of crops that were compared.
+    """
     frames: list[SearchedFrame] = []
-    for observation in (*query.neighbours, query.observation):
+    for observation in observations:
         frame, found = localize_on_demand(
             relocalizer, frames, observation, recorded_crops(observation, relocalizer.options),
-            recognizer=recognizer if observation is query.observation else None)
+            recognizer=recognizer if observation is observations[-1] else None)
         frames.append(frame)
     crops = sum(len(one.observation.detections) for one in frames)
     compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
@@ -175,7 +171,7 @@ def _localize_on_demand(relocalizer: Relocalizer, query: Query,
 
 
 def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
-           found: Relocalization, crops_share: float) -> Result:
+           found: Relocalization, crops_share: float, keyframes_ms: float) -> Result:
     pose = found.map_from_camera
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
@@ -195,4 +191,5 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
         map='' if pose is None else place_of(landmark_map, pose).name,
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
-        keyframe_inliers=0 if found.recognized is None else found.recognized.inliers)
+        keyframe_inliers=0 if found.recognized is None else found.recognized.inliers,
+        keyframes_ms=keyframes_ms)

@@ -23,7 +23,6 @@ from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.frames import read_color, undistorted
 from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.poses import TrajectoryPoses
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections
@@ -85,10 +84,9 @@ def views_of_folder(path: Path) -> PosedDetections:
     if not (path / 'rgb.txt').exists():
         raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
     sequence, camera = read_tum(path), find_camera(None, path)[0]
-    poses = TrajectoryPoses(sequence.trajectory)
     tum_frames(sequence, camera)  # refuses a folder without poses
     posed = [(stamp, pose) for stamp in sequence.stamps_ns
-             if (pose := poses.pose_at(stamp)) is not None]
+             if (pose := sequence.pose_at(stamp)) is not None]
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
     return PosedDetections(

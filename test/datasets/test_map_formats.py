@@ -34,9 +34,8 @@ from cliploc_ros.datasets.map_formats.given_map import (
     place,
     read_class_names,
 )
-from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
 from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
-from cliploc_ros.datasets.map_formats.oaslam import read_oaslam
+from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 from cliploc_ros.datasets.map_formats.table import read_table
 from cliploc_ros.errors import DatasetError
 

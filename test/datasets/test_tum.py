@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.intrinsics import PRESETS, find_camera, read_camera
+from cliploc_ros.datasets.poses import TimedPoses, slerp
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-from cliploc_ros.datasets.trajectory import Trajectory, slerp
 from cliploc_ros.datasets.tum import parse_stamp_ns, read_tum, read_tum_trajectory
 from cliploc_ros.errors import DatasetError
 
@@ -186,7 +186,7 @@ def test_real_poses_agree_with_others_interpolation(shared_data):
 
 
 def test_empty_trajectory_has_no_pose():
-    empty = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 4)))
+    empty = TimedPoses(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 4)))
     assert empty.pose_at(0) is None
 
 

@@ -25,9 +25,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.map_formats.given_map import COCO, Placement, place
-from cliploc_ros.datasets.map_formats.goreloc import read_goreloc
 from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
-from cliploc_ros.datasets.map_formats.oaslam import read_oaslam
+from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 from cliploc_ros.datasets.map_formats.table import read_table
 from cliploc_ros.errors import DatasetError
 

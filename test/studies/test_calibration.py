@@ -15,10 +15,10 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.figures import within_ellipsoid
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.trials import make_queries
-from cliploc_ros.evaluation.trust import within_ellipsoid
 from studies.acceptance.fit import Case, best_recall, fit, judge, outcomes
 
 # a fit begins at the installed influence of the map's size and the vertical
