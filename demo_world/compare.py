@@ -25,11 +25,11 @@ from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import TrueFrame, read_frames
-from cliploc_ros.evaluation.evaluation import compare_methods
 from cliploc_ros.evaluation.methods import parse_methods
-from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.recording import make_queries_of
+from cliploc_ros.evaluation.run import compare_methods
 from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.files.storage import make_folder
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.yolo_detector import YoloDetector

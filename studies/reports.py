@@ -37,7 +37,7 @@ def draw_judged(folder: Path, title: str, judged: Mapping[str, Judged]) -> None:
     """Draw a reliability diagram: reliability.png in a folder."""
     # late, since tables need no matplotlib
     from cliploc_ros.evaluation.figures import add_legend, draw_reliability, new_axes, save_figure
-    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.files.storage import make_folder
 
     make_folder(folder)
     figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')

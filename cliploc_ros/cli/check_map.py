@@ -109,7 +109,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.evaluation.map_check.output import PAGE, write_report
     from cliploc_ros.evaluation.map_check.page import summary_lines
-    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.files.storage import make_folder
     from cliploc_ros.mapping.checking.checking import check_map
 
     begin = time.monotonic()

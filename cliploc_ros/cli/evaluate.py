@@ -8,7 +8,6 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,15 +24,11 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.core.observation import Observation
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
-    from cliploc_ros.evaluation.cases import Observe
     from cliploc_ros.evaluation.methods import Method
     from cliploc_ros.evaluation.trials import Query
 
@@ -152,11 +147,11 @@ def evaluate(options: argparse.Namespace) -> int:
     # imported late, so that --help is fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.evaluation.evaluation import compare_methods
     from cliploc_ros.evaluation.methods import parse_methods
-    from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.recording import with_features
+    from cliploc_ros.evaluation.run import compare_methods
     from cliploc_ros.evaluation.trials import make_queries
+    from cliploc_ros.files.storage import make_folder
     from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
@@ -240,41 +235,26 @@ def _is_case(options: argparse.Namespace) -> bool:
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
     from cliploc_ros.datasets.cases import read_case
-    from cliploc_ros.evaluation.cases import options_of, replay_case, used_keyframes
-
-    case = read_case(options.bag)
-    observe = _with_clip(options, landmark_map) if options_of(case).needs_similarities \
-        else _without_clip
-    wanted = options.keyframes
-    if wanted is None and not used_keyframes(case):
-        wanted = False
-    layer = read_layer(options.map[0], landmark_map, wanted) if len(options.map) == 1 else None
-    replayed = replay_case(case, landmark_map, observe, layer)
-    print(f'{options.bag}: {len(case.frames)} frames, map {case.report.get("map_hash")}\n'
-          f'recorded: {case.report.get("message")}\n'
-          f'again:    {"accepted" if replayed.again else f"refused: {replayed.reason_again}"}\n'
-          f'{"the same verdict" if replayed.is_same else "another verdict"}', flush=True)
-    return 0 if replayed.is_same else 1
-
-
-def _with_clip(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Observe':
-    """Return what compares the crops of a frame with the map."""
+    from cliploc_ros.evaluation.cases import options_of, parameters_of, replay_case
     from cliploc_ros.models.map_rows import load_encoder_for_map
     from cliploc_ros.models.observer import Observer
 
-    observer = Observer(*load_encoder_for_map(
-        clip_options(options), landmark_map, [str(file) for file in options.map],
-        options.landmark_embeddings))
-
-    def observe(image: 'NDArray[np.uint8]', seen: 'Observation') -> 'Observation':
-        similarities = observer.observe(image, seen.camera, seen.detections,
-                                        seen.stamp_ns).similarities
-        return replace(seen, similarities=similarities)
-    return observe
-
-
-def _without_clip(image: 'NDArray[np.uint8]', seen: 'Observation') -> 'Observation':
-    return seen
+    case, observer = read_case(options.bag), None
+    if options_of(case).needs_similarities:
+        observer = Observer(*load_encoder_for_map(
+            clip_options(options), landmark_map, [str(file) for file in options.map],
+            options.landmark_embeddings))
+    wanted = options.keyframes
+    if wanted is None and not parameters_of(case).get('keyframes_file', True):
+        wanted = False
+    layer = read_layer(options.map[0], landmark_map, wanted) if len(options.map) == 1 else None
+    again = replay_case(case, landmark_map, observer, layer)
+    is_same = again.accepted == (case.report.get('found') == 'accepted')
+    print(f'{options.bag}: {len(case.frames)} frames, map {case.report.get("map_hash")}\n'
+          f'recorded: {case.report.get("message")}\n'
+          f'again:    {"accepted" if again.accepted else f"refused: {again.reason}"}\n'
+          f'{"the same verdict" if is_same else "another verdict"}', flush=True)
+    return 0 if is_same else 1
 
 
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,22 +49,12 @@ _Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:
     """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
 
-    Parameters
-    ----------
-    msg : sensor_msgs/Image or sensor_msgs/CompressedImage
-        Of encoding 16UC1, mono16 or 32FC1. 0 or NaN stands for no depth.
-
-    Raises
-    ------
-    ImageError
-        A field is invalid; the message names it.
+    Its encoding is 16UC1, mono16 or 32FC1; 0 or NaN stands for no depth. ImageError: a field is
+    invalid.
     """
-    return _decoded(msg) if isinstance(msg, CompressedImageMessage) else _unpacked(msg)
-
-
-def _unpacked(msg: ImageMessage) -> NDArray[np.generic]:
-    dtype = np.dtype(_TYPES[_checked(msg.encoding)])
-    dtype = dtype.newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
+    if isinstance(msg, CompressedImageMessage):
+        return _decode_depth_png(msg)
+    dtype = _depth_type(msg.encoding).newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
     check_size(msg.width, msg.height)
     used = msg.width * dtype.itemsize
     if msg.step < used or len(msg.data) < msg.step * msg.height:
@@ -74,12 +65,18 @@ def _unpacked(msg: ImageMessage) -> NDArray[np.generic]:
     return pixels.astype(dtype.newbyteorder('='))
 
 
-def _decoded(msg: CompressedImageMessage) -> NDArray[np.generic]:
+def _depth_type(encoding: str) -> np.dtype[Any]:
+    if encoding not in _TYPES:
+        raise ImageError(f"depth encoding '{encoding}' is none of {', '.join(_TYPES)}")
+    return np.dtype(_TYPES[encoding])
+
+
+def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
     encoding, _, transport = (part.strip() for part in msg.format.partition(';'))
     if not transport.startswith('compressedDepth') or transport.endswith('rvl'):
         raise ImageError(f"depth format '{msg.format}' is not 'ENCODING; compressedDepth png': "
                          'record the compressedDepth topic, as PNG')
-    is_inverse = _TYPES[_checked(encoding)] == np.float32
+    is_inverse = _depth_type(encoding) == np.float32
     data = bytes(msg.data)
     check_size(*declared_size(data[_HEADER.size:], msg.format))
     try:
@@ -90,20 +87,13 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.generic]:
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is no PNG of 16 bits "
                          'with one channel')
-    return _from_inverse(values, *_HEADER.unpack_from(data)[1:]) if is_inverse else values
-
-
-def _from_inverse(values: NDArray[np.generic], a: float, b: float) -> NDArray[np.float32]:
+    if not is_inverse:
+        return values
+    _, a, b = _HEADER.unpack_from(data)
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         depths = np.float32(a) / (values.astype(np.float32) - np.float32(b))
     depths[values == 0] = np.nan
     return depths
-
-
-def _checked(encoding: str) -> str:
-    if encoding not in _TYPES:
-        raise ImageError(f"depth encoding '{encoding}' is none of {', '.join(_TYPES)}")
-    return encoding
 
 
 @dataclass(frozen=True)
@@ -135,16 +125,7 @@ def pose_sources(bag: Path) -> list[str]:
 
 def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                depth: DepthFormat | None = None) -> Frames:
-    """Return the frames of a recording.
-
-    Parameters
-    ----------
-    bag : Path
-        A rosbag2 folder or file.
-    read_poses : callable
-        Makes the poses of the open recording.
-    depth : DepthFormat, optional
-        How depth images are to be read.
+    """Return the frames of a recording, a rosbag2 folder or file.
 
     Raises
     ------
@@ -176,10 +157,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
     """Return the poses of a recording's camera by odometry.
 
-    Raises
-    ------
-    DatasetError
-        The topic or tf is missing or broken, or of another time than the images.
+    DatasetError: the topic or tf is missing or broken, or of another time than the images.
     """
     with BagReader(bag) as reader:
         return _poses_of_images(reader, image_topic, read_odometry, f'{bag}: odometry')
@@ -197,12 +175,8 @@ def _poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses,
 def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
     """Return the images of a recording, to be read in any order.
 
-    The recording is read once, for the stamps.
-
-    Raises
-    ------
-    DatasetError
-        A topic is missing, of another type, or empty.
+    The recording is read once, for the stamps. DatasetError: a topic is missing, of another type,
+    or empty.
     """
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
@@ -228,10 +202,7 @@ class BagImages:
     def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
         """Return an image (h, w, 3), red first, and its camera.
 
-        Raises
-        ------
-        DatasetError
-            It cannot be decoded, or the recording changed.
+        DatasetError: it cannot be decoded, or the recording changed.
         """
         taken_ns, recorded_ns = self.times_ns[place].tolist()
         with BagReader(self.bag) as reader:
@@ -257,6 +228,13 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
     """Yield the wanted images, each with the depth image nearest in time, or None."""
     waiting: deque[_Selected] = deque()
     depths: deque[tuple[int, bytes]] = deque(maxlen=2 * _MAX_WAITING)
+
+    def with_depth(selected: _Selected) -> _Selected:
+        at_ns = selected[1]
+        nearest = min(depths, key=lambda depth: abs(depth[0] - at_ns), default=None)
+        if nearest is None or abs(nearest[0] - at_ns) > _MAX_DEPTH_DELAY_NS:
+            return selected
+        return (*selected[:4], nearest[1])
     place = 0
     for recorded in reader.messages([topics.image, *([topics.depth] if topics.depth else [])]):
         stamp_ns = _peek_stamp_ns(recorded)
@@ -269,17 +247,8 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
             place += 1
         while waiting and (not topics.depth or len(waiting) > _MAX_WAITING
                            or (depths and depths[-1][0] >= waiting[0][1] + _MAX_DEPTH_DELAY_NS)):
-            yield _with_depth(waiting.popleft(), depths)
-    for selected in waiting:
-        yield _with_depth(selected, depths)
-
-
-def _with_depth(selected: _Selected, depths: deque[tuple[int, bytes]]) -> _Selected:
-    stamp_ns = selected[1]
-    nearest = min(depths, key=lambda depth: abs(depth[0] - stamp_ns), default=None)
-    if nearest is None or abs(nearest[0] - stamp_ns) > _MAX_DEPTH_DELAY_NS:
-        return selected
-    return (*selected[:4], nearest[1])
+            yield with_depth(waiting.popleft())
+    yield from map(with_depth, waiting)
 
 
 def _peek_stamp_ns(recorded: BagMessage) -> int:

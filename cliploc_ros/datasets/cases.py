@@ -3,8 +3,8 @@
 """A request as a recording: what the relocalizer saw, what it knew, and what it answered."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,19 +76,27 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
     """
     image_type = case.frames[-1].image_type
     image = '/image' if image_type == IMAGE else '/image/compressed'
+    types = typestore().types
     with BagWriter(path, storage) as writer:
         for topic, msgtype in ((image, image_type), (_CAMERA_INFO, CAMERA_INFO),
                                (_DETECTIONS, DETECTIONS), (_CAMERA, POSE), (_UP, _VECTOR),
                                (VERDICT, _TEXT)):
             writer.add_topic(topic, msgtype)
         for frame in case.frames:
-            # the image last: it completes a frame for who replays the recording
-            for topic, data in ((_CAMERA_INFO, frame.camera_info),
-                                (_DETECTIONS, frame.detections), (image, frame.image),
-                                *_state_messages(frame)):
-                writer.write(topic, frame.stamp_ns, data)
-        text = typestore().types[_TEXT](data=json.dumps(dict(case.report)))
-        writer.write(VERDICT, case.frames[-1].stamp_ns, text)
+            stamp = frame.stamp_ns
+            # the image last: it completes a frame for a node that replays the recording
+            writer.write(_CAMERA_INFO, stamp, frame.camera_info)
+            writer.write(_DETECTIONS, stamp, frame.detections)
+            writer.write(image, stamp, frame.image)
+            if frame.odom_from_camera is not None:
+                writer.write(_CAMERA, stamp, pose_message(stamp, 'odom', frame.odom_from_camera))
+            if frame.up_in_camera is not None:
+                x, y, z = map(float, frame.up_in_camera)
+                writer.write(_UP, stamp, types[_VECTOR](
+                    header=frame.message('camera_info').header,
+                    vector=types['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)))
+        writer.write(VERDICT, case.frames[-1].stamp_ns,
+                     types[_TEXT](data=json.dumps(dict(case.report))))
 
 
 def is_case(path: Path) -> bool:
@@ -114,32 +122,29 @@ def read_case(path: Path) -> Case:
         images = _by_stamp(reader, topics[0])
         others = {name: _by_stamp(reader, name)
                   for name in (_CAMERA_INFO, _DETECTIONS, _CAMERA, _UP)}
-        text = next(reader.messages([VERDICT]))
-        report = _parsed(reader.deserialize(text).data, path)
+        text = reader.deserialize(next(reader.messages([VERDICT]))).data
+    try:
+        report = json.loads(text)
+    except ValueError as error:
+        raise DatasetError(f'{path}: {VERDICT} is no JSON: {error}') from error
+    if not isinstance(report, dict):
+        raise DatasetError(f'{path}: {VERDICT} must be a mapping')
     frames = []
     for stamp, image in sorted(images.items()):
         if not (stamp in others[_CAMERA_INFO] and stamp in others[_DETECTIONS]):
             raise DatasetError(f'{path}: the image of {stamp} ns has no camera_info or detections')
-        data = others[_CAMERA].get(stamp)
-        pose_of = None if data is None else map_from_camera_of(deserialize(data, POSE, _CAMERA))
-        frames.append(CaseFrame(
-            stamp, image_type, image, others[_CAMERA_INFO][stamp], others[_DETECTIONS][stamp],
-            _up_of(others[_UP].get(stamp)), pose_of))
+        frame = CaseFrame(
+            stamp, image_type, image, others[_CAMERA_INFO][stamp], others[_DETECTIONS][stamp])
+        if (data := others[_UP].get(stamp)) is not None:
+            vector = deserialize(data, _VECTOR, _UP).vector
+            frame = replace(frame, up_in_camera=np.array([vector.x, vector.y, vector.z]))
+        if (data := others[_CAMERA].get(stamp)) is not None:
+            frame = replace(frame, odom_from_camera=map_from_camera_of(
+                deserialize(data, POSE, _CAMERA)))
+        frames.append(frame)
     if not frames:
         raise DatasetError(f'{path}: {topics[0]} has no messages')
     return Case(tuple(frames), report)
-
-
-def _state_messages(frame: CaseFrame) -> Sequence[tuple[str, Any]]:
-    messages: list[tuple[str, Any]] = []
-    if frame.odom_from_camera is not None:
-        messages.append((_CAMERA, pose_message(frame.stamp_ns, 'odom', frame.odom_from_camera)))
-    if frame.up_in_camera is not None:
-        info = frame.message('camera_info')
-        x, y, z = map(float, frame.up_in_camera)
-        vector = typestore().types['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)
-        messages.append((_UP, typestore().types[_VECTOR](header=info.header, vector=vector)))
-    return messages
 
 
 def _by_stamp(reader: BagReader, name: str) -> dict[int, bytes]:
@@ -147,20 +152,3 @@ def _by_stamp(reader: BagReader, name: str) -> dict[int, bytes]:
     if name not in reader.topics:
         return {}
     return {one.stamp_ns: one.data for one in reader.messages([name])}
-
-
-def _parsed(text: str, path: Path) -> Mapping[str, Any]:
-    try:
-        report = json.loads(text)
-    except ValueError as error:
-        raise DatasetError(f'{path}: {VERDICT} is no JSON: {error}') from error
-    if not isinstance(report, dict):
-        raise DatasetError(f'{path}: {VERDICT} must be a mapping')
-    return report
-
-
-def _up_of(data: bytes | None) -> NDArray[np.float64] | None:
-    if data is None:
-        return None
-    vector = deserialize(data, _VECTOR, _UP).vector
-    return np.array([vector.x, vector.y, vector.z])

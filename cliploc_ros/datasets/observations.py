@@ -14,21 +14,15 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
-from cliploc_ros.datasets.queries import RIGID
+from cliploc_ros.datasets.queries import FRAME_FIELDS
 from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.files.arrays import BOX, FINITE, SHARE, Arrays, Check, Field, Offsets, Schema
+from cliploc_ros.files.arrays import FINITE, Arrays, Check, Field, Schema
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
 # F frames, n boxes, d numbers of an embedding.
 _SCHEMA = Schema('observation file', {
-    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE,)),
+    **FRAME_FIELDS,
     'image_size': Field('integers', (2,)),
-    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
-    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
-    'class_ids': Field('text', ('n',)),
-    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
-    'timestamps': Field('numbers', ('F',), (FINITE,)),
-    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, RIGID)),
     # NaN where unknown
     'depths': Field('floats', ('n',), (Check('is not positive', lambda depths: depths <= 0.0),),
                     is_optional=True),
@@ -41,13 +35,13 @@ _SCHEMA = Schema('observation file', {
     'odom_from_camera': Field('floats', ('F', 4, 4), (Check(
         'is no rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
-    'stamps_ns': Field('integers', ('F',), is_optional=True),
-    'detector_ms': Field('floats', ('F',), is_optional=True),
-    'clip_ms': Field('floats', ('F',), is_optional=True),
     'image_counts': Field('integers', (2,), is_optional=True),
     'described': Field('text', is_optional=True),
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
+
+# Of PosedDetections
+_OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges')
 
 
 @dataclass(frozen=True)
@@ -71,11 +65,6 @@ def load_observations(path: str | Path) -> PosedDetections:
     Frames are put in the order of time. A frame may lack boxes; a file may lack frames with
     boxes only if mapping is told so later.
 
-    Parameters
-    ----------
-    path : str or Path
-        An npz file without pickles.
-
     Raises
     ------
     DatasetError
@@ -86,12 +75,37 @@ def load_observations(path: str | Path) -> PosedDetections:
 
 def load_recorded(path: str | Path) -> Recorded:
     """Read and validate an observation file, and how it came about; see load_observations."""
-    path = Path(path)
-    arrays = _SCHEMA.read(path)
+    arrays = _SCHEMA.read(Path(path))
+    width, height = map(int, arrays['image_size'])
     try:
-        return _make_recorded(arrays)
+        fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
+        camera = Camera(width, height, fx, fy, cx, cy)
     except CameraError as error:
-        raise _SCHEMA.invalid(path, error) from error
+        raise _SCHEMA.invalid(Path(path), error) from error
+    names, classes = np.unique(arrays['class_ids'], return_inverse=True)
+    detections = PosedDetections(
+        camera=camera, map_from_camera=arrays['map_from_camera'].astype(np.float64),
+        stamps_s=arrays['timestamps'].astype(np.float64),
+        frame_offsets=arrays['frame_offsets'].astype(np.int64),
+        bboxes_xyxy=arrays['boxes_xyxy'].astype(np.float64),
+        class_names=tuple(map(str, names)), classes=classes.astype(np.int64).reshape(-1),
+        scores=arrays['scores'].astype(np.float64),
+        encoder_key=str(arrays.get('encoder_key', '')),
+        odom_from_camera=(arrays['odom_from_camera'].astype(np.float64)
+                          if 'odom_from_camera' in arrays else None),
+        **{name: arrays.get(name) for name in _OPTIONAL if name != 'odom_from_camera'})
+    order = np.argsort(detections.stamps_s, kind='stable')
+    if (order != np.arange(len(order))).any():
+        detections = detections.select_frames(order)
+    frames = len(order)
+    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
+    rounded = np.round(arrays['timestamps'] * 1e6).astype(np.int64) * 1000
+    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
+                            for name in ('detector_ms', 'clip_ms'))
+    images, without_pose = arrays.get('image_counts', (frames, 0))
+    return Recorded(
+        detections, arrays.get('stamps_ns', rounded).astype(np.int64)[order], detector_ms,
+        clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
 
 
 def save_observations(path: str | Path, detections: PosedDetections) -> None:
@@ -126,7 +140,7 @@ def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
         'map_from_camera': detections.map_from_camera,
         'timestamps': detections.stamps_s,
     }
-    for name in ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges'):
+    for name in _OPTIONAL:
         if (values := getattr(detections, name)) is not None:
             arrays[name] = values
     if detections.encoder_key:
@@ -137,39 +151,3 @@ def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
 def _write(path: Path, arrays: Arrays) -> None:
     # embeddings do not compress, and take minutes to try
     _SCHEMA.write(path, arrays, compress='embeddings' not in arrays)
-
-
-def _make_recorded(arrays: dict[str, NDArray[Any]]) -> Recorded:
-    detections = _make_detections(arrays)
-    order = np.argsort(detections.stamps_s, kind='stable')
-    if (order != np.arange(len(order))).any():
-        detections = detections.select_frames(order)
-    frames = len(order)
-    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
-    rounded = np.round(arrays['timestamps'] * 1e6).astype(np.int64) * 1000
-    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
-                            for name in ('detector_ms', 'clip_ms'))
-    images, without_pose = arrays.get('image_counts', (frames, 0))
-    return Recorded(
-        detections, arrays.get('stamps_ns', rounded).astype(np.int64)[order], detector_ms,
-        clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
-
-
-def _make_detections(arrays: dict[str, NDArray[Any]]) -> PosedDetections:
-    width, height = map(int, arrays['image_size'])
-    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
-    names, classes = np.unique(arrays['class_ids'], return_inverse=True)
-    return PosedDetections(
-        camera=Camera(width, height, fx, fy, cx, cy),
-        map_from_camera=arrays['map_from_camera'].astype(np.float64),
-        stamps_s=arrays['timestamps'].astype(np.float64),
-        frame_offsets=arrays['frame_offsets'].astype(np.int64),
-        bboxes_xyxy=arrays['boxes_xyxy'].astype(np.float64),
-        class_names=tuple(str(name) for name in names),
-        classes=classes.astype(np.int64).reshape(-1),
-        scores=arrays['scores'].astype(np.float64),
-        depths=arrays.get('depths'), depth_spreads=arrays.get('depth_spreads'),
-        embeddings=arrays.get('embeddings'), encoder_key=str(arrays.get('encoder_key', '')),
-        odom_from_camera=(arrays['odom_from_camera'].astype(np.float64)
-                          if 'odom_from_camera' in arrays else None),
-        open_edges=arrays.get('open_edges'))

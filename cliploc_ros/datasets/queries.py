@@ -28,9 +28,22 @@ from cliploc_ros.files.arrays import (
 )
 from cliploc_ros.units import NS_PER_S
 
-#: A check of poses (n, 4, 4).
-RIGID = Check('is no rigid transform', lambda poses: ~are_rigid(poses))
 _STAGES = ('detector_ms', 'clip_ms')
+#: Of files of frames with boxes: F frames, n boxes.
+FRAME_FIELDS = {
+    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE,)),
+    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
+    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
+    'class_ids': Field('text', ('n',)),
+    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
+    'timestamps': Field('numbers', ('F',), (FINITE,)),
+    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, Check(
+        'is no rigid transform', lambda poses: ~are_rigid(poses)))),
+    # exact, which a float64 of seconds is not [ns]
+    'stamps_ns': Field('integers', ('F',), is_optional=True),
+    # time that the networks took [ms], NaN where unknown
+    **dict.fromkeys(_STAGES, Field('numbers', ('F',), is_optional=True)),
+}
 
 
 def _check_truth(name: str, arrays: Arrays) -> None:
@@ -55,26 +68,19 @@ def _check_groups(name: str, arrays: Arrays) -> None:
 # F frames, n boxes, L landmarks.
 _SCHEMA = Schema('query file', {
     'landmark_ids': Field('text', ('L',), (UNIQUE, Check('is empty', lambda ids: ids == ''))),
+    **FRAME_FIELDS,
     'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE, Check(
         'is a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
-    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
-    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
-    'class_ids': Field('text', ('n',)),
-    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
     # half precision rounds some cosines to just above 1
     'similarities': Field('numbers', ('n', 'L'), (FINITE, Check(
         'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
     'true_landmark': Field('integers', ('n',), (_check_truth,)),
     'timestamps': Field('numbers', ('F',), (
         FINITE, Check('is negative', lambda seconds: seconds < 0))),
-    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, RIGID)),
     'query_group': Field('integers', ('F',)),
     'is_main': Field('booleans', ('F',), (_check_groups,)),
-    # exact, which a float64 of seconds is not [ns]
     'stamps_ns': Field('integers', ('F',), (_check_stamps,), is_optional=True),
-    # time that the networks took [ms], NaN where unknown
-    **dict.fromkeys(_STAGES, Field('numbers', ('F',), is_optional=True)),
 }, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
 
 
@@ -136,15 +142,13 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
 
     Parameters
     ----------
-    path : str or Path
-        An npz file without pickles.
     landmark_ids : collection of str, optional
         The map's landmarks; the file must contain no others.
 
     Raises
     ------
     DatasetError
-        If the file is invalid; the message names file, array and error.
+        Names file, array and error.
     """
     path = Path(path)
     arrays = _SCHEMA.read(path)

@@ -31,7 +31,7 @@ from cliploc_ros.demo.processes import (
 )
 from cliploc_ros.demo.review import Judged, Reviewer, judge
 from cliploc_ros.demo.robot import Robot
-from cliploc_ros.evaluation.output import make_folder
+from cliploc_ros.files.storage import make_folder
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The first start compiles the kernels of the search.

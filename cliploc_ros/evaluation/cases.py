@@ -3,12 +3,9 @@
 """Answer a recorded request again, without ROS: a failure in the field as a test case."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
@@ -20,29 +17,13 @@ from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.bag_messages import detections_of
-from cliploc_ros.datasets.cases import Case, CaseFrame
+from cliploc_ros.datasets.cases import Case
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.messages import camera_from_msg, image_from_msg
-
-#: Takes an image (h, w, 3), red first, and an observation; returns it with its similarities.
-Observe = Callable[[NDArray[np.uint8], Observation], Observation]
-
-
-class Replayed(NamedTuple):
-    """A recorded answer and the one that was found again."""
-
-    accepted: bool
-    again: bool
-    #: Empty where accepted
-    reason: str
-    reason_again: str
-
-    @property
-    def is_same(self) -> bool:
-        """Return whether the verdict is the same."""
-        return self.accepted == self.again
+from cliploc_ros.models.observer import Observer
 
 
 def options_of(case: Case) -> RelocalizerOptions:
@@ -63,23 +44,23 @@ def options_of(case: Case) -> RelocalizerOptions:
         raise DatasetError(f'the options of this case are broken: {error}') from error
 
 
-def used_keyframes(case: Case) -> bool:
-    """Return whether the relocalizer was to use keyframes, if it had some.
-
-    Raises
-    ------
-    DatasetError
-        The case does not hold its parameters.
-    """
-    return bool(_parameters(case).get('keyframes_file', True))
+def parameters_of(case: Case) -> Mapping[str, Any]:
+    """Return the parameters that a case was recorded with; DatasetError: some are missing."""
+    parameters = case.report.get('parameters')
+    needed = {'rectified', 'class_map', 'max_detections', 'fuse_frames', 'fuse_window_s'}
+    if not isinstance(parameters, dict) or not needed <= parameters.keys():
+        raise DatasetError(f'the parameters of this case are broken: it needs {sorted(needed)}')
+    return parameters
 
 
-def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
-                layer: KeyframeLayer | None = None) -> Replayed:
+def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None,
+                layer: KeyframeLayer | None = None) -> Relocalization:
     """Answer a case again with a map: as it was recorded, or with another one.
 
     Parameters
     ----------
+    observer : Observer, optional
+        Compares the crops of a frame with the map, where the options need it.
     layer : KeyframeLayer, optional
         Keyframes of the map.
 
@@ -88,15 +69,30 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
     CliplocError
         A message or the report is broken.
     """
-    options, parameters = options_of(case), _parameters(case)
+    options, parameters = options_of(case), parameters_of(case)
     session = Localizer(Relocalizer(landmark_map, options))
     keyframes = None if layer is None else KeyframeLocalizer(layer)
+    pairs = (pair.partition('=') for pair in parameters['class_map'].split(',') if pair.strip())
+    names = {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
     found = None
     for frame in case.frames:
-        image, seen = _seen(frame, parameters)
+        # as the node makes it
+        image = image_from_msg(frame.message('image'))
+        height, width = image.shape[:2]
+        camera = camera_from_msg(frame.message('camera_info'), (width, height),
+                                 parameters['rectified'])
+        detections = detections_of(frame.message('detections'))
+        detections = replace(detections, class_ids=tuple(
+            names.get(name, name) for name in detections.class_ids)
+            ).usable(width, height, parameters['max_detections'])
+        observation = Observation(camera, detections, stamp_ns=frame.stamp_ns,
+                                  up_in_camera=frame.up_in_camera,
+                                  odom_from_camera=frame.odom_from_camera)
         recognizer = None if keyframes is None else ImageRecognizer(
-            keyframes, query_features(image), seen.camera)
-        observation = observe(image, seen)
+            keyframes, query_features(image), camera)
+        if observer is not None:
+            observation = replace(observation, similarities=observer.observe(
+                image, camera, detections, frame.stamp_ns).similarities)
         crops = recorded_crops(observation, options)
         if observation.odom_from_camera is None:
             found = session.localize(observation, crops=crops, recognizer=recognizer)
@@ -104,33 +100,4 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observe: Observe,
             found = session.localize(observation, 0, parameters['fuse_frames'],
                                      parameters['fuse_window_s'], crops, recognizer)
     assert found is not None  # a case has a frame
-    accepted = case.report.get('found') == 'accepted'
-    reason = '' if accepted else str(case.report.get('reason', '')).rpartition(' [')[0]
-    return Replayed(accepted, found.accepted, reason, found.reason)
-
-
-def _seen(frame: CaseFrame, parameters: Mapping[str, Any]
-          ) -> tuple[NDArray[np.uint8], Observation]:
-    """Return the image and the observation of a frame, as the node makes it."""
-    image = image_from_msg(frame.message('image'))
-    height, width = image.shape[:2]
-    camera = camera_from_msg(frame.message('camera_info'), (width, height),
-                             parameters['rectified'])
-    detections = detections_of(frame.message('detections'))
-    text = parameters['class_map']
-    pairs = (pair.partition('=') for pair in text.split(',') if pair.strip())
-    names = {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
-    detections = replace(detections, class_ids=tuple(
-        names.get(name, name) for name in detections.class_ids))
-    return image, Observation(
-        camera, detections.usable(width, height, parameters['max_detections']),
-        stamp_ns=frame.stamp_ns, up_in_camera=frame.up_in_camera,
-        odom_from_camera=frame.odom_from_camera)
-
-
-def _parameters(case: Case) -> Mapping[str, Any]:
-    parameters = case.report.get('parameters')
-    needed = {'rectified', 'class_map', 'max_detections', 'fuse_frames', 'fuse_window_s'}
-    if not isinstance(parameters, dict) or not needed <= parameters.keys():
-        raise DatasetError(f'the parameters of this case are broken: it needs {sorted(needed)}')
-    return parameters
+    return found

@@ -19,9 +19,9 @@ from scipy.stats import chi2
 from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.methods import PAPER_METHODS
-from cliploc_ros.evaluation.output import write_file
 from cliploc_ros.evaluation.summary import Summary, find_best, wilson_interval
 from cliploc_ros.evaluation.trials import Query, Result
+from cliploc_ros.files.storage import write_file
 
 #: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)

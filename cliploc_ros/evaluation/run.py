@@ -1,28 +1,49 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""All trials of all methods on all queries, on all cores or on a cluster."""
+"""Methods compared: all trials on all queries, on all cores or on a cluster, and the files."""
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
-from itertools import batched
+from dataclasses import asdict, dataclass, replace
+from itertools import batched, chain
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.datasets.queries import QueryFrame
+from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.evaluation.methods import Method
+from cliploc_ros.evaluation.summary import (
+    Summary,
+    as_csv,
+    as_json,
+    as_markdown,
+    as_text,
+    notes,
+    summarize,
+    table_rows,
+)
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
+from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import MakeWork, run_tasks
+from cliploc_ros.files.storage import make_folder, write_text
+from cliploc_ros.units import NS_PER_S
 
 # A stopped run loses at most this many queries of each core.
 _QUERIES_A_PART = 8
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+# Separates the name of a method from a number of iterations.
+_AT = '@'
 
 
 class RunError(CliplocError):
@@ -60,11 +81,6 @@ class _Part(NamedTuple):
     method: Method
     trial: int
     places: tuple[int, ...]
-
-    @property
-    def name(self) -> str:
-        """Return what it is, for a message."""
-        return f'{self.method.name}, trial {self.trial}, rows {self.places[0]}-{self.places[-1]}'
 
 
 def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
@@ -122,9 +138,11 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
                 results += found
                 advance(found)
     if lost:
+        first = lost[0]
         raise RunError(f'workers died again and again at {len(lost)} of {len(parts)} parts, first '
-                       f'at {lost[0].name}; the others are done: continue with --resume and fewer '
-                       '--workers')
+                       f'at {first.method.name}, trial {first.trial}, rows {first.places[0]}-'
+                       f'{first.places[-1]}; the others are done: continue with --resume and '
+                       'fewer --workers')
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda one: (order[one.method], one.trial, one.query))
 
@@ -153,3 +171,179 @@ class _MakeSearch:
             return run_trial(self.landmark_map, part.method, part.trial,
                              [queries[place] for place in part.places], keyframes)
         return run
+
+
+def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
+                    methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
+                    resume: bool = False, figures: bool = True,
+                    frames: Sequence[QueryFrame] = (), **running: Any) -> list[Summary]:
+    """Run methods, print the table, write all files to a folder; return their summaries.
+
+    Parameters
+    ----------
+    out : Path
+        An existing folder.
+    sweep : sequence of int
+        Further numbers of iterations for each sampling method, for a figure.
+    resume : bool
+        Continue an unfinished run.
+    frames : sequence of QueryFrame
+        Frames of the query file, for the times of detector and CLIP.
+    running
+        trials, workers, scheduler, layer, noisy: see run_methods.
+
+    Raises
+    ------
+    CliplocError
+        The run cannot be resumed, or a file cannot be written.
+    """
+    swept = [replace(one, name=f'{one.name}{_AT}{count}',
+                     options=replace(one.options, iterations=count))
+             for one in methods if not one.draws_nothing
+             for count in sweep if figures and count != one.options.iterations]
+    everything = [*methods, *swept]
+    unfinished = out / 'unfinished.jsonl'
+    if unfinished.exists() and not resume:
+        raise OptionsError(f'{out} holds an unfinished run; continue with --resume, give '
+                           f'another --out, or remove {unfinished}')
+    total = len(queries) * sum(
+        count_trials(one, running['trials'], bool(running.get('noisy'))) for one in everything)
+    run = describe(landmark_map, queries, everything, running['trials'], running.get('layer'),
+                   running.get('noisy', ()))
+    with closing(Log(unfinished, OptionsError, 'make room and continue with --resume')) as log:
+        done = read_results(log, run)
+        with tqdm(total=total, initial=len(done), unit='search', disable=None) as bar:
+            def advance(results: list[Result]) -> None:
+                log.append([result.as_dict() for result in results])
+                bar.update(len(results))
+
+            results = run_methods(landmark_map, everything, queries, done=done, advance=advance,
+                                  **running)
+        own = [one for one in results if _AT not in one.method]
+        summaries = summarize(own)
+        rows = table_rows(summaries)
+        write_trajectories(out / 'trajectories', queries, own)
+        remarks = notes(summaries)
+        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
+        write_text(out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
+        write_text(out / 'results.json', as_json(own))
+        write_text(out / 'summary.csv', as_csv(summaries))
+        if figures:
+            _draw(out, parts_of(landmark_map)[0].landmark_map, queries, own, summaries,
+                  _by_count(summarize(results), methods), frames)
+        log.remove()
+    print(f'results: {out.resolve()}', flush=True)
+    return summaries
+
+
+def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
+    """Return the results of an unfinished run, or begin the log of a new one.
+
+    Parameters
+    ----------
+    run : mapping
+        Description of the run, as JSON keeps it.
+
+    Raises
+    ------
+    OptionsError
+        The log belongs to another run (names what differs), or is damaged.
+    """
+    entries, is_damaged = log.read()
+    if not (entries or is_damaged):
+        log.append(run)
+        return []
+    try:
+        if is_damaged:
+            raise ValueError('a line in its middle cannot be read')
+        begun, *parts = entries
+        differing = [key for key in run if begun.get(key) != run[key]]
+        done = [Result(**fields) for part in parts for fields in part]
+    except (ValueError, TypeError, AttributeError) as error:
+        raise OptionsError(f'{log.path}: is damaged; remove it to start again') from error
+    if differing:
+        raise OptionsError(f'{log.path}: was begun with another {" and ".join(differing)}; '
+                           'give the same, or remove it to start again')
+    return done
+
+
+def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Sequence[Method],
+             trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[Query]]
+             ) -> dict[str, Any]:
+    """Return what identifies a run, as JSON keeps it."""
+    digest = hashlib.sha256()
+    for query in chain(queries, *noisy):
+        for one in (*query.neighbours, query.observation):
+            for part in (one.similarities, one.detections.bboxes_xyxy):
+                digest.update(np.ascontiguousarray(part).tobytes())
+            digest.update(repr((one.detections.class_ids, one.up_in_camera,
+                                one.odom_from_camera)).encode())
+        digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
+        digest.update(repr(query.number).encode())
+    world = hashlib.sha256(repr((landmark_map.landmark_ids, landmark_map.class_ids,
+                                 landmark_map.classes.members.tolist(),
+                                 landmark_map.centers.tolist(),
+                                 landmark_map.shapes.tolist())).encode())
+    run = {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': trials,
+           'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
+                       for one in methods}, 'keyframes': None}
+    if layer is not None:
+        digest = hashlib.sha256()
+        for query in queries:
+            if query.image is not None:
+                digest.update(query.image.features.descriptors.tobytes())
+        for array in (layer.map_from_camera, layer.points, layer.descriptors):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        run['keyframes'] = {'digest': digest.hexdigest(),
+                            'methods': [one.name for one in methods if one.keyframes]}
+    return run
+
+
+def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+          results: Sequence[Result], summaries: Sequence[Summary],
+          sweep: dict[str, dict[int, Summary]], frames: Sequence[QueryFrame]) -> None:
+    try:
+        from cliploc_ros.evaluation.figures import draw_all
+    except ImportError as error:
+        print(f'no figures: {error}; install matplotlib', flush=True)
+        return
+    observing = {stage: np.array([getattr(frame, name) for frame in frames])
+                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
+    draw_all(out, landmark_map, queries, results, summaries, sweep,
+             {stage: float(np.nanmean(times)) for stage, times in observing.items()
+              if np.isfinite(times).any()})
+
+
+def _by_count(summaries: Sequence[Summary], methods: Sequence[Method]
+              ) -> dict[str, dict[int, Summary]]:
+    """Return the summaries of each sampling method, by their number of iterations."""
+    counts: dict[str, dict[int, Summary]] = {}
+    iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
+    for one in summaries:
+        name, _, count = one.method.partition(_AT)
+        if name in iterations:
+            counts.setdefault(name, {})[int(count or iterations[name])] = one
+    return {name: dict(sorted(found.items())) for name, found in counts.items()
+            if len(found) > 1}
+
+
+def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:
+    """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial."""
+    make_folder(folder)
+    write_text(folder / 'ground_truth.txt', _tum_text(
+        (query.observation.stamp_ns / NS_PER_S, query.map_from_camera) for query in queries))
+    for method in dict.fromkeys(result.method for result in results):
+        found = [(one, np.array(one.map_from_camera)) for one in results
+                 if one.method == method and one.trial == 0 and one.solved]
+        write_text(folder / f'{method}.txt',
+                   _tum_text((one.timestamp, pose) for one, pose in found))
+        write_text(folder / f'{method}.accepted.txt',
+                   _tum_text((one.timestamp, pose) for one, pose in found if one.accepted))
+
+
+def _tum_text(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> str:
+    lines = ['# timestamp tx ty tz qx qy qz qw']
+    for timestamp, pose in sorted(poses, key=lambda one: one[0]):
+        numbers = [*pose[:3, 3], *quaternion_from_transform(pose)]
+        lines.append(' '.join([f'{timestamp:.6f}', *(f'{number:.9f}' for number in numbers)]))
+    return '\n'.join(lines) + '\n'

@@ -8,10 +8,12 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+
+from cliploc_ros.errors import OptionsError
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +44,41 @@ def replace_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path) -> None:
+    """Create the output folder and its parents.
+
+    Raises
+    ------
+    OptionsError
+        The folder cannot be created or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f'.{os.getpid()}.probe'
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OptionsError(f'--out {folder}: cannot be written to: {error.strerror}') from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file in one step; OptionsError: it cannot be written, and nothing is left."""
+    write_file(path, lambda partial: partial.write_text(text, encoding='utf-8'))
+
+
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Let a function write a file, which gets its name only when it is complete.
+
+    The function takes the path to write to, which has the suffix of the file. OptionsError: the
+    file cannot be written, and nothing is left.
+    """
+    try:
+        with replace_file(path) as partial:
+            write(partial)
+    except OSError as error:
+        raise OptionsError(f'{path}: cannot be written: {error.strerror}') from error
 
 
 def resolve_cache_dir(cache_dir: str) -> Path:

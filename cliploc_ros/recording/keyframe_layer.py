@@ -89,9 +89,10 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         camera = camera or frame.camera.pinhole
         seen.append(_look(frame, options))
     images = [one.posed for one in seen]
-    points = [_points(images, row, one.depths)
-              for row, one in enumerate(seen)]
-    kept = [_strongest(found, options.most_points) for found in points]
+    points = [_points(images, row, one.depths) for row, one in enumerate(seen)]
+    # the strongest features that have a point
+    kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
+            for found in points]
     rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
     if camera is None or not rows:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
@@ -101,7 +102,11 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                       [points[row] for row in rows], [kept[row] for row in rows],
                       FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
                       else TRIANGULATED)
-    return _with_images(layer, [seen[row].jpeg for row in rows]) if options.images else layer
+    if not options.images:
+        return layer
+    jpegs = [seen[row].jpeg for row in rows]
+    return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
+                   image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
@@ -155,11 +160,6 @@ def _small_jpeg(frame: Frame) -> bytes:
     return bytes(content)
 
 
-def _with_images(layer: KeyframeLayer, jpegs: Sequence[bytes]) -> KeyframeLayer:
-    return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
-                   image_offsets=np.cumsum([0, *map(len, jpegs)]))
-
-
 def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float64]
             ) -> NDArray[np.float64]:
     """Return the points (n, 3) of a keyframe in its own coordinate frame; NaN where unknown."""
@@ -167,11 +167,6 @@ def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float6
         bearings = images[row].bearings
         return np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
     return triangulate(images, row)
-
-
-def _strongest(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Return the rows of the strongest features that have a point."""
-    return np.nonzero(np.isfinite(points).all(axis=1))[0][:most]
 
 
 def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedFeatures],

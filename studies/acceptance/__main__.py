@@ -21,8 +21,8 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.run import run_all
+from cliploc_ros.files.storage import make_folder
 from studies.acceptance import fit
 from studies.acceptance.looks import (
     LOOKS,

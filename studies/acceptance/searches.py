@@ -134,8 +134,8 @@ def draw_curves(folder: Path, outcomes: Sequence[Outcome]) -> Path:
     from matplotlib.figure import Figure
 
     from cliploc_ros.evaluation.figures import save_figure
-    from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.summary import wilson_interval
+    from cliploc_ros.files.storage import make_folder
 
     make_folder(folder)
     curves = {name: list(some) for name, some in groupby(outcomes, lambda one: one.trouble)}

@@ -157,7 +157,7 @@ def run(arguments: list[str]) -> int:
 def _draw(folder: Path, squares: Mapping[str, Squares]) -> None:
     # late, since the table needs no matplotlib
     from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
-    from cliploc_ros.evaluation.output import make_folder
+    from cliploc_ros.files.storage import make_folder
 
     make_folder(folder)
     figure, axes = new_axes('share that the ellipsoids should hold', 'share that they hold')

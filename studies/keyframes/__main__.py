@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.output import write_text
 from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.storage import write_text
 from studies.keyframes.cases import cases
 from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
 from studies.keyframes.judge import WAYS, draw, make_judge, table

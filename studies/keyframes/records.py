@@ -39,7 +39,7 @@ from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.evaluation.output import make_folder, write_file
+from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import YoloOptions

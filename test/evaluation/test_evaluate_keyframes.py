@@ -17,8 +17,7 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.evaluation.paper_table import notes, table_rows
-from cliploc_ros.evaluation.summary import summarize
+from cliploc_ros.evaluation.summary import notes, summarize, table_rows
 from cliploc_ros.evaluation.trials import Result
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 

@@ -16,11 +16,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.evaluation.evaluation import read_results
 from cliploc_ros.evaluation.methods import parse_methods
-from cliploc_ros.evaluation.paper_table import notes
-from cliploc_ros.evaluation.run import RunError, count_trials, run_all, run_methods
-from cliploc_ros.evaluation.summary import summarize
+from cliploc_ros.evaluation.run import RunError, count_trials, read_results, run_all, run_methods
+from cliploc_ros.evaluation.summary import notes, summarize
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.files.log import Log
 

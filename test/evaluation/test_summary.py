@@ -10,19 +10,17 @@ import numpy as np
 import pytest
 
 from cliploc_ros.evaluation.figures import new_axes, precision_recall, save_figure
-from cliploc_ros.evaluation.paper_table import (
+from cliploc_ros.evaluation.summary import (
+    Summary,
     as_csv,
     as_json,
     as_markdown,
     as_text,
-    notes,
-    table_rows,
-)
-from cliploc_ros.evaluation.summary import (
-    Summary,
     compare,
     find_best,
+    notes,
     summarize,
+    table_rows,
     wilson_interval,
 )
 from cliploc_ros.evaluation.trials import Result

@@ -10,7 +10,7 @@ from typing import Any
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.evaluation.map_check.page import make_page
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-from cliploc_ros.evaluation.output import write_text
+from cliploc_ros.files.storage import write_text
 from cliploc_ros.mapping.checking.report import CheckReport
 
 PAGE, DATA = 'check.html', 'check.json'
