@@ -8,20 +8,13 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from cliploc_ros.command import printable, run_main
-from cliploc_ros.errors import DatasetError, MapError, MappingError, OptionsError
+from cliploc_ros.errors import DatasetError, MapError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.map_formats.given_map import (
-        GivenMap,
-        ImportedMap,
-        LeftOut,
-        Placement,
-    )
-    from cliploc_ros.mapping.refit import RefitMap
+    from cliploc_ros.datasets.map_formats.given_map import GivenMap, ImportedMap, Placement
 
 _FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
 _LEFT_OUT_SHOWN = 10
@@ -38,14 +31,6 @@ examples:
   import_map --from oaslam map_objects.txt --scale 2.31 --transform 0 0 1.2 -0.5 0.5 -0.5 0.5 \\
              --refit office.npz --out office.yaml
 """
-
-
-class _Result(NamedTuple):
-    """A map to write, what is not in it, and what to say about it."""
-
-    landmark_map: 'LandmarkMap'
-    left_out: 'tuple[LeftOut, ...]'
-    lines: tuple[str, ...]
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -88,7 +73,7 @@ def import_map(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.map_file import write_map
-    from cliploc_ros.datasets.map_formats.given_map import place
+    from cliploc_ros.datasets.map_formats.given_map import place, refit
 
     begin = time.monotonic()
     _check_paths(options)
@@ -99,19 +84,19 @@ def import_map(options: argparse.Namespace) -> int:
                          f'import_map {options.format} {options.input.name}')
     except DatasetError as error:
         raise DatasetError(f'{options.input}: {error}') from error
-    result = _refit(imported, options) if options.refit else _Result(
-        imported.landmark_map, imported.left_out, (
+    result = refit(imported, options.refit, options.keep_unsupported) if options.refit else (
+        imported._replace(notes=(
             f'{len(imported.landmark_map)} landmarks as the file has them',
             *(f'note: {note}' for note in imported.notes),
-            'note: maps of other systems localize better after --refit OBSERVATIONS'))
+            'note: maps of other systems localize better after --refit OBSERVATIONS')))
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
-               *result.lines[:1]])
+               *result.notes[:1]])
     if note := remove_layer(options.out):
         print(note)
     if options.report is not None:
         _write_report(options.report, result)
-    print('\n'.join(printable(line) for line in result.lines))
+    print('\n'.join(printable(line) for line in result.notes))
     print(f'left out: {len(result.left_out)}')
     for one in result.left_out[:_LEFT_OUT_SHOWN]:
         print(printable(f'  {one.landmark_id}: {one.reason}'))
@@ -168,49 +153,10 @@ def _read(options: argparse.Namespace) -> 'GivenMap':
     return readers[options.format](options.input, names)
 
 
-def _refit(imported: 'ImportedMap', options: argparse.Namespace) -> _Result:
-    """Return the map fitted to the observations that the command line names."""
-    from cliploc_ros.datasets.map_formats.given_map import LeftOut
-    from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.mapping.refit import refit_map
-
-    detections = load_observations(options.refit)
-    try:
-        refit = refit_map(detections, imported.landmark_map)
-    except MappingError as error:
-        raise MappingError(f'{options.refit}: {error}') from error
-    left_out, kept = list(imported.left_out), []
-    for row, reason in enumerate(refit.reasons):
-        is_duplicate = refit.part_of[row] != row
-        if reason is None or (options.keep_unsupported and not is_duplicate):
-            kept.append(row)
-        else:
-            left_out.append(LeftOut(imported.landmark_map.landmark_ids[row], reason))
-    return _Result(refit.landmark_map.select(kept), tuple(left_out),
-                   tuple(_refit_lines(imported, refit, options.refit)))
-
-
-def _refit_lines(imported: 'ImportedMap', refit: 'RefitMap', observations: Path) -> list[str]:
-    """Return what fitting did, for the terminal."""
-    import numpy as np
-
-    fitted = [row for row, reason in enumerate(refit.reasons) if reason is None]
-    before, after = imported.landmark_map, refit.landmark_map
-    moved_m = np.linalg.norm(after.centers - before.centers, axis=1)
-    far = [row for row in fitted if moved_m[row] > 2.0 * before.semi_axes[row].max()]
-    lines = [f'{len(fitted)} of {len(before)} landmarks fitted to {observations.name}: explained '
-             f'boxes {refit.explained_before:.1%} -> {refit.explained:.1%}, median IoU '
-             f'{refit.iou_before:.3f} -> {refit.iou:.3f} (on the frames used for fitting)',
-             f'they moved by {np.median(moved_m[fitted]) * 100:.1f} cm (median)']
-    lines += [f'note: {note}' for note in (*imported.notes, *refit.notes)]
-    return lines + [f'note: {after.landmark_ids[row]} moved by {moved_m[row]:.2f} m, more than '
-                    'its size: check its label' for row in far]
-
-
-def _write_report(path: Path, result: _Result) -> None:
+def _write_report(path: Path, result: 'ImportedMap') -> None:
     from cliploc_ros.files.storage import replace_file
 
-    report = {'landmarks': len(result.landmark_map), 'lines': result.lines,
+    report = {'landmarks': len(result.landmark_map), 'lines': result.notes,
               'left_out': [one._asdict() for one in result.left_out]}
     try:
         with replace_file(path) as partial:

@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.errors import DatasetError, MappingError
+from cliploc_ros.mapping.refit import refit_map
 
 # A landmark with a thinner semi-axis is a fit that collapsed; a larger one is no object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
@@ -74,7 +76,7 @@ class Placement:
 
 
 class ImportedMap(NamedTuple):
-    """A map of ours, what was left out and why, and notes on the file."""
+    """A map of ours, what was left out and why, and what to say about it."""
 
     landmark_map: LandmarkMap
     left_out: tuple[LeftOut, ...]
@@ -117,6 +119,44 @@ def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
         np.array(semi_axes) * placement.scale, rotations.as_quat(),
         tuple(replace(one, source=source) for one in details))
     return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
+
+
+def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:
+    """Return an imported map fitted to the boxes of an observation file.
+
+    Parameters
+    ----------
+    keep_unsupported : bool
+        Keep landmarks that cannot be fitted, where the file has them.
+
+    Raises
+    ------
+    CliplocError
+        The file is invalid, or nothing can be fitted to it.
+    """
+    detections = load_observations(observations)
+    before = imported.landmark_map
+    try:
+        fit = refit_map(detections, before)
+    except MappingError as error:
+        raise MappingError(f'{observations}: {error}') from error
+    left_out, kept = list(imported.left_out), []
+    for row, reason in enumerate(fit.reasons):
+        if reason is None or (keep_unsupported and fit.part_of[row] == row):
+            kept.append(row)
+        else:
+            left_out.append(LeftOut(before.landmark_ids[row], reason))
+    fitted = [row for row, reason in enumerate(fit.reasons) if reason is None]
+    moved_m = np.linalg.norm(fit.landmark_map.centers - before.centers, axis=1)
+    far = [row for row in fitted if moved_m[row] > 2.0 * before.semi_axes[row].max()]
+    return ImportedMap(fit.landmark_map.select(kept), tuple(left_out), (
+        f'{len(fitted)} of {len(before)} landmarks fitted to {observations.name}: explained '
+        f'boxes {fit.explained_before:.1%} -> {fit.explained:.1%}, median IoU '
+        f'{fit.iou_before:.3f} -> {fit.iou:.3f} (on the frames used for fitting)',
+        f'they moved by {np.median(moved_m[fitted]) * 100:.1f} cm (median)',
+        *(f'note: {note}' for note in (*imported.notes, *fit.notes)),
+        *(f'note: {before.landmark_ids[row]} moved by {moved_m[row]:.2f} m, more than its size: '
+          'check its label' for row in far)))
 
 
 def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:

@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Query files and observation files: reading, refusing and writing them."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.datasets.observations import load_observations, save_observations
+from cliploc_ros.datasets.queries import load_queries, save_queries
+from cliploc_ros.errors import DatasetError
+
+
+def frame_arrays() -> dict[str, np.ndarray]:
+    """Three frames, the second of them without a box."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, :3, 3] = [1, 2, 3]
+    return {
+        'intrinsics_fx_fy_cx_cy': np.array([500.0, 501, 320, 240]),
+        'frame_offsets': np.array([0, 2, 2, 3]),
+        'boxes_xyxy': np.array([[0.0, 0, 10, 10], [5, 6, 7, 8], [1, 2, 30, 40]]),
+        'class_ids': np.array(['cup', 'tv', 'cup']),
+        'scores': np.array([0.5, 0.75, 1.0]),
+        'map_from_camera': poses,
+        'timestamps': np.array([1341847980.722988, 1341847980.754743, 1341847981.0]),
+    }
+
+
+def query_arrays() -> dict[str, np.ndarray]:
+    """Two groups and three landmarks."""
+    return frame_arrays() | {
+        'landmark_ids': np.array(['cup_1', 'cup_2', 'tv_1']),
+        'similarities': np.arange(9, dtype=np.float32).reshape(3, 3) / 10,
+        'true_landmark': np.array([0, 2, -1]),
+        'query_group': np.array([0, 0, 4]),
+        'is_main': np.array([True, False, True]),
+    }
+
+
+def observation_arrays() -> dict[str, np.ndarray]:
+    return frame_arrays() | {'image_size': np.array([640, 480]),
+                             'timestamps': np.array([10.0, 10.5, 11.0])}
+
+
+KINDS = {'query': (query_arrays, load_queries, save_queries),
+         'observation': (observation_arrays, load_observations, save_observations)}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    """Arrays of a valid file, and what loads and saves such files."""
+    return KINDS[request.param]
+
+
+def save(path, arrays):
+    np.savez_compressed(path, **arrays)
+    return path
+
+
+def put(name, index, value):
+    def change(arrays):
+        if isinstance(value, float):
+            arrays[name] = arrays[name].astype(np.float64)
+        arrays[name][index] = value
+    return change
+
+
+def become(name, value):
+    return lambda arrays: arrays.update({name: np.asarray(value)})
+
+
+def refuse(path, arrays, change, load, message):
+    change(arrays)
+    with pytest.raises(DatasetError, match=message) as caught:
+        load(save(path, arrays))
+    assert str(path) in str(caught.value)
+
+
+# ---- both ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda arrays: arrays.pop('scores'), 'array scores is missing'),
+    (become('scores', [0.5, 0.5]), r'array scores has shape \(2,\), expected \(3,\)'),
+    (become('boxes_xyxy', np.zeros((3, 5))), r'boxes_xyxy has shape \(3, 5\), .*\(3, 4\)'),
+    (become('boxes_xyxy', 3.0), 'array boxes_xyxy is a single value'),
+    (become('timestamps', 3.0), 'array timestamps is a single value'),
+    (become('map_from_camera', np.zeros((3, 3, 4))), 'map_from_camera has shape'),
+    (become('class_ids', [1, 2, 3]), 'array class_ids has type int64, expected text'),
+    (become('frame_offsets', [0.0, 2, 2, 3]), 'frame_offsets has type float64, expected integers'),
+    (become('frame_offsets', [0, 2, 2, 4]), 'goes from 0 to 4, expected 0 to 3, the number'),
+    (put('frame_offsets', 3, 2), 'frame_offsets goes from 0 to 2, expected 0 to 3'),
+    (put('frame_offsets', 1, 3), 'frame_offsets decreases in row 2'),
+    (put('boxes_xyxy', (1, 2), np.nan), 'array boxes_xyxy is not finite in row 1'),
+    (put('boxes_xyxy', (2, 2), 1.0), 'boxes_xyxy is not left, top, right, bottom in row 2'),
+    (put('scores', 2, -0.1), 'scores is outside 0 to 1 in row 2'),
+    (put('scores', 2, 1.5), 'scores is outside 0 to 1 in row 2'),
+    (put('map_from_camera', (1, 0, 0), 2.0), 'map_from_camera is no rigid transform in row 1'),
+    (put('map_from_camera', (2, 3, 0), 1.0), 'map_from_camera is no rigid transform in row 2'),
+    (put('map_from_camera', (0, 2, 2), -1.0), 'map_from_camera is no rigid transform in row'),
+    (put('intrinsics_fx_fy_cx_cy', 0, 0.0), 'focal length'),
+    (become('scores', np.array([1, 'a', None], dtype=object)), 'array scores cannot be read'),
+])
+def test_malformed_arrays_are_named(tmp_path, kind, change, message):
+    refuse(tmp_path / 'q.npz', kind[0](), change, kind[1], message)
+
+
+@pytest.mark.parametrize('damage', [
+    lambda data: b'', lambda data: b'hello', lambda data: data[:10], lambda data: data[:100],
+    lambda data: data[:len(data) // 2], lambda data: data[:-30], lambda data: data[:-1],
+    lambda data: data[:600] + b'\xff' * 100 + data[700:]])
+def test_broken_files_are_refused(tmp_path, kind, damage):
+    path = save(tmp_path / 'q.npz', kind[0]())
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(DatasetError, match=r'q\.npz'):
+        kind[1](path)
+
+
+def test_other_files_are_refused(tmp_path, kind):
+    with pytest.raises(DatasetError, match=r'no such (query|observation) file'):
+        kind[1](tmp_path / 'none.npz')
+    np.save(tmp_path / 'single.npy', np.zeros(3))
+    with pytest.raises(DatasetError, match='a single array'):
+        kind[1](tmp_path / 'single.npy')
+
+
+def test_missing_folder_is_named(tmp_path, kind):
+    arrays, load, write = kind
+    with pytest.raises(DatasetError, match=r'nowhere/q\.npz: cannot be written: No such file'):
+        write(tmp_path / 'nowhere' / 'q.npz', load(save(tmp_path / 'q.npz', arrays())))
+
+
+# ---- queries ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (become('similarities', np.zeros((3, 2))), r'similarities has shape \(3, 2\), .*\(3, 3\)'),
+    (become('true_landmark', [0.0, 1, 2]), 'true_landmark has type float64, .*integers'),
+    (become('is_main', [1, 0, 1]), 'is_main has type int64, expected booleans'),
+    (put('similarities', (0, 0), np.inf), 'array similarities is not finite in row 0'),
+    (put('similarities', (1, 1), 30.0), 'similarities is no cosine, .* in row 1'),
+    (put('true_landmark', 0, 3), 'true_landmark is no landmark in row 0'),
+    (put('timestamps', 0, -1.0), 'timestamps is negative in row 0'),
+    (put('landmark_ids', 0, 'cup_2'), 'landmark_ids repeats an id in row 1'),
+    (put('landmark_ids', 0, ''), 'landmark_ids is empty in row 0'),
+    (put('is_main', 1, True), 'is_main marks 2 frames of query_group 0'),
+    (put('is_main', 2, False), 'is_main marks 0 frames of query_group 4'),
+    (become('stamps_ns', np.zeros(3, dtype=np.int64)), 'stamps_ns contradicts timestamps'),
+])
+def test_malformed_queries_are_named(tmp_path, change, message):
+    refuse(tmp_path / 'q.npz', query_arrays(), change, load_queries, message)
+
+
+def test_queries_without_frames_are_refused(tmp_path):
+    arrays = {name: one if name in ('landmark_ids', 'intrinsics_fx_fy_cx_cy')
+              else one[:int(name == 'frame_offsets')] for name, one in query_arrays().items()}
+    with pytest.raises(DatasetError, match='holds no frames'):
+        load_queries(save(tmp_path / 'q.npz', arrays))
+
+
+def test_queries_are_read(tmp_path):
+    path = save(tmp_path / 'q.npz', query_arrays())
+    queries = load_queries(path, ['cup_1', 'cup_2', 'tv_1', 'lamp'])
+    assert queries.landmark_ids == ('cup_1', 'cup_2', 'tv_1')
+    assert queries.intrinsics_fx_fy_cx_cy == (500, 501, 320, 240)
+    assert [len(frame) for frame in queries] == [2, 0, 1]
+    assert [frame.stamp_ns for frame in queries] == [
+        1341847980722988000, 1341847980754743000, 1341847981000000000]
+    first, second, third = queries
+    assert first.class_ids == ('cup', 'tv')
+    np.testing.assert_array_equal(first.bboxes_xyxy, [[0, 0, 10, 10], [5, 6, 7, 8]])
+    np.testing.assert_array_equal(first.true_landmark, [0, 2])
+    assert first.similarities.shape == (2, 3)
+    assert second.bboxes_xyxy.shape == (0, 4)
+    assert second.similarities.shape == (0, 3)
+    np.testing.assert_array_equal(second.map_from_camera[:3, 3], [1, 2, 3])
+    np.testing.assert_allclose(third.similarities, [[0.6, 0.7, 0.8]])
+    assert queries.main_frames() == (first, third)
+    assert queries.group(0) == (first, second)
+    with pytest.raises(DatasetError, match=r"'cup_2', which the map does not know \(and 1 more"):
+        load_queries(path, ['cup_1'])
+
+
+def test_byte_strings_are_read(tmp_path):
+    arrays = query_arrays()
+    arrays['class_ids'] = arrays['class_ids'].astype('S')
+    assert load_queries(save(tmp_path / 'q.npz', arrays))[0].class_ids == ('cup', 'tv')
+
+
+def assert_same(queries, others):
+    assert queries.landmark_ids == others.landmark_ids
+    assert queries.intrinsics_fx_fy_cx_cy == others.intrinsics_fx_fy_cx_cy
+    for one, other in zip(queries, others, strict=True):
+        for name, value in vars(one).items():
+            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+
+
+def test_queries_come_back(tmp_path):
+    queries = load_queries(save(tmp_path / 'q.npz', query_arrays()))
+    # A float64 of seconds cannot hold this stamp.
+    exact = replace(queries[2], stamp_ns=1341847981000000123)
+    queries = replace(queries, frames=(*queries.frames[:2], exact))
+    save_queries(tmp_path / 'again.npz', queries)
+    assert_same(load_queries(tmp_path / 'again.npz'), queries)
+    save_queries(tmp_path / 'other.npz', queries)
+    assert (tmp_path / 'other.npz').read_bytes() == (tmp_path / 'again.npz').read_bytes()
+
+
+def test_real_queries_come_back(shared_data, tmp_path):
+    path = shared_data / 'tum_fr3_office' / 'queries.npz'
+    queries = load_queries(path)
+    assert (len(queries), len(queries.main_frames()), len(queries.landmark_ids)) == (258, 52, 40)
+    save_queries(tmp_path / 'again.npz', queries)
+    assert_same(load_queries(tmp_path / 'again.npz'), queries)
+    original, again = np.load(path), np.load(tmp_path / 'again.npz')
+    for name in original.files:
+        np.testing.assert_array_equal(original[name], again[name], err_msg=name)
+        assert original[name].dtype == again[name].dtype
+
+
+def test_malformed_queries_are_not_written(tmp_path):
+    queries = load_queries(save(tmp_path / 'q.npz', query_arrays()))
+    wrong = replace(queries[0], bboxes_xyxy=np.full((2, 4), np.nan))
+    with pytest.raises(DatasetError, match='boxes_xyxy is not finite'):
+        save_queries(tmp_path / 'again.npz', replace(queries, frames=(wrong, *queries.frames[1:])))
+    ragged = replace(queries[0], similarities=np.zeros((2, 7)))
+    with pytest.raises(DatasetError, match='cannot be written'):
+        save_queries(tmp_path / 'again.npz', replace(queries, frames=(ragged,)))
+    assert [path.name for path in tmp_path.iterdir()] == ['q.npz']
+
+
+def test_full_disk_keeps_the_old_file(tmp_path):
+    """A limit on the size of files gives the error of a full disk."""
+    path = save(tmp_path / 'q.npz', query_arrays())
+    before = path.read_bytes()
+    program = textwrap.dedent("""
+        import resource, sys
+        from cliploc_ros.datasets.queries import load_queries, save_queries
+        from cliploc_ros.errors import DatasetError
+        queries = load_queries(sys.argv[1])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        try:
+            save_queries(sys.argv[1], queries)
+        except DatasetError as error:
+            print(error)
+    """)
+    run = subprocess.run([sys.executable, '-c', program, path], capture_output=True, text=True,
+                         check=True, timeout=300)
+    assert 'cannot be written: File too large; nothing was changed' in run.stdout
+    assert [one.name for one in tmp_path.iterdir()] == ['q.npz']
+    assert path.read_bytes() == before
+
+
+# ---- observations -------------------------------------------------------------------------------
+
+
+def test_reads_every_array(tmp_path):
+    loaded = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
+    assert (loaded.camera.width, loaded.camera.height, loaded.camera.fy) == (640, 480, 501.0)
+    assert loaded.class_names == ('cup', 'tv')
+    assert loaded.classes.tolist() == [0, 1, 0]
+    assert loaded.frames.tolist() == [0, 0, 2]
+    assert loaded.bboxes_xyxy[2].tolist() == [1, 2, 30, 40]
+    assert loaded.map_from_camera[1, :3, 3].tolist() == [1, 2, 3]
+    assert loaded.stamps_s.tolist() == [10.0, 10.5, 11.0]
+
+
+def test_puts_frames_in_the_order_of_time(tmp_path):
+    arrays = observation_arrays() | {'timestamps': np.array([11.0, 10.5, 10.0])}
+    loaded = load_observations(save(tmp_path / 'o.npz', arrays))
+    assert loaded.stamps_s.tolist() == [10.0, 10.5, 11.0]
+    assert loaded.frame_offsets.tolist() == [0, 1, 1, 3]
+    assert loaded.classes.tolist() == [0, 0, 1]
+
+
+def test_a_written_file_is_read_back(tmp_path):
+    first = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
+    save_observations(tmp_path / 'again.npz', first)
+    again = load_observations(tmp_path / 'again.npz')
+    for name in ('map_from_camera', 'stamps_s', 'frame_offsets', 'bboxes_xyxy', 'classes',
+                 'scores'):
+        assert (getattr(again, name) == getattr(first, name)).all()
+    assert (again.camera, again.class_names) == (first.camera, first.class_names)
+
+
+def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
+    odometry = np.tile(np.eye(4), (3, 1, 1))
+    odometry[:, 0, 3] = [3.0, np.nan, 1.0]
+    odometry[1] = np.nan
+    arrays = observation_arrays() | {'timestamps': np.array([11.0, 10.5, 10.0]),
+                              'odom_from_camera': odometry}
+    loaded = load_observations(save(tmp_path / 'o.npz', arrays))
+    assert loaded.odom_from_camera[[0, 2], 0, 3].tolist() == [1.0, 3.0]
+    assert np.isnan(loaded.odom_from_camera[1]).all()
+    save_observations(tmp_path / 'again.npz', loaded)
+    np.testing.assert_array_equal(load_observations(tmp_path / 'again.npz').odom_from_camera,
+                                  loaded.odom_from_camera)
+
+
+def test_embeddings_stay_in_the_file(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(3, 300_000)).astype(np.float16)
+    plain = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
+    given = replace(plain, embeddings=rows)
+    save_observations(tmp_path / 'large.npz', given)
+    loaded = load_observations(tmp_path / 'large.npz')
+    assert isinstance(loaded.embeddings, np.memmap)
+    assert (loaded.embeddings == rows).all()
+    save(tmp_path / 'compressed.npz', observation_arrays() | {'embeddings': rows})
+    assert (load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
+
+    content = bytearray((tmp_path / 'large.npz').read_bytes())
+    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as a failing disk does
+    (tmp_path / 'large.npz').write_bytes(content)
+    with pytest.raises(DatasetError, match='array embeddings cannot be read: Bad CRC-32'):
+        load_observations(tmp_path / 'large.npz')
+
+
+def test_reads_the_shared_file(shared_data):
+    loaded = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
+    assert len(loaded) == 2583
+    assert len(loaded.classes) == 17211
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda arrays: (arrays.pop('image_size'), arrays.update(similarities=np.eye(3))),
+     'array image_size is missing .this is a query file'),
+    (become('odom_from_camera', np.zeros((2, 4, 4))), 'shape .2, 4, 4., expected .3, 4, 4.'),
+    (become('odom_from_camera', [np.eye(4), np.eye(4), np.diag([1.0, 1, -1, 1])]),
+     'odom_from_camera is no rigid transform in row 2'),
+    (become('odom_from_camera', [np.eye(4), np.diag([np.nan, 1, 1, 1]), np.eye(4)]),
+     'odom_from_camera is no rigid transform in row 1'),
+    (become('odom_from_camera', [np.eye(4), np.diag([1.0, 1, 1, np.inf]), np.eye(4)]),
+     'odom_from_camera is no rigid transform in row 1'),
+    (become('image_size', [0, 480]), 'image size 0x480'),
+    (lambda arrays: arrays.pop('boxes_xyxy'), 'record the observations again'),
+])
+def test_malformed_observations_are_named(tmp_path, change, message):
+    refuse(tmp_path / 'o.npz', observation_arrays(), change, load_observations, message)
+
+
+def test_the_old_file_stays_when_the_new_one_cannot_be_written(tmp_path):
+    path = save(tmp_path / 'o.npz', observation_arrays())
+    good = load_observations(path)
+    old = path.read_bytes()
+    with pytest.raises(DatasetError, match='cannot be written: array scores is outside'):
+        save_observations(path, replace(good, scores=np.array([2.0, 0.5, 0.5])))
+    assert path.read_bytes() == old
+    assert [file.name for file in tmp_path.iterdir()] == ['o.npz']
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='needs /dev/full')
+def test_a_full_disk_is_named(tmp_path):
+    good = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
+    path = tmp_path / 'full.npz'
+    # the temporary file of this process, on a disk without room
+    (tmp_path / f'.{os.getpid()}.full.npz').symlink_to('/dev/full')
+    with pytest.raises(DatasetError, match='No space left on device; nothing was changed'):
+        save_observations(path, good)
+    assert not path.exists()
