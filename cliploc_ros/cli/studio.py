@@ -78,21 +78,21 @@ def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Late, so that --help is fast.
     try:
-        from cliploc_ros.studio.server import serve_studio
+        from cliploc_ros.studio.page import serve_studio
     except ModuleNotFoundError as error:
         raise OptionsError(f'{error.name} is not installed; pip install viser==1.1.1') from error
 
     studio = open_studio(options)
     try:
         with (follow(options) as live,
-              serve_studio(studio, options.host, options.port, live) as served):
+              serve_studio(studio, options.host, options.port, live) as (url, _)):
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
             for note in studio.document.notes:
                 print(f'note: {note}')
-            print(f'studio: {served.url}', flush=True)
+            print(f'studio: {url}', flush=True)
             if not options.no_browser:
-                webbrowser.open(served.url)
+                webbrowser.open(url)
             threading.Event().wait()
     finally:
         studio.document.close()

@@ -4,14 +4,14 @@
 
 import json
 import subprocess
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.observations import Recorded, load_recorded
+from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.map_review import (
     PICTURE,
@@ -40,10 +40,7 @@ from cliploc_ros.recording.recorder import record_every_frame
 def run_map_demo(options: DemoOptions) -> None:
     """Build a map from the mapping walk, compare it with the room, and wake up in it.
 
-    Raises
-    ------
-    CliplocError
-        For missing or invalid assets, and if the map cannot be built or the nodes do not run.
+    CliplocError: assets are missing or invalid, the map cannot be built, or the nodes do not run.
     """
     if options.method.startswith('class'):
         raise DemoError(f'--map compares labels, but --method {options.method} uses none: choose '
@@ -54,34 +51,25 @@ def run_map_demo(options: DemoOptions) -> None:
         raise DemoError(f'{walk} is missing: run script/setup again, or choose another folder '
                         'with --assets')
     objects = read_objects(walk)
-    built = _build(options, walk)
+    files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
+    _build(options, walk, files)
+    detections = load_recorded(files['npz']).detections
     review = review_map(
-        LandmarkMap.from_file(built.map_file), objects,
-        count_sightings(tuple(read_frames(walk)), built.recorded.detections),
-        built.report['left_out'])
+        LandmarkMap.from_file(files['yaml']), objects,
+        count_sightings(tuple(read_frames(walk)), detections),
+        json.loads(files['json'].read_text())['left_out'])
     print('\n'.join(console_lines(review)), flush=True)
-    successes = _judge(options, built.map_file)
+    successes = _judge(options, files['yaml'])
     print('\n' + '\n'.join(success_lines(successes)) + '\n', flush=True)
-    poses = built.recorded.detections.map_from_camera
-    draw_map_review(review, poses, options.out / PICTURE)
+    draw_map_review(review, detections.map_from_camera, options.out / PICTURE)
     landmark_of = review.landmark_of
     run_demo(replace(options, wake_up_map=WakeUpMap(
-        built.map_file, lambda object_id: landmark_of.get(object_id, ''),
-        section(review, successes, len(built.recorded.detections)))))
+        files['yaml'], lambda object_id: landmark_of.get(object_id, ''),
+        section(review, successes, len(detections)))))
 
 
-@dataclass(frozen=True)
-class _Built:
-    """What build_map wrote: the map, its report, and what detector and CLIP said."""
-
-    map_file: Path
-    report: dict[str, Any]
-    recorded: Recorded
-
-
-def _build(options: DemoOptions, walk: Path) -> _Built:
-    """Build a map as a user does, with the installed executable."""
-    files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
+def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
+    """Write map, report and detections as a user does, with the installed executable."""
     arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
                  '--record-to', files['npz'], '--model', options.assets / 'yolo.pt',
                  '--clip-model', options.assets / 'clip.json',
@@ -91,8 +79,6 @@ def _build(options: DemoOptions, walk: Path) -> _Built:
                           check=False)
     if done.returncode:
         raise DemoError(f'build_map ended with exit code {done.returncode}; its message is above')
-    return _Built(files['yaml'], json.loads(files['json'].read_text()),
-                  load_recorded(files['npz']))
 
 
 def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:

@@ -3,7 +3,7 @@
 """Compare the map that the demo built with the room: found, missed and false objects."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -30,8 +30,6 @@ from cliploc_ros.units import NS_PER_S
 #: A landmark this near to an object stands for it [m]. The objects are 0.2 m apart and more.
 NEAR_M = 0.1
 PICTURE = 'built_map.png'
-_SUCCESS_COLUMNS = ('', *(f'within {limit:g} m' for limit in LIMITS_M), 'median error', 'accepted',
-                    'false accepts')
 _DPI = 110
 _MARGIN_M = 0.35
 _MISSED = '#E69F00'
@@ -95,12 +93,7 @@ def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
                ) -> MapReview:
     """Return what a map found, missed and made up.
 
-    Parameters
-    ----------
-    sightings : dict of str to Sightings
-        By id of the object.
-    left_out : sequence of dict
-        Of build_map's report: class_id, center and reason of each.
+    The sightings are by the object's id; ``left_out`` is that of build_map's report.
     """
     offsets_m = np.linalg.norm(np.array([one.center for one in objects])[:, None]
                                - landmark_map.centers, axis=2)
@@ -109,13 +102,21 @@ def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
     costs = np.where(is_class & (offsets_m < NEAR_M), offsets_m, 2 * NEAR_M)
     pairs = [(int(row), int(landmark)) for row, landmark in zip(
         *linear_sum_assignment(costs), strict=True) if costs[row, landmark] < NEAR_M]
+    # the radius of the sphere of equal volume
+    radii = np.cbrt(np.prod(landmark_map.semi_axes, axis=1))
     found = tuple(Found(row, landmark, float(offsets_m[row, landmark]),
-                        _radius(landmark_map.semi_axes[landmark])
-                        / _radius(objects[row].semi_axes)) for row, landmark in pairs)
-    false = {landmark: _what_is_there(landmark_map.class_ids[landmark], objects,
-                                      offsets_m[:, landmark])
-             for landmark in range(len(landmark_map))
-             if landmark not in {one.landmark for one in found}}
+                        float(radii[landmark] / np.cbrt(np.prod(objects[row].semi_axes))))
+                  for row, landmark in pairs)
+    false = {}
+    for landmark in sorted(set(range(len(landmark_map))) - {one.landmark for one in found}):
+        row = int(np.argmin(offsets_m[:, landmark]))
+        nearest, offset_m = objects[row], offsets_m[row, landmark]
+        if offset_m >= NEAR_M:
+            false[landmark] = f'nothing is there; {nearest.object_id} is {offset_m:.2f} m away'
+        elif nearest.class_id == landmark_map.class_ids[landmark]:
+            false[landmark] = f'{nearest.object_id} a second time'
+        else:
+            false[landmark] = f'{nearest.object_id} is there: {nearest.label}'
     missed = {}
     for row, one in enumerate(objects):
         if row in {hit.object_row for hit in found}:
@@ -143,22 +144,6 @@ def count_sightings(frames: Sequence[TrueFrame], detections: PosedDetections
         for one, class_number in sorted(set(zip(ids, detections.classes[rows], strict=True))):
             detected.setdefault(one, Counter())[detections.class_names[class_number]] += 1
     return {one: Sightings(count, detected.get(one, Counter())) for one, count in shown.items()}
-
-
-def _radius(semi_axes: NDArray[np.float64]) -> float:
-    """Return the radius of the sphere of equal volume."""
-    return float(np.cbrt(np.prod(semi_axes)))
-
-
-def _what_is_there(class_id: str, objects: Sequence[TrueObject], offsets_m: NDArray[np.float64]
-                   ) -> str:
-    nearest = int(np.argmin(offsets_m))
-    one = objects[nearest]
-    if offsets_m[nearest] >= NEAR_M:
-        return f'nothing is there; {one.object_id} is {offsets_m[nearest]:.2f} m away'
-    if one.class_id == class_id:
-        return f'{one.object_id} a second time'
-    return f'{one.object_id} is there: {one.label}'
 
 
 def _why_missed(one: TrueObject, instead: Sequence[str], seen: Sightings | None,
@@ -189,14 +174,22 @@ def console_lines(review: MapReview) -> Iterator[str]:
 
 def success_lines(summaries: Mapping[str, Summary]) -> Iterator[str]:
     """Yield the table of success in both maps."""
-    rows = [_SUCCESS_COLUMNS, *(_success_cells(*item) for item in summaries.items())]
-    for row in rows:
+    for row in _success_rows(summaries):
         yield '  '.join(cell.ljust(13) for cell in row).rstrip()
+
+
+def _success_rows(summaries: Mapping[str, Summary]) -> list[tuple[str, ...]]:
+    return [('', *(f'within {limit:g} m' for limit in LIMITS_M), 'median error', 'accepted',
+             'false accepts'),
+            *((name, *(f'{one.success(limit):.2f}' for limit in LIMITS_M),
+               f'{one.median_error_m:.3f} m', f'{one.accepted.sum()} of {one.errors_m.size}',
+               str(one.false_accepts())) for name, one in summaries.items())]
 
 
 def section(review: MapReview, summaries: Mapping[str, Summary], images: int) -> str:
     """Return the section of the page."""
-    return '\n'.join([
+    objects, landmark_map = review.objects, review.landmark_map
+    parts = [
         '<h2>The map</h2>',
         f'<p><code>build_map</code> built it from {images} images of a mapping walk, with the '
         'poses of that walk. The wake-ups come later: objects have moved, and the light has '
@@ -207,59 +200,35 @@ def section(review: MapReview, summaries: Mapping[str, Summary], images: int) ->
         '<figcaption>Found, missed and false objects. The dotted line is the mapping walk.'
         '</figcaption></figure>',
         '<p>One look at each image of the wake-ups, in the built map and in the true map:</p>',
-        _table(_SUCCESS_COLUMNS, (_success_cells(*item) for item in summaries.items())),
-        *_losses(review), _all_found(review), '<h2>The wake-ups in this map</h2>'])
-
-
-def _success_cells(name: str, summary: Summary) -> tuple[str, ...]:
-    count = summary.errors_m.size
-    return (name, *(f'{summary.success(limit):.2f}' for limit in LIMITS_M),
-            f'{summary.median_error_m:.3f} m', f'{summary.accepted.sum()} of {count}',
-            str(summary.false_accepts()))
-
-
-def _losses(review: MapReview) -> Iterator[str]:
-    """Yield the tables of missed and false objects."""
+        _table(_success_rows(summaries))]
     if review.missed:
-        yield '<h3>Missed objects</h3>'
-        yield _table(('object', 'label', 'why'), (
-            (review.objects[row].object_id, review.objects[row].label, reason)
-            for row, reason in review.missed.items()))
+        parts += ['<h3>Missed objects</h3>', _table([('object', 'label', 'why'), *(
+            (objects[row].object_id, objects[row].label, reason)
+            for row, reason in review.missed.items())])]
     if review.false:
-        yield '<h3>False objects</h3>'
-        yield _table(('landmark', 'label', 'what is there'), (
-            (review.landmark_map.landmark_ids[landmark], review.landmark_map.labels[landmark],
-             instead) for landmark, instead in review.false.items()))
+        parts += ['<h3>False objects</h3>', _table([('landmark', 'label', 'what is there'), *(
+            (landmark_map.landmark_ids[landmark], landmark_map.labels[landmark], instead)
+            for landmark, instead in review.false.items())])]
+    found = _table([
+        ('object', "a person's label", 'landmark', "the map's label", 'off by', 'size'),
+        *((objects[one.object_row].object_id, objects[one.object_row].label,
+           landmark_map.landmark_ids[one.landmark], landmark_map.labels[one.landmark],
+           f'{one.offset_m * 100:.1f} cm', f'{one.size_ratio - 1:+.0%}')
+          for one in sorted(review.found, key=lambda one: -one.offset_m))])
+    return '\n'.join([
+        *parts, '<details><summary>All found objects, the least accurate first</summary>'
+        f'{found}</details>', '<h2>The wake-ups in this map</h2>'])
 
 
-def _all_found(review: MapReview) -> str:
-    rows = [(review.objects[one.object_row].object_id, review.objects[one.object_row].label,
-             review.landmark_map.landmark_ids[one.landmark],
-             review.landmark_map.labels[one.landmark], f'{one.offset_m * 100:.1f} cm',
-             f'{one.size_ratio - 1:+.0%}')
-            for one in sorted(review.found, key=lambda one: -one.offset_m)]
-    return ('<details><summary>All found objects, the least accurate first</summary>'
-            + _table(('object', "a person's label", 'landmark', "the map's label", 'off by',
-                      'size'), rows) + '</details>')
-
-
-def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        return '<tr>' + ''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in cells) + '</tr>'
-
-    return '<table>' + line(headings, 'th') + ''.join(line(row, 'td') for row in rows) + '</table>'
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of HTML; the first row is its headings."""
+    lines = [''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)
+             for tag, row in zip(['th', *['td'] * (len(rows) - 1)], rows, strict=True)]
+    return '<table>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>'
 
 
 def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], path: Path) -> None:
-    """Draw found, missed and false objects.
-
-    Parameters
-    ----------
-    map_from_camera : ndarray (F, 4, 4)
-        Of the images of the mapping walk.
-    path : Path
-        The PNG to write.
-    """
+    """Draw found, missed and false objects, and the poses (F, 4, 4) of the mapping walk."""
     points = np.concatenate([[one.center for one in review.objects], review.landmark_map.centers,
                              map_from_camera[:, :3, 3]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
@@ -284,13 +253,19 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
                 axes.plot(*zip(start, end, strict=True), color='#666666', linewidth=0.9, zorder=2)
     legend = figure.add_subplot(grid[0, 1])
     legend.set_axis_off()
-    legend.legend(handles=_legend(review), loc='upper left', frameon=False, fontsize=11)
+    legend.legend(loc='upper left', frameon=False, fontsize=11, handles=[
+        Patch(facecolor=ACCEPTED, alpha=0.45, label=f'landmark of an object: {len(review.found)}'),
+        Patch(facecolor=REFUSED, alpha=0.45, label=f'false landmark: {len(review.false)}'),
+        Patch(facecolor='none', edgecolor=_MISSED, linewidth=2.0,
+              label=f'missed object: {len(review.missed)}'),
+        Patch(facecolor='none', edgecolor=_TRUTH, linewidth=0.6, label='true object'),
+        Line2D([], [], color='#666666', marker='.', linestyle=':',
+               label='mapping walk, with the direction of each view')])
     figure.savefig(path)
 
 
 def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
                 entries: tuple[int, int, int]) -> None:
-    found = {one.object_row for one in review.found}
     landmark_map = review.landmark_map
     for landmark, (center, shape) in enumerate(zip(landmark_map.centers, landmark_map.shapes,
                                                    strict=True)):
@@ -301,7 +276,7 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
     shapes = shape_matrices(np.array([one.semi_axes for one in review.objects]),
                             np.array([one.orientation for one in review.objects]))
     for row, (one, shape) in enumerate(zip(review.objects, shapes, strict=True)):
-        is_missed = row not in found
+        is_missed = row in review.missed
         outline = outline_points(np.array([*one.center[[*plane]], *shape[[*entries]]]))
         axes.add_patch(Polygon(outline, closed=True, fill=False, zorder=6 if is_missed else 5,
                                edgecolor=_MISSED if is_missed else _TRUTH,
@@ -316,14 +291,3 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
 def _name(axes: Axes, place: NDArray[np.float64], name: str, color: str) -> None:
     axes.text(place[0], place[1], name, fontsize=8, ha='center', va='center', color=color,
               zorder=8, fontweight='bold', path_effects=EDGED)
-
-
-def _legend(review: MapReview) -> list[Line2D | Patch]:
-    return [
-        Patch(facecolor=ACCEPTED, alpha=0.45, label=f'landmark of an object: {len(review.found)}'),
-        Patch(facecolor=REFUSED, alpha=0.45, label=f'false landmark: {len(review.false)}'),
-        Patch(facecolor='none', edgecolor=_MISSED, linewidth=2.0,
-              label=f'missed object: {len(review.missed)}'),
-        Patch(facecolor='none', edgecolor=_TRUTH, linewidth=0.6, label='true object'),
-        Line2D([], [], color='#666666', marker='.', linestyle=':',
-               label='mapping walk, with the direction of each view')]

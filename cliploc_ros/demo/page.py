@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cliploc_ros.demo.review import ACCEPTED, REFUSED, WRONG_M, Judged, Review, verdict
+from cliploc_ros.demo.review import ACCEPTED, REFUSED, WRONG_M, Judged, Review
 
 TOP_VIEW = 'top_view.png'
 #: Pattern of the wake-ups' pictures.
@@ -81,21 +81,22 @@ def summary(judged: Sequence[Judged]) -> str:
 def write_page(folder: Path, reviews: Sequence[Review], method: str, section: str = '') -> Path:
     """Write the page that shows all pictures; return its file.
 
-    Parameters
-    ----------
-    section : str
-        What to say before the wake-ups, as HTML.
+    The section is HTML to put before the wake-ups.
     """
     judged = [review.judged for review in reviews]
     repeated = sum(review.repeated for review in reviews)
     how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
-    page = folder / 'index.html'
     rows = [''.join(f'<th>{escape(heading)}</th>' for heading, _ in _COLUMNS)]
     for one in judged:
         kind = 'accepted' if one.wake_up.accepted else 'refused'
         rows.append(''.join(f'<td class="{kind}">{escape(cell)}</td>' if cell == kind
                             else f'<td>{escape(cell)}</td>' for cell in _cells(one)))
     table = '<table>' + ''.join(f'<tr>{row}</tr>' for row in rows) + '</table>'
+    figures = [f'<figure><img src="{picture_name(one)}" loading="lazy" '
+               f'alt="wake-up {one.number}: {escape(one.verdict)}">'
+               f'<figcaption>“{escape(one.wake_up.message)}”</figcaption></figure>'
+               for one in judged]
+    page = folder / 'index.html'
     page.write_text('\n'.join([
         '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
         '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
@@ -104,34 +105,23 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
         f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
         '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
         'poses were not published.</figcaption></figure>', how,
-        *map(_figure, judged), '</html>', '']), encoding='utf-8')
+        *figures, '</html>', '']), encoding='utf-8')
     return page
 
 
-def _figure(judged: Judged) -> str:
-    said = escape(judged.wake_up.message)
-    return (f'<figure><img src="{picture_name(judged)}" loading="lazy" '
-            f'alt="wake-up {judged.number}: {escape(verdict(judged))}">'
-            f'<figcaption>“{said}”</figcaption></figure>')
-
-
 def _cells(judged: Judged) -> list[str]:
+    """Return a wake-up's cells; the error of a refused pose is in brackets."""
     wake_up = judged.wake_up
-    position = '–'
+    position = error = '–'
     if wake_up.accepted and judged.pose is not None:
         position = ' '.join(f'{value:.2f}' for value in judged.pose[:3, 3])
+    if judged.error is not None:
+        error = f'{judged.error[0]:.3f} m {judged.error[1]:.1f}°'
+        error = error if wake_up.accepted else f'({error})'
     stages = ', '.join(f'{stage} {ms} ms' for stage, ms in wake_up.stage_ms.items())
     return [str(judged.number), f'{judged.time_s:.1f} s',
             'accepted' if wake_up.accepted else 'refused', f'{wake_up.score:.2f}',
-            str(wake_up.inliers), position, _error(judged), f'{wake_up.answer_s:.2f} s', stages]
-
-
-def _error(judged: Judged) -> str:
-    """Return the error, in brackets if the pose was refused."""
-    if judged.error is None:
-        return '–'
-    text = f'{judged.error[0]:.3f} m {judged.error[1]:.1f}°'
-    return text if judged.wake_up.accepted else f'({text})'
+            str(wake_up.inliers), position, error, f'{wake_up.answer_s:.2f} s', stages]
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 """Run the demo's processes, which all end with the demo, even if it is killed."""
 
 import ctypes
+import itertools
 import os
 import signal
 import socket
@@ -27,23 +28,25 @@ class DemoError(CliplocError):
 class Process:
     """A running process whose output goes to a file."""
 
-    def __init__(self, name: str, popen: 'subprocess.Popen[bytes]', log: Path) -> None:
-        self.name = name
-        self._popen, self._log = popen, log
+    def __init__(self, command: Sequence[object], log: Path) -> None:
+        arguments = [str(argument) for argument in command]
+        self._name, self._log = Path(arguments[0]).name, log
+        with log.open('wb') as output:
+            # If the demo is killed, the kernel ends its processes.
+            self._popen = subprocess.Popen(
+                arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                preexec_fn=lambda: ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM))
 
     def wait_for_output(self, text: str, patience_s: float) -> None:
         """Wait until the output contains a text.
 
-        Raises
-        ------
-        DemoError
-            If the process reports an error, ends, or takes longer than patience_s; the message
-            quotes its last line.
+        DemoError: the process reports an error, ends, or takes longer than patience_s; the message
+        quotes its last line.
         """
         deadline = time.monotonic() + patience_s
         while text not in (output := self._log.read_text(errors='replace')):
             if '[ERROR]' in output or time.monotonic() > deadline:
-                raise DemoError(f'the {self.name} does not become ready: {self._last_line()}')
+                raise DemoError(f'the {self._name} does not become ready: {self._last_line()}')
             self.check()
             time.sleep(_POLL_S)
 
@@ -51,7 +54,7 @@ class Process:
         """Raise a DemoError if the process has ended."""
         code = self._popen.poll()
         if code is not None:
-            raise DemoError(f'the {self.name} ended with exit code {code}: {self._last_line()}')
+            raise DemoError(f'the {self._name} ended with exit code {code}: {self._last_line()}')
 
     def wait(self) -> None:
         """Wait until the process ends by itself."""
@@ -74,22 +77,8 @@ class Process:
 
 @contextmanager
 def running(command: Sequence[object], log: Path) -> Iterator[Process]:
-    """Run a program inside a with statement.
-
-    Parameters
-    ----------
-    command : sequence
-        Program and arguments.
-    log : Path
-        The file for its output.
-    """
-    arguments = [str(argument) for argument in command]
-    with log.open('wb') as output:
-        # If the demo is killed, the kernel ends its processes.
-        popen = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=output,
-                                 stderr=subprocess.STDOUT,
-                                 preexec_fn=_end_with_parent)
-    process = Process(Path(arguments[0]).name, popen, log)
+    """Run a program and its arguments inside a with statement; its output goes to a file."""
+    process = Process(command, log)
     try:
         yield process
     finally:
@@ -98,22 +87,10 @@ def running(command: Sequence[object], log: Path) -> Iterator[Process]:
         signal.signal(signal.SIGINT, handler)
 
 
-def _end_with_parent() -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
 def node_command(name: str, parameters: Mapping[str, object]) -> list[object]:
-    """Return the command line of an installed node with parameters.
-
-    Raises
-    ------
-    DemoError
-        If the package is not installed.
-    """
-    arguments: list[object] = [find_executable(name), '--ros-args']
-    for parameter, value in parameters.items():
-        arguments += ['-p', f'{parameter}:={value}']
-    return arguments
+    """Return the command line of an installed node with parameters."""
+    settings = [('-p', f'{parameter}:={value}') for parameter, value in parameters.items()]
+    return [find_executable(name), '--ros-args', *itertools.chain(*settings)]
 
 
 def installed_share() -> Path:
@@ -124,10 +101,7 @@ def installed_share() -> Path:
 def find_executable(name: str) -> Path:
     """Find an executable of the package beside the running one, or in the sourced workspace.
 
-    Raises
-    ------
-    DemoError
-        If the package is not installed.
+    DemoError: the package is not installed.
     """
     folders = [Path(sys.argv[0]).resolve().parent]
     try:
@@ -149,23 +123,18 @@ def own_ros_domain() -> Iterator[int]:
     A bound port reserves the domain (1 to 101), as in ROS's own ``domain_coordinator``. The
     reservation ends with this process, even if it is killed.
     """
-    domain, reservation = _reserve_domain()
+    for attempt in range(101):
+        domain, reservation = (os.getpid() + attempt) % 101 + 1, socket.socket()
+        try:
+            reservation.bind(('', 32768 + domain))
+            break
+        except OSError:
+            reservation.close()
+    else:
+        raise DemoError('all ROS domains of this machine are in use: end other demos or test runs')
     with reservation:
         os.environ['ROS_DOMAIN_ID'] = str(domain)
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         # The older name of this variable: with both set, ROS warns.
         os.environ.pop('ROS_LOCALHOST_ONLY', None)
         yield domain
-
-
-def _reserve_domain() -> tuple[int, socket.socket]:
-    for attempt in range(101):
-        domain = (os.getpid() + attempt) % 101 + 1
-        reservation = socket.socket()
-        try:
-            reservation.bind(('', 32768 + domain))
-        except OSError:
-            reservation.close()
-        else:
-            return domain, reservation
-    raise DemoError('all ROS domains of this machine are in use: end other demos or test runs')

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from geometry_msgs.msg import Pose, PoseArray
+from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -75,12 +75,7 @@ class WakeUp:
 class Robot(Node):
     """Publishes a recording and stops for each wake-up.
 
-    Parameters
-    ----------
-    reader : BagReader
-        The open recording.
-    check : callable
-        Called while waiting; raises if a node has ended.
+    ``check`` is called while waiting; it raises if a node has ended.
     """
 
     def __init__(self, reader: BagReader, check: Callable[[], None]) -> None:
@@ -105,14 +100,9 @@ class Robot(Node):
                    and self.count_publishers('relocalizer/hypotheses') > 0)
 
     def walk(self, wake_up_at: Collection[int], rate: float) -> Iterator[WakeUp]:
-        """Play the recording; at each wake-up stop, request the pose, and yield the answer.
+        """Play the recording; stop at the images of some stamps [ns] and yield the pose there.
 
-        Parameters
-        ----------
-        wake_up_at : collection of int
-            Stamps of images [ns].
-        rate : float
-            Speed between wake-ups; 1 is as recorded.
+        The rate is the speed between wake-ups; 1 is as recorded.
         """
         last_ns = self._reader.start_ns
         for stamp, group in groupby(self._reader.messages(), key=lambda message: message.stamp_ns):
@@ -170,9 +160,7 @@ class Robot(Node):
         self._detections[stamp_ns(msg.header.stamp)] = detections_from_msg(msg)
 
     def _on_hypotheses(self, msg: PoseArray) -> None:
-        self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(map(_transform, msg.poses))
-
-
-def _transform(pose: Pose) -> NDArray[np.float64]:
-    p, q = pose.position, pose.orientation
-    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+        self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(transform_from_pose(
+            np.array([pose.position.x, pose.position.y, pose.position.z]),
+            np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z,
+                      pose.orientation.w])) for pose in msg.poses)

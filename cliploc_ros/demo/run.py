@@ -15,11 +15,7 @@ import numpy as np
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from cliploc_ros.core.localizer import localize_on_demand, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.bag_reader import BagReader
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import TumSequence, read_tum
@@ -28,16 +24,14 @@ from cliploc_ros.demo import page
 from cliploc_ros.demo.pictures import draw_top_view, draw_wake_up
 from cliploc_ros.demo.processes import (
     DemoError,
-    Process,
     installed_share,
     node_command,
     own_ros_domain,
     running,
 )
-from cliploc_ros.demo.review import Judged, Observe, Review, Reviewer, judge, observe_classes
+from cliploc_ros.demo.review import Judged, Reviewer, judge
 from cliploc_ros.demo.robot import Robot
 from cliploc_ros.evaluation.output import make_folder
-from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The first start compiles the kernels of the search.
@@ -96,26 +90,27 @@ class DemoOptions:
 
 
 def run_demo(options: DemoOptions) -> list[Judged]:
-    """Let the robot walk and wake up, and draw the results.
+    """Let the robot walk and wake up, and draw the results; return the wake-ups.
 
-    Returns
-    -------
-    list of Judged
-        The wake-ups.
-
-    Raises
-    ------
-    CliplocError
-        For missing or invalid assets, and if the nodes do not run.
+    CliplocError: assets are missing or invalid, or the nodes do not run.
     """
     start = time.monotonic()
     prepare(options)
     landmark_map = LandmarkMap.from_file(options.map_file)
     sequence = read_tum(options.assets / 'sequence')
     with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
-        bag = _convert(sequence, Path(folder) / 'walk', landmark_map.frame_id)
+        bag = Path(folder) / 'walk'
+        convert_tum(sequence, find_camera(None, sequence.folder)[0], bag,
+                    ConversionOptions(world_frame=landmark_map.frame_id))
+        print(f'converted a walk of {len(sequence)} images into a recording', flush=True)
         domain = stack.enter_context(own_ros_domain())
-        rviz = stack.enter_context(_rviz(options, landmark_map.frame_id))
+        rviz = None
+        if options.rviz and shutil.which('rviz2'):
+            config = installed_share() / 'config' / 'demo.rviz'
+            rviz = stack.enter_context(running(
+                ['rviz2', '-d', config, '-f', landmark_map.frame_id], options.out / 'rviz2.log'))
+        elif options.rviz:
+            print('RViz (rviz2) is not installed or not sourced here: continuing without it')
         judged = _walk(options, bag, sequence, domain)
         print(page.summary(judged), flush=True)
         index = _draw(options, landmark_map, sequence, judged)
@@ -129,10 +124,7 @@ def run_demo(options: DemoOptions) -> list[Judged]:
 def prepare(options: DemoOptions) -> None:
     """Check options and assets, and make the folder for the pictures, before anything starts.
 
-    Raises
-    ------
-    CliplocError
-        For an unknown method, missing assets, and a folder that cannot be written.
+    CliplocError: the method is unknown, assets are missing, or the folder cannot be written.
     """
     options.values.check()
     # Make the folder for the pictures, and remove those of an earlier run.
@@ -147,39 +139,23 @@ def prepare(options: DemoOptions) -> None:
                             'folder with --assets')
 
 
-def _convert(sequence: TumSequence, bag: Path, frame_id: str) -> Path:
-    camera, _ = find_camera(None, sequence.folder)
-    convert_tum(sequence, camera, bag, ConversionOptions(world_frame=frame_id))
-    print(f'converted a walk of {len(sequence)} images into a recording', flush=True)
-    return bag
-
-
-@contextmanager
-def _rviz(options: DemoOptions, frame_id: str) -> Iterator[Process | None]:
-    """Open RViz if requested and installed."""
-    if options.rviz and shutil.which('rviz2'):
-        config = installed_share() / 'config' / 'demo.rviz'
-        with running(['rviz2', '-d', config, '-f', frame_id],
-                     options.out / 'rviz2.log') as process:
-            yield process
-        return
-    if options.rviz:
-        print('RViz (rviz2) is not installed or not sourced here: continuing without it')
-    yield None
-
-
 def _walk(options: DemoOptions, bag: Path, sequence: TumSequence, domain: int) -> list[Judged]:
     """Let the robot wake up along the recording; print each answer as it arrives."""
     chosen = np.linspace(0, len(sequence) - 1, min(options.wake_ups, len(sequence)))
     wake_up_at = {sequence.stamps_ns[round(index)] for index in chosen}
     judged: list[Judged] = []
-    with (_nodes(options, domain) as check, BagReader(bag) as reader,
-          _robot(reader, check) as robot):
-        robot.connect()
-        print('\n' + page.console_header(), flush=True)
-        for wake_up in robot.walk(wake_up_at, options.rate):
-            judged.append(judge(wake_up, len(judged) + 1, sequence))
-            print(page.console_row(judged[-1]), flush=True)
+    with _nodes(options, domain) as check, BagReader(bag) as reader:
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            robot = Robot(reader, check)
+            robot.connect()
+            print('\n' + page.console_header(), flush=True)
+            for wake_up in robot.walk(wake_up_at, options.rate):
+                judged.append(judge(wake_up, len(judged) + 1, sequence))
+                print(page.console_row(judged[-1]), flush=True)
+            robot.destroy_node()
+        finally:
+            rclpy.try_shutdown()
     return judged
 
 
@@ -204,22 +180,13 @@ def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
         yield check
 
 
-@contextmanager
-def _robot(reader: BagReader, check: Callable[[], None]) -> Iterator[Robot]:
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        robot = Robot(reader, check)
-        yield robot
-        robot.destroy_node()
-    finally:
-        rclpy.try_shutdown()
-
-
 def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence,
           judged: list[Judged]) -> Path:
     """Draw all pictures and the page that shows them; return the page."""
-    reviewer = _reviewer(options, landmark_map, sequence)
-    reviews: list[Review] = []
+    own = options.wake_up_map
+    reviewer = Reviewer(options.values, landmark_map, sequence,
+                        str if own is None else own.landmark_of)
+    reviews = []
     for one in judged:
         reviews.append(reviewer.review(one))
         draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(one))
@@ -228,27 +195,5 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
     walked = truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]
     draw_top_view(judged, landmark_map, walked, options.out / page.TOP_VIEW)
-    section = '' if options.wake_up_map is None else options.wake_up_map.section
-    return page.write_page(options.out, reviews, options.method, section)
-
-
-def _reviewer(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence) -> Reviewer:
-    values = options.values
-    method = values.options()
-    camera, _ = find_camera(None, sequence.folder)
-
-    observe: Observe = observe_classes
-    if method.needs_similarities:
-        from cliploc_ros.models.map_rows import load_encoder_for_map
-        from cliploc_ros.models.observer import Observer
-        observe = Observer(*load_encoder_for_map(
-            ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),
-            landmark_map, [values.map_file], values.landmark_embeddings)).observe
-    relocalizer = Relocalizer(landmark_map, method)
-
-    def relocalize(observation: Observation) -> Relocalization:
-        return localize_on_demand(relocalizer, (), observation,
-                                  recorded_crops(observation, method))[1]
-    return Reviewer(sequence, camera, observe, relocalize,
-                    values.max_detections,
-                    str if options.wake_up_map is None else options.wake_up_map.landmark_of)
+    return page.write_page(options.out, reviews, options.method,
+                           '' if own is None else own.section)

@@ -53,10 +53,7 @@ class TrueFrame:
 def read_objects(world: Path) -> tuple[TrueObject, ...]:
     """Return the objects of a world, whether they are in its map or not.
 
-    Raises
-    ------
-    DatasetError
-        truth.json is missing or lacks them.
+    DatasetError: truth.json is missing or lacks them.
     """
     file = world / 'truth.json'
     try:

@@ -13,7 +13,7 @@ from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import check_inference, check_precision
+from cliploc_ros.models.devices import check_run
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
@@ -51,8 +51,7 @@ class ClipOptions:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_precision(self.precision)
-        check_inference(self.inference)
+        check_run(self.precision, self.inference)
         if self.max_batch < 1:
             raise OptionsError(f'max_batch must be at least 1, not {self.max_batch}')
 

@@ -20,16 +20,12 @@ INFERENCES = ('auto', 'pytorch', 'openvino')
 logger = logging.getLogger(__name__)
 
 
-def check_inference(inference: str) -> None:
-    """Raise an OptionsError for an inference engine that is none of INFERENCES."""
-    if inference not in INFERENCES:
-        raise OptionsError(f"inference '{inference}' is none of {', '.join(INFERENCES)}")
-
-
-def check_precision(precision: str) -> None:
-    """Raise an OptionsError for a precision that is none of PRECISIONS."""
-    if precision not in PRECISIONS:
-        raise OptionsError(f"precision '{precision}' is none of {', '.join(PRECISIONS)}")
+def check_run(precision: str, inference: str) -> None:
+    """Raise an OptionsError for a precision or an inference engine that is not known."""
+    for name, value, known in (('precision', precision, PRECISIONS),
+                               ('inference', inference, INFERENCES)):
+        if value not in known:
+            raise OptionsError(f"{name} '{value}' is none of {', '.join(known)}")
 
 
 def resolve_device(device: str) -> 'torch.device':
@@ -64,7 +60,6 @@ def resolve_device(device: str) -> 'torch.device':
 
 def resolve_precision(precision: str, device: 'torch.device') -> str:
     """Return 'fp16' or 'fp32'; 'auto' means fp16 on a GPU and fp32 on a CPU."""
-    check_precision(precision)
     if precision == 'auto':
         return 'fp16' if device.type == 'cuda' else 'fp32'
     return precision
@@ -80,7 +75,6 @@ def resolve_inference(inference: str, device: 'torch.device', precision: str) ->
     OptionsError
         When OpenVINO is required on a GPU, in fp16, or where it is not installed.
     """
-    check_inference(inference)
     fits = device.type == 'cpu' and precision == 'fp32'
     if inference == 'pytorch' or (inference == 'auto' and not fits):
         return 'pytorch'

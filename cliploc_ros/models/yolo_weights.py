@@ -20,7 +20,7 @@ from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import check_inference, check_precision
+from cliploc_ros.models.devices import check_run
 from cliploc_ros.models.files import check_weights_file, download, first_line
 
 _LEAST_STRIDE = 32
@@ -53,8 +53,7 @@ class YoloOptions:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_precision(self.precision)
-        check_inference(self.inference)
+        check_run(self.precision, self.inference)
         for name in ('conf', 'iou'):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')

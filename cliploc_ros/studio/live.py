@@ -134,7 +134,15 @@ class LiveRelocalizer:
             raise LiveError('a request waits for its answer: repeat yours after it')
         try:
             if not client.service_is_ready():
-                raise LiveError(self._absent())
+                others = sorted(name.removesuffix('/relocalize') for name, types in
+                                self._node.get_service_names_and_types()
+                                if name.endswith('/relocalize')
+                                and 'std_srvs/srv/Trigger' in types)
+                hint = f'; --relocalizer {others[0]} would find another' if others else ''
+                raise LiveError(
+                    f'no relocalizer found at {self.name}: start it with ros2 run cliploc_ros '
+                    'relocalizer --ros-args -p map_file:=MAP, in the ROS domain of the studio'
+                    f'{hint}')
             self._change(is_busy=True)
             answered, begin = threading.Event(), time.monotonic()
             future = client.call_async(Trigger.Request())
@@ -161,15 +169,6 @@ class LiveRelocalizer:
                             'answer: see whether it still runs')
         if now - begin > _PATIENCE_S:
             raise LiveError(f'{self.name} gave no answer within {_PATIENCE_S:.0f} s: see its log')
-
-    def _absent(self) -> str:
-        others = sorted(name.removesuffix('/relocalize') for name, types in
-                        self._node.get_service_names_and_types()
-                        if name.endswith('/relocalize') and 'std_srvs/srv/Trigger' in types)
-        known = f'; --relocalizer {others[0]} would find another' if others else ''
-        return (f'no relocalizer found at {self.name}: start it with ros2 run cliploc_ros '
-                'relocalizer --ros-args -p map_file:=MAP, in the ROS domain of the studio'
-                f'{known}')
 
     def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         p, q = msg.pose.pose.position, msg.pose.pose.orientation

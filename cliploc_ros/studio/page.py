@@ -1,18 +1,33 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the scene and the panels, and the one loop that redraws them.
+"""The page: the scene and the panels, the one loop that redraws them, and who may open it.
 
 viser calls back from many threads. Each callback holds the document's lock for its action. One
 thread redraws, at most 20 times a second, and reads the studio under the same lock. So all
 browsers show the same state, and a slow one delays no edit.
+
+viser 1.1 lets everyone in who reaches its port. On the loopback interface these include every
+page that this machine's browsers show, since a browser opens WebSockets to any host. So a request
+needs a loopback name as its host, a WebSocket needs the studio's own page as its origin, and
+beyond the loopback interface each request needs the token that the studio prints.
 """
 
+import hmac
+import http
+import io
+import secrets
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import viser
+import websockets.asyncio.server
 from scipy.spatial.transform import Rotation
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits
@@ -21,7 +36,7 @@ from cliploc_ros.studio.panels import Actions, LandmarkPanel, MapPanel, TablePan
 from cliploc_ros.studio.recording import MIN_BOX_PX
 from cliploc_ros.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
 from cliploc_ros.studio.studio import Studio
-from cliploc_ros.studio.tool_panels import KeyframesPanel, LivePanel, PlacesPanel
+from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel, add_keyframes
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
@@ -29,6 +44,7 @@ if TYPE_CHECKING:
 _REDRAW_INTERVAL_S = 0.05
 _GRID_M = 20.0
 _GIZMO = 0.4
+_LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 
 
 class Page:
@@ -93,7 +109,7 @@ class Page:
             self._places = PlacesPanel(actions)
             self._panels.append(self._places)
             if self._studio.layer is not None:
-                KeyframesPanel(actions, self._studio.layer)
+                add_keyframes(actions, self._studio.layer)
         if live is not None:
             with tools.add_tab('Robot'):
                 self._panels.append(LivePanel(actions, live))
@@ -118,13 +134,14 @@ class Page:
         corner = self._image.pixel(eye, event.start_position)
         other = self._image.pixel(eye, event.end_position)
 
-        def draw_silently() -> None:
-            self._studio.draw_box(corner, other)
+        is_end = event.phase == 'end'
 
-        if event.phase == 'end':
-            self._actions.act(event, lambda: self._studio.draw_box(corner, other))
-        elif np.abs(other - corner).min() >= MIN_BOX_PX:
-            self._actions.act(None, draw_silently)
+        def draw() -> str | None:
+            message = self._studio.draw_box(corner, other)
+            return message if is_end else None
+
+        if is_end or np.abs(other - corner).min() >= MIN_BOX_PX:
+            self._actions.act(event if is_end else None, draw)
 
     def _dragged_gizmo(self, event: Any) -> None:
         # Callbacks may overtake one another: each takes the gizmo's present pose, not its own.
@@ -195,3 +212,81 @@ class Page:
             return
         self._image.show(picture, studio.map_from_camera)
         self._view.show(picture)
+
+
+# ---- who may open it ----------------------------------------------------------------------------
+
+class Gate:
+    """The check of a server that listens at an address."""
+
+    def __init__(self, host: str):
+        self.is_local = host in _LOOPBACK_NAMES
+        self.token = '' if self.is_local else secrets.token_urlsafe(24)
+
+    @property
+    def path(self) -> str:
+        """The path of the page: the token, if one is needed."""
+        return f'/{self.token}/' if self.token else '/'
+
+    def admit(self, request: Request) -> str | None:
+        """Return the path that viser shall see; None where the request is refused."""
+        host = request.headers.get('Host', '')
+        origin = request.headers.get('Origin')
+        if self.is_local and urlsplit(f'//{host}').hostname not in _LOOPBACK_NAMES:
+            return None
+        if origin is not None and urlsplit(origin).netloc != host:
+            return None
+        if request.headers.get('Upgrade', '').lower() == 'websocket' and origin is None:
+            return None
+        if not self.token:
+            return request.path
+        first, _, rest = request.path.partition('?')[0].lstrip('/').partition('/')
+        is_known = hmac.compare_digest(first.encode(), self.token.encode())
+        return f'/{rest}' if is_known else None
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Let servers that start inside of the block ask this gate first.
+
+        viser 1.1.1 has no option for it. It looks up ``websockets.asyncio.server.serve`` when it
+        starts, so that name leads to the check for as long as the block lasts.
+        """
+        serve = websockets.asyncio.server.serve
+
+        def guarded(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+            def process(connection: Any, request: Request) -> Any:
+                path = self.admit(request)
+                if path is None:
+                    return Response(http.HTTPStatus.FORBIDDEN, 'Forbidden', Headers(),
+                                    b'refused: use the address that the studio printed\n')
+                request.path = path
+                return process_request(connection, request)
+            return serve(*args, process_request=process, **options)
+
+        websockets.asyncio.server.serve = guarded  # type: ignore[misc, assignment]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+@contextmanager
+def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | None' = None
+                 ) -> Iterator[tuple[str, viser.ViserServer]]:
+    """Serve the page of a studio for as long as the block lasts; yield the URL and the server.
+
+    The port is the next free one from this on; 0: any. Beyond the loopback interface, the URL
+    holds a token. ``live`` is the running relocalizer, to show it, too.
+    """
+    gate = Gate(host)
+    with gate.guard(), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
+        server = viser.ViserServer(host, port, verbose=False)
+    # viser would open a tunnel to a server on the Internet for any browser that asks
+    server.request_share_url = lambda *args, **options: None  # type: ignore[method-assign]
+    page = Page(studio, server, live)
+    try:
+        shown_host = f'[{host}]' if ':' in host else host
+        yield f'http://{shown_host}:{server.get_port()}{gate.path}', server
+    finally:
+        page.stop()
+        server.stop()

@@ -278,7 +278,8 @@ class LandmarkPanel:
         # while a person types, a field may end in a space that the label does not have
         self._label.show(one.label, _same_text)
         self._class.show(one.class_id, _same_text)
-        self._center.show(tuple(float(value) for value in one.center), _same_numbers)
+        self._center.show(tuple(float(value) for value in one.center), lambda shown, values: bool(
+            np.abs(np.subtract(shown, values)).max() <= 5e-7))
         angles = Rotation.from_quat(one.quat_xyzw).as_euler('xyz', degrees=True)
         self._angles.show(tuple(round(float(angle), 3) + 0.0 for angle in angles),
                           _same_rotation)
@@ -290,10 +291,6 @@ class LandmarkPanel:
 
 def _same_text(shown: str, text: str) -> bool:
     return ' '.join(shown.split()) == text
-
-
-def _same_numbers(shown: Any, values: Any) -> bool:
-    return bool(np.abs(np.subtract(shown, values)).max() <= 5e-7)
 
 
 def _same_rotation(shown: Any, angles: Any) -> bool:

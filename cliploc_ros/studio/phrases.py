@@ -83,10 +83,9 @@ class PhraseFinder:
         self._answers: dict[tuple[object, ...], FoundPhrases] = {}
         self._fault: FoundPhrases | None = None
         self._wanted: Question | None = None
-        self._condition = threading.Condition()
+        self._lock = threading.Lock()
         self._listener: Callable[[], None] = lambda: None
-        self._thread: threading.Thread | None = None
-        self._is_closed = False
+        self._is_working = self._is_closed = False
 
     def subscribe(self, listener: Callable[[], None]) -> None:
         """Call a function after each answer."""
@@ -94,28 +93,29 @@ class PhraseFinder:
 
     def answer(self, question: Question) -> FoundPhrases:
         """Return the answer, or that it is not known yet."""
-        with self._condition:
+        with self._lock:
             found = self._answers.get(question.key, self._fault)
             if found is not None:
                 return found
-            if self._wanted is None or self._wanted.key != question.key:
-                self._wanted = question
-                self._condition.notify()
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, daemon=True)
-                self._thread.start()
+            self._wanted = question
+            if not self._is_working and not self._is_closed:
+                self._is_working = True
+                threading.Thread(target=self._work, daemon=True).start()
             return _PENDING
 
     def close(self) -> None:
         """Answer nothing more."""
-        with self._condition:
-            self._is_closed = True
-            self._condition.notify()
+        self._is_closed = True
 
     # ---- in the thread --------------------------------------------------------------------------
 
     def _work(self) -> None:
-        while (question := self._next()) is not None:
+        while True:
+            with self._lock:
+                question = self._wanted
+                if self._is_closed or question is None or question.key in self._answers:
+                    self._is_working = False
+                    return
             try:
                 found = self._find(question)
             except CliplocError as error:
@@ -124,19 +124,12 @@ class PhraseFinder:
                 logger.exception('CLIP finds no phrases for %s', question.landmark_id)
                 found = FoundPhrases((), f'CLIP offers no phrases: {type(error).__name__}: '
                                      f'{error}')
-            with self._condition:
+            with self._lock:
                 if len(self._answers) >= _MOST_KEPT:
                     self._answers.clear()
                 self._answers[question.key] = found
                 self._fault = found if self._weights is None else None
             self._listener()
-
-    def _next(self) -> Question | None:
-        with self._condition:
-            while not self._is_closed and (
-                    self._wanted is None or self._wanted.key in self._answers):
-                self._condition.wait()
-            return None if self._is_closed else self._wanted
 
     def _find(self, question: Question) -> FoundPhrases:
         if self._weights is None:

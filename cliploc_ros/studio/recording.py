@@ -181,24 +181,11 @@ class Recording:
 
 # ---- a landmark from boxes that a person drew ---------------------------------------------------
 
-class DrawnBox(NamedTuple):
-    """A box in an undistorted image [px], and the pose (4, 4) of this image."""
+def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
+              bboxes_xyxy: NDArray[np.float64]) -> tuple[Fit, str]:
+    """Return the ellipsoid that fits boxes of one object, and what is doubtful about it, or ''.
 
-    map_from_camera: NDArray[np.float64]
-    bbox_xyxy: tuple[float, float, float, float]
-
-
-class BoxFit(NamedTuple):
-    """An ellipsoid that fits drawn boxes."""
-
-    #: (3,), (3, 3): the basis' columns are the semi-axes [m]
-    center: NDArray[np.float64]
-    basis: NDArray[np.float64]
-    warning: str  #: What is doubtful about it; empty if nothing is
-
-
-def fit_boxes(camera: Camera, boxes: Sequence[DrawnBox]) -> BoxFit:
-    """Return the ellipsoid that fits boxes of one object.
+    The boxes (n, 4) lie in undistorted images [px] of n poses (n, 4, 4).
 
     Raises
     ------
@@ -206,20 +193,18 @@ def fit_boxes(camera: Camera, boxes: Sequence[DrawnBox]) -> BoxFit:
         There are fewer than two boxes, one is too small, or their rays do not meet in front of
         the cameras.
     """
-    if len(boxes) < 2:
-        raise EditError(f'create: {len(boxes)} boxes drawn; draw one in each of two images or '
-                        'more, best three')
-    for box in boxes:
-        left, top, right, bottom = box.bbox_xyxy
-        if not (right - left >= MIN_BOX_PX and bottom - top >= MIN_BOX_PX):
-            raise EditError(f'create: the box {box.bbox_xyxy} is smaller than {MIN_BOX_PX:g} '
-                            'pixels; draw it around the whole object')
-    count = len(boxes)
+    count = len(bboxes_xyxy)
+    if count < 2:
+        raise EditError(f'create: {count} boxes drawn; draw one in each of two images or more, '
+                        'best three')
+    for box in bboxes_xyxy:
+        if not (box[2:] - box[:2] >= MIN_BOX_PX).all():
+            raise EditError(f'create: the box {tuple(box.tolist())} is smaller than '
+                            f'{MIN_BOX_PX:g} pixels; draw it around the whole object')
     views = make_views(PosedDetections(
-        camera=camera, map_from_camera=np.array([box.map_from_camera for box in boxes]),
+        camera=camera, map_from_camera=map_from_camera,
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
-        bboxes_xyxy=np.array([box.bbox_xyxy for box in boxes], dtype=np.float64),
-        class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
+        bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
         scores=np.ones(count)), MappingOptions())
     # each box was drawn for itself: none shares the error of a detector that stood still
     views = views._replace(weights=np.ones(count))
@@ -235,7 +220,7 @@ def fit_boxes(camera: Camera, boxes: Sequence[DrawnBox]) -> BoxFit:
               key=lambda one: one.cost)
     offsets = fit.center - origins
     angle_deg = widest_angle_deg(offsets / np.linalg.norm(offsets, axis=1, keepdims=True))
-    return BoxFit(fit.center, fit.basis, '' if angle_deg >= LEAST_ANGLE_DEG else (
+    return fit, ('' if angle_deg >= LEAST_ANGLE_DEG else (
         f'the views are only {angle_deg:.0f} degrees apart, expected {LEAST_ANGLE_DEG:.0f} or '
         'more: distance and depth are uncertain; draw a box in a view from another side'))
 

@@ -29,14 +29,7 @@ from cliploc_ros.studio.images import (
 )
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
-from cliploc_ros.studio.recording import (
-    LEAST_BOXES,
-    MIN_BOX_PX,
-    Answer,
-    DrawnBox,
-    Recording,
-    fit_boxes,
-)
+from cliploc_ros.studio.recording import LEAST_BOXES, MIN_BOX_PX, Answer, Recording, fit_boxes
 
 Rgb = tuple[int, int, int]
 # Views of the whole recording in which the relocalizer is tried.
@@ -179,11 +172,9 @@ class Studio:
     def toggle_lock(self) -> str:
         """Lock the selection; unlock it if all of it is locked."""
         ids, landmarks = self._selected(), self.document.landmarks
-        if all(landmarks[key].is_locked for key in ids):
-            self.document.apply(edits.unlock(landmarks, ids))
-            return f'unlocked {", ".join(ids)}'
-        self.document.apply(edits.lock(landmarks, ids))
-        return f'locked {", ".join(ids)}'
+        are_locked = all(landmarks[key].is_locked for key in ids)
+        self.document.apply((edits.unlock if are_locked else edits.lock)(landmarks, ids))
+        return f'{"unlocked" if are_locked else "locked"} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""
@@ -262,8 +253,9 @@ class Studio:
         """Create a landmark from the drawn boxes, and select it."""
         recording, landmarks = self._recording(), self.document.landmarks
         detections = recording.detections
-        fit = fit_boxes(detections.camera, [DrawnBox(detections.map_from_camera[view], box)
-                                            for view, box in sorted(self.drawn.items())])
+        views = sorted(self.drawn)
+        fit, warning = fit_boxes(detections.camera, detections.map_from_camera[views],
+                                 np.array([self.drawn[view] for view in views]))
         change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
         (landmark_id,) = change.after
         rows = recording.boxes_of(change.apply(landmarks))[landmark_id]
@@ -273,7 +265,7 @@ class Studio:
         self.drawn.clear()
         hint = (f'{len(rows)} boxes of the recording show it: Refit fits it to them'
                 if len(rows) >= LEAST_BOXES else '')
-        return '; '.join(filter(None, [f'created {landmark_id}', fit.warning, hint]))
+        return '; '.join(filter(None, [f'created {landmark_id}', warning, hint]))
 
     # ---- the table ------------------------------------------------------------------------------
 

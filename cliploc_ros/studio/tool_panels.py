@@ -184,37 +184,29 @@ def _rgb(color: str) -> tuple[int, int, int]:
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
-class KeyframesPanel:
-    """A switch for the layer of keyframes, which is drawn when it is first shown."""
+def add_keyframes(actions: Actions, layer: KeyframeLayer) -> None:
+    """Add a switch for the layer of keyframes, which is drawn when it is first shown."""
+    scene, handles = actions.server.scene, list[Any]()
+    images = 'no images' if layer.images is None else 'small images'
+    box = actions.server.gui.add_checkbox(
+        'Show keyframes', False,
+        hint=f'{len(layer)} keyframes with {layer.offsets[-1]} points, {images}')
 
-    def __init__(self, actions: Actions, layer: KeyframeLayer):
-        self._scene, self._layer = actions.server.scene, layer
-        self._handles: list[Any] = []
-        images = 'no images' if layer.images is None else 'small images'
-        self._box = actions.server.gui.add_checkbox(
-            'Show keyframes', False,
-            hint=f'{len(layer)} keyframes with {layer.offsets[-1]} points, {images}')
-        self._box.on_update(lambda event: self._show())
-
-    def _show(self) -> None:
-        if self._box.value and not self._handles:
-            self._handles = self._draw()
-        for handle in self._handles:
-            handle.visible = self._box.value
-
-    def _draw(self) -> list[Any]:
-        """Draw where the keyframes were taken, and the points of their features."""
-        layer, shown = self._layer, some_cameras(len(self._layer))
-        step = max(1, -(-int(layer.offsets[-1]) // _MAX_POINTS))
-        points = np.concatenate([layer.points_in_map(row)[::step] for row in range(len(layer))])
-        return [
-            self._scene.add_line_segments(
+    @box.on_update
+    def _(event: Any) -> None:
+        if box.value and not handles:
+            shown, step = some_cameras(len(layer)), -(-int(layer.offsets[-1]) // _MAX_POINTS)
+            points = np.concatenate([layer.points_in_map(row)[::max(1, step)]
+                                     for row in range(len(layer))])
+            handles.append(scene.add_line_segments(
                 '/keyframes/cameras',
                 frusta(layer.camera, layer.map_from_camera[shown], _KEYFRAME_FRUSTUM_M),
-                _KEYFRAME_RGB, thickness=2.0, thickness_units='screen'),
-            self._scene.add_point_cloud('/keyframes/points', points.astype(np.float32),
-                                        _KEYFRAME_RGB, point_size=_POINT_M,
-                                        point_shape='circle')]
+                _KEYFRAME_RGB, thickness=2.0, thickness_units='screen'))
+            handles.append(scene.add_point_cloud(
+                '/keyframes/points', points.astype(np.float32), _KEYFRAME_RGB,
+                point_size=_POINT_M, point_shape='circle'))
+        for handle in handles:
+            handle.visible = box.value
 
 
 class LivePanel:

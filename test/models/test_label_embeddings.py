@@ -1,17 +1,25 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Label embeddings on disk: hits, damaged files, and failures that only cost the cache."""
+"""Embeddings of labels and phrases: the cache on disk, its failures, and weighted labels."""
 
 import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.models import label_embeddings
+from cliploc_ros.models.clip_encoder import encode_labels
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
+from cliploc_ros.models.phrase_embeddings import embed_phrases
 
 KEY = 'ViT-B-32:gelu:0123'
 LABELS = ['a red mug', 'tasse bleue é', "it's \0 odd"]
@@ -146,3 +154,96 @@ def test_what_killed_writers_left_is_cleared(cache):
     os.utime(old, (0, 0))
     cache.store(KEY, ['another'], unit_rows(1))
     assert not old.exists() and young.exists()
+
+
+# ---- several labels of a landmark make one embedding
+
+AXES = {'a': [1.0, 0, 0], 'b': [0, 1.0, 0], 'c': [0, 0.6, 0.8]}
+
+
+def encode(labels):
+    return np.array([AXES[label] for label in labels], dtype=np.float32)
+
+
+def test_the_weighted_mean_in_numbers():
+    rows = mixed_rows([(('a', 3.0), ('b', 4.0)), (('c', 0.2),), (('b', 1.0), ('c', 1.0))],
+                      encode, 3)
+    assert rows.dtype == np.float32
+    assert rows[0] == pytest.approx([0.6, 0.8, 0.0])
+    assert np.array_equal(rows[1], encode('c')[0])  # to the last bit
+    assert rows[2] == pytest.approx(np.array([0.0, 1.6, 0.8]) / np.sqrt(3.2))
+
+
+def test_each_label_is_encoded_once_and_parts_change_nothing(monkeypatch):
+    rng = np.random.default_rng(0)
+    descriptions = [tuple((f'{number:03d}', float(weight)) for number, weight in zip(
+        rng.choice(100, 6, replace=False), rng.uniform(0.1, 1, 6), strict=True))
+        for _ in range(70)]
+    embeddings = {f'{number:03d}': row for number, row in enumerate(
+        rng.normal(size=(100, 8)).astype(np.float32))}
+    asked = []
+
+    def encode_some(labels):
+        asked.append(list(labels))
+        return np.array([embeddings[label] for label in labels])
+
+    whole = mixed_rows(descriptions, encode_some, 8)
+    monkeypatch.setattr(label_embeddings, 'PART', 16)
+    monkeypatch.setattr(label_embeddings, '_BLOCK', 32)
+    assert mixed_rows(descriptions, encode_some, 8) == pytest.approx(whole, abs=1e-6)
+    assert max(map(len, asked[1:])) == 16
+    assert list(chain(*asked[1:])) == asked[0] == sorted(set(asked[0]))
+    assert np.linalg.norm(whole, axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_no_labels():
+    assert mixed_rows([], encode, 3).shape == (0, 3)
+
+
+def test_a_label_beside_the_list_counts_like_the_best():
+    """As a name that a person gave a landmark which build_map had described."""
+    one = LandmarkDetails(labels=(('a red mug', 0.5), ('a cup', 0.2)))
+    assert one.labels_with('a cup') == one.labels
+    assert one.labels_with('my mug') == (('my mug', 0.5), *one.labels)
+    assert LandmarkDetails().labels_with('my mug') == (('my mug', 1.0),)
+
+
+# ---- phrases are encoded once, class by class
+
+PHRASES = {'mug': ('a red mug', 'a blue mug with white dots'), 'box': ('a box',)}
+
+
+@pytest.fixture
+def clip(tmp_path):
+    assets = PROJECT / 'cliploc_ros/demo/assets'
+    return ClipOptions(model=str(assets / 'clip.json'), device='cpu', cache_dir=str(tmp_path),
+                       pretrained=str(assets / 'clip.safetensors'))
+
+
+def test_each_class_is_encoded_once(clip, caplog):
+    weights = resolve_clip_weights(clip)
+    found = embed_phrases(weights, clip, PHRASES)
+    assert list(found) == list(PHRASES)
+    for name, texts in PHRASES.items():
+        alone = encode_labels(weights, texts, torch.device('cpu'))
+        np.testing.assert_allclose(found[name], alone, atol=1e-6)
+    assert 'CLIP reads 3 phrases of 2 classes' in caplog.text
+    caplog.clear()
+    more = embed_phrases(weights, clip, PHRASES | {'can': ('a can', 'a tin')})
+    assert 'CLIP reads 2 phrases of 1 classes' in caplog.text
+    caplog.clear()
+    again = embed_phrases(weights, clip, {'can': ('a can', 'a tin'), 'mug': PHRASES['mug']})
+    assert caplog.text == ''
+    assert list(again) == ['can', 'mug']
+    np.testing.assert_array_equal(again['can'], more['can'])
+    np.testing.assert_array_equal(again['mug'], found['mug'])
+    assert embed_phrases(weights, clip, {}) == {}
+
+
+def test_without_a_place_for_the_cache_phrases_are_encoded_all_the_same(clip, tmp_path, caplog):
+    file = tmp_path / 'file'
+    file.write_text('')
+    nowhere = replace(clip, cache_dir=str(file / 'cache'))
+    found = embed_phrases(resolve_clip_weights(nowhere), nowhere, PHRASES)
+    assert found['mug'].shape == (2, 128)
+    assert 'are not cached' in caplog.text

@@ -114,30 +114,20 @@ def small_cache(small_clip, tmp_path_factory) -> Path:
     return folder
 
 
-def cut_weights(folder):
-    os.truncate(folder / 'network.bin', 1000)
-
-
 def change_weights(folder):
     with (folder / 'network.bin').open('r+b') as file:
         file.seek(50_000)
         file.write(bytes(5_000))
 
 
-def remove_network(folder):
-    (folder / 'network.xml').unlink()
-
-
-def empty_description(folder):
-    (folder / 'about.json').write_text('')
-
-
-def foreign_description(folder):
-    (folder / 'about.json').write_text('{"identity": ["another"]}')
-
-
 @pytest.mark.parametrize('damage', [
-    cut_weights, change_weights, remove_network, empty_description, foreign_description])
+    lambda folder: os.truncate(folder / 'network.bin', 1000), change_weights,
+    lambda folder: (folder / 'network.xml').unlink(),
+    lambda folder: (folder / 'probe.npz').write_bytes(b'PK'),
+    lambda folder: (folder / 'about.json').write_text(''),
+    lambda folder: (folder / 'about.json').write_text('{"identity": ["another"]}'),
+], ids=['short weights', 'changed weights', 'no network', 'no probe', 'no description',
+        'of another network'])
 def test_a_damaged_cache_is_made_anew(small_clip, small_cache, tmp_path, image_rgb, caplog,
                                       damage):
     shutil.copytree(small_cache, tmp_path, dirs_exist_ok=True)

@@ -75,7 +75,7 @@ def demo_studio(path):
 @contextmanager
 def open_page(studio, host='127.0.0.1'):
     """Serve the page of a studio; yield its URL and the server, and close the document."""
-    from cliploc_ros.studio.server import serve_studio
+    from cliploc_ros.studio.page import serve_studio
 
     try:
         with serve_studio(studio, host, 0) as (url, server):

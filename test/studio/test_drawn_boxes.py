@@ -15,7 +15,7 @@ from cliploc_ros.mapping.views import camera_centers, make_views
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import Landmark, shape_fields
-from cliploc_ros.studio.recording import DrawnBox, Recording, fit_boxes
+from cliploc_ros.studio.recording import Recording, fit_boxes
 
 TRIALS_PER_LANDMARK = 6
 
@@ -44,10 +44,11 @@ def draw_triple(directions, rng):
 def draw_boxes(office, script, rng):
     """Yield three boxes of one landmark and the rows of its other views.
 
-    The script tells which rows may be drawn, and how: as the detector does unless it says more.
+    The boxes come with their poses, as fit_boxes takes them. The script tells which rows may be
+    drawn, and how: as the detector does unless it says more.
     """
     detections, views, landmarks, shown = office
-    drawn_box = script.get('draw', lambda row, *_: tuple(detections.bboxes_xyxy[row]))
+    drawn_box = script.get('draw', lambda row, *_: detections.bboxes_xyxy[row])
     for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
         rows = rows[~views.is_open[rows].any(axis=1)]
         if len(rows) < 30:
@@ -63,17 +64,17 @@ def draw_boxes(office, script, rng):
             if triple is None:
                 break
             drawn = rows[drawable[triple]]
-            yield [DrawnBox(detections.map_from_camera[views.frames[row]],
-                            drawn_box(row, center, basis)) for row in drawn], np.setdiff1d(
-                                rows, drawn)
+            boxes = np.array([drawn_box(row, center, basis) for row in drawn])
+            yield ((detections.map_from_camera[views.frames[drawn]], boxes),
+                   np.setdiff1d(rows, drawn))
 
 
 def iou_in_other_views(office, script):
     detections, views = office[:2]
     medians = []
     for boxes, others in draw_boxes(office, script, np.random.default_rng(0)):
-        fit = fit_boxes(detections.camera, boxes)
-        assert fit.warning == ''
+        fit, warning = fit_boxes(detections.camera, *boxes)
+        assert warning == ''
         medians.append(np.median(ious_with(views, others, fit.center, fit.basis)))
     return np.array(medians)
 
@@ -92,7 +93,7 @@ def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, least):
         assert project_box(views.rotations[frame], views.translations[frame], center, basis, box)
         edges = box * np.tile([camera.fx, camera.fy], 2) + np.tile([camera.cx, camera.cy], 2)
         extents = np.tile(edges[2:] - edges[:2], 2)
-        return tuple(edges + rng.normal(0.0, 0.03, 4) * extents)
+        return edges + rng.normal(0.0, 0.03, 4) * extents
 
     medians = iou_in_other_views(office, {
         'min_iou': 0.8 if 'fit' in name else 0.2,
@@ -115,7 +116,7 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
     drawn, unseen = {}, {}
     for boxes, others in draw_boxes(office, {'min_iou': 0.2, 'frames': half},
                                     np.random.default_rng(0)):
-        fit, number = fit_boxes(detections.camera, boxes), shown[others[0]]
+        (fit, _), number = fit_boxes(detections.camera, *boxes), shown[others[0]]
         drawn[str(number)] = Landmark({
             'label': 'x', 'class_id': detections.class_names[landmarks.classes[number]],
             **shape_fields(fit.center, fit.basis)})
@@ -133,22 +134,20 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
 
 def test_views_that_look_alike_are_warned_of(office):
     detections, views, landmarks, shown = office
-    rows = group_boxes(shown, len(landmarks.centers))[0]
-    boxes = [DrawnBox(detections.map_from_camera[views.frames[row]],
-                      tuple(detections.bboxes_xyxy[row])) for row in rows[:3]]
-    assert 'degrees apart' in fit_boxes(detections.camera, boxes).warning
+    rows = group_boxes(shown, len(landmarks.centers))[0][:3]
+    _, warning = fit_boxes(detections.camera, detections.map_from_camera[views.frames[rows]],
+                           detections.bboxes_xyxy[rows])
+    assert 'degrees apart' in warning
 
 
-def test_what_is_no_object_is_refused():
+@pytest.mark.parametrize(('second', 'distance_m', 'message'), [
+    (None, 0.0, '1 boxes drawn'), ((10.0, 10.0, 12.0, 50.0), 1.0, 'smaller than 4 pixels'),
+    ((300.0, 220.0, 340.0, 260.0), 0.0, 'along one line'),
+    ((500.0, 220.0, 540.0, 260.0), 1.0, 'behind a camera')])
+def test_what_is_no_object_is_refused(second, distance_m, message):
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-    here, there = np.eye(4), np.eye(4)
-    there[0, 3] = 1.0
-    box = DrawnBox(here, (300.0, 220.0, 340.0, 260.0))
-    with pytest.raises(EditError, match='1 boxes drawn'):
-        fit_boxes(camera, [box])
-    with pytest.raises(EditError, match='smaller than 4 pixels'):
-        fit_boxes(camera, [box, DrawnBox(there, (10.0, 10.0, 12.0, 50.0))])
-    with pytest.raises(EditError, match='along one line'):
-        fit_boxes(camera, [box, box])
-    with pytest.raises(EditError, match='behind a camera'):
-        fit_boxes(camera, [box, DrawnBox(there, (500.0, 220.0, 540.0, 260.0))])
+    poses = np.array([np.eye(4), np.eye(4)])
+    poses[1, 0, 3] = distance_m
+    boxes = np.array([(300.0, 220.0, 340.0, 260.0)] + ([] if second is None else [second]))
+    with pytest.raises(EditError, match=message):
+        fit_boxes(camera, poses[:len(boxes)], boxes)

@@ -35,7 +35,7 @@ from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import open_images, views_of_folder
 from cliploc_ros.studio.landmark import map_of
-from cliploc_ros.studio.recording import DrawnBox, Recording, fit_boxes
+from cliploc_ros.studio.recording import Recording, fit_boxes
 from cliploc_ros.studio.studio import Studio
 
 OBJECTS = 12
@@ -121,8 +121,8 @@ def fitted(drawn, views):
     """Return the map that the studio makes of drawn boxes."""
     landmarks = {}
     for one, boxes in drawn:
-        fit = fit_boxes(views.camera, [DrawnBox(views.map_from_camera[view], tuple(box))
-                                       for view, box in boxes.items()])
+        fit, _ = fit_boxes(views.camera, views.map_from_camera[list(boxes)],
+                           np.array(list(boxes.values()), dtype=float))
         landmarks = edits.create(landmarks, one.label, one.class_id, fit.center, fit.basis
                                  ).apply(landmarks)
     return map_of(landmarks, 'map', 'drawn')
