@@ -220,10 +220,10 @@ class Problem(NamedTuple):
         cost += 0.5 * float((pull * state.errors).sum())
         if self.steps is None:
             return cost, equations
-        moved = self.steps.linearize(state.views)
-        return cost + moved.cost, equations._replace(
-            of_poses=equations.of_poses + moved.of_poses, of_steps=moved.of_steps,
-            pose_gradient=equations.pose_gradient + moved.gradient)
+        own_cost, of_poses, of_steps, gradient = self.steps.linearize(state.views)
+        return cost + own_cost, equations._replace(
+            of_poses=equations.of_poses + of_poses, of_steps=of_steps,
+            pose_gradient=equations.pose_gradient + gradient)
 
     def solve(self, equations: Equations, damping: float
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
