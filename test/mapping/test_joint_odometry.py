@@ -188,6 +188,9 @@ def test_poses_that_are_taken_as_they_are_need_no_odometry(linked):
             ).all()
 
 
-def test_selected_frames_keep_their_odometry(linked):
-    chosen = linked.select_frames([3, 5])
-    assert (chosen.odom_from_camera == linked.odom_from_camera[[3, 5]]).all()
+def test_selected_frames_keep_what_belongs_to_them(linked):
+    depths = np.arange(len(linked.classes), dtype=np.float32)
+    chosen = replace(linked, depths=depths).select_frames([5, 3])
+    assert (chosen.odom_from_camera == linked.odom_from_camera[[5, 3]]).all()
+    rows = np.r_[np.arange(*linked.frame_offsets[5:7]), np.arange(*linked.frame_offsets[3:5])]
+    assert (chosen.depths == depths[rows]).all()
