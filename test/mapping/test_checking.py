@@ -19,10 +19,13 @@ from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
-from cliploc_ros.mapping.checking.detector_model import measure_detector
 from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
 from cliploc_ros.mapping.checking.places import LookAlike, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import make_folds, try_recording
+from cliploc_ros.mapping.checking.relocalization import (
+    make_folds,
+    measure_detector,
+    try_recording,
+)
 from cliploc_ros.mapping.options import CheckOptions, MappingOptions, Thresholds
 from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import make_views

@@ -13,11 +13,6 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.building import Progress
 from cliploc_ros.mapping.checking.advice import give_advice
-from cliploc_ros.mapping.checking.detector_model import (
-    DetectorModel,
-    guess_detector,
-    measure_detector,
-)
 from cliploc_ros.mapping.checking.landmark_faults import (
     Witness,
     check_landmarks,
@@ -30,6 +25,7 @@ from cliploc_ros.mapping.checking.relocalization import (
     Trial,
     box_quality,
     make_folds,
+    measure_detector,
     sample_frames,
     try_observations,
     try_poses,
@@ -48,6 +44,7 @@ from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import Views, check_input, make_views
+from cliploc_ros.simulation.detector import DetectorModel, guess_detector
 
 _NOTES = (
     'similarities of crops and labels are simulated, except for queries: labels of equal text '
@@ -86,7 +83,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     recorded = None if detections is None else detections.map_from_camera
     if detections is None:
         notes.append(_NO_RECORDING)
-        model = guess_detector(landmark_map, options.mapping)
+        model = guess_detector(landmark_map, (options.mapping.edge_sigma_px,
+                                              options.mapping.edge_sigma_share))
     else:
         tell('judging landmarks', 0.0)
         views = make_views(detections, options.mapping)

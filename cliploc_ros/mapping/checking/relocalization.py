@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Cross-validation over time: landmarks fitted to some blocks of a recording, judged on others."""
+"""Relocalize in recorded frames, with maps fitted to others, and in simulated ones."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,15 +14,19 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.mapping.checking.detector_model import DetectorModel
 from cliploc_ros.mapping.checking.landmark_faults import Witness
-from cliploc_ros.mapping.evidence import explained
+from cliploc_ros.mapping.evidence import REACH, best_ious, explained, is_expected
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes
-from cliploc_ros.mapping.options import CheckOptions
+from cliploc_ros.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.views import Views
+from cliploc_ros.mapping.systematic import linearize_boxes
+from cliploc_ros.mapping.views import Views, camera_centers
+from cliploc_ros.simulation.detector import GUESSED_MIN_SIDE_PX, DetectorModel, Sightings
 from cliploc_ros.simulation.labels import LabelModel
+
+_MAX_SAMPLED_FRAMES = 600
+_CLUTTER_IOU = 0.1
 
 Verdict = Literal['accepted', 'refused', 'misled']
 Tell = Callable[[float], None]
@@ -85,6 +89,46 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
 def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
     """Return how well landmarks explain boxes, by the best IoU of each with one of its class."""
     return BoxQuality(len(ious), *explained(ious))
+
+
+def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, options: MappingOptions) -> DetectorModel:
+    """Return the detector of a recording.
+
+    A landmark that was never detected does not exist: the model never detects it.
+    """
+    landmarks, cameras = witness.landmarks, camera_centers(views)
+    frames = np.arange(0, len(detections), -(-len(detections) // _MAX_SAMPLED_FRAMES))
+    reach, sightings = np.zeros(len(landmark_map)), []
+    for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
+        center, basis = landmarks.centers[row], landmarks.bases[row]
+        if len(rows):
+            offsets = center - cameras[views.frames[rows]]
+            reach[row] = REACH * np.linalg.norm(offsets, axis=1).max()
+        offsets = center - cameras
+        distances = np.linalg.norm(offsets, axis=1)
+        expected = frames[(is_expected(views, cameras, center, basis, reach[row])
+                           & (distances > 0.0))[frames]]
+        sightings.append(Sightings(offsets[expected] / distances[expected, None],
+                                    np.isin(expected, views.frames[rows])))
+    sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
+    min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
+    # the boxes that no landmark explains, by frame
+    is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
+    clutter = []
+    for frame in frames:
+        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
+        rows = rows[is_clutter[rows]]
+        clutter.append((detections.bboxes_xyxy[rows],
+                        tuple(detections.class_names[one] for one in detections.classes[rows])))
+    # the robust deviation of closed edges, in standard deviations
+    rows = np.nonzero(witness.shown >= 0)[0]
+    linear = linearize_boxes(views, rows, witness.shown[rows], landmarks)
+    residuals = np.abs(linear.residuals[linear.weights > 0.0])
+    scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
+    return DetectorModel(
+        landmark_map, detections.camera, tuple(sightings), witness.evidence.seen_ratio, reach,
+        (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
 
 
 class PosedObservation(NamedTuple):
