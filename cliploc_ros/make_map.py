@@ -57,15 +57,8 @@ class Labeller:
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
         """Return the map with labels, and its image embeddings.
 
-        Parameters
-        ----------
-        shown : ndarray (n,) of int
-            Row of the landmark that each box shows, -1 for none.
-
-        Raises
-        ------
-        CliplocError
-            The text tower cannot be loaded.
+        The array shown (n,) has the row of the landmark that each box shows, -1 for none.
+        CliplocError: the text tower cannot be loaded.
         """
         if not _has_embeddings(detections):
             return landmark_map, None

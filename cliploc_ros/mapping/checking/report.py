@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a check: figures, verdict and advice."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -195,44 +195,32 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
     """Return the thresholds that a report misses."""
     failures = []
 
-    def demand(is_met: bool, text: str) -> None:
-        if not is_met:
-            failures.append(text)
+    def percent(value: float) -> str:
+        """Return a share with enough digits to show that it is below its limit."""
+        return f'{100.0 * value:.4g} %'
+
+    def demand(text: str, value: float, limit: float, is_most: bool,
+               show: Callable[[float], str] = percent) -> None:
+        if value > limit if is_most else value < limit:
+            failures.append(f'{text}: {show(value)} {">" if is_most else "<"} {show(limit)}')
 
     views = [*report.grid.trials, *report.queries]
-    demand(report.faulty <= limits.max_faulty,
-           f'landmarks with a serious fault: {_percent(report.faulty)} > '
-           f'{_percent(limits.max_faulty)}')
-    demand(report.duplicates <= limits.max_duplicates,
-           f'pairs of duplicates: {report.duplicates} > {limits.max_duplicates}')
-    demand(len(report.look_alikes) <= limits.max_look_alikes,
-           f'pairs of places that look alike: {len(report.look_alikes)} > '
-           f'{limits.max_look_alikes}')
+    demand('landmarks with a serious fault', report.faulty, limits.max_faulty, True)
+    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, str)
+    demand('pairs of places that look alike', len(report.look_alikes), limits.max_look_alikes,
+           True, str)
     if (recording := report.recording) is not None:
         views += recording.trials
-        quality = recording.held_out
-        demand(quality.explained >= limits.min_explained,
-               f'held-out boxes explained: {_percent(quality.explained)} < '
-               f'{_percent(limits.min_explained)}')
-        demand(quality.median_iou >= limits.min_iou,
-               f'held-out median IoU: {quality.median_iou:.4g} < {limits.min_iou:g}')
-        accepted = share(recording.trials, 'accepted')
-        demand(accepted >= limits.min_accepted,
-               f'recorded frames accepted: {_percent(accepted)} < '
-               f'{_percent(limits.min_accepted)}')
-    positions = report.grid.accepted_positions
-    demand(positions >= limits.min_positions,
-           f'positions with an accepted heading: {_percent(positions)} < '
-           f'{_percent(limits.min_positions)}')
-    misled = share(views, 'misled')
-    demand(misled <= limits.max_misled,
-           f'views that mislead a robot: {_percent(misled)} > {_percent(limits.max_misled)}')
+        demand('held-out boxes explained', recording.held_out.explained, limits.min_explained,
+               False)
+        demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
+               '{:.4g}'.format)
+        demand('recorded frames accepted', share(recording.trials, 'accepted'),
+               limits.min_accepted, False)
+    demand('positions with an accepted heading', report.grid.accepted_positions,
+           limits.min_positions, False)
+    demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
     return failures
-
-
-def _percent(value: float) -> str:
-    """Return a share with enough digits to show that it is below its limit."""
-    return f'{100.0 * value:.4g} %'
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:
@@ -242,13 +230,7 @@ def share(trials: Sequence[Trial], verdict: str) -> float:
 
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
-    """Return what keyframes reach.
-
-    Parameters
-    ----------
-    recorded : ndarray (F, 4, 4), optional
-        Poses map_from_camera of a recording.
-    """
+    """Return what keyframes reach; recorded (F, 4, 4) has the poses of a recording."""
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
     reached = in_reach(layer, np.array([one.position for one in grid.trials]),
                        np.array([one.forward for one in grid.trials]))
@@ -261,10 +243,7 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
              forward: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which views (n,) have a keyframe within reach.
 
-    Parameters
-    ----------
-    positions, forward : ndarray (n, 3)
-        Of the cameras: where they are [m], and the unit vectors along which they look.
+    Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """
     places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
     found = np.zeros(len(positions), dtype=np.bool_)
