@@ -86,6 +86,15 @@ def test_imports_point_downwards():
     assert not upward, '\n' + '\n'.join(upward)
 
 
+def test_the_acceptance_names_its_modules():
+    folder = PROJECT / ROOT / 'core/acceptance'
+    text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text()))
+    named = [name for line in text.splitlines() if line and not line.startswith((' ', 'Whether'))
+             for name in line.split(', ') if line[0].islower()]
+    assert sorted(named) == sorted(path.stem for path in folder.glob('*.py')
+                                   if path.stem != '__init__')
+
+
 def test_importing_the_package_imports_no_library():
     code = (f'import sys; before = set(sys.modules); import {ROOT}\n'
             "print(sorted({'rclpy', 'torch', 'numpy'} & (set(sys.modules) - before)))")

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Setting,
-    Support,
-    confidences,
-    none_right,
-    support,
-    utilities,
-)
+from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
 from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
