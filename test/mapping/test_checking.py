@@ -17,11 +17,11 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-from cliploc_ros.mapping.checking.advice import give_advice
-from cliploc_ros.mapping.checking.checking import check_map
-from cliploc_ros.mapping.checking.landmark_faults import find_map_overlaps, hear_witness
-from cliploc_ros.mapping.checking.places import LookAlike, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import (
+from cliploc_ros.mapping.check.advice import give_advice
+from cliploc_ros.mapping.check.checking import check_map
+from cliploc_ros.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.mapping.check.places import LookAlike, find_look_alikes, make_grid
+from cliploc_ros.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     try_recording,

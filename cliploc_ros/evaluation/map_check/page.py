@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.evaluation.output import write_text
-from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
-from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts
-from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, RecordingCheck, share
+from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts
+from cliploc_ros.mapping.check.report import SERIOUS, CheckReport, RecordingCheck, share
 
 PAGE, DATA = 'check.html', 'check.json'
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'

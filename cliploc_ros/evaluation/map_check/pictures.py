@@ -30,9 +30,9 @@ from cliploc_ros.evaluation.map_check.page import (
     VERDICT_COLORS,
     grade,
 )
-from cliploc_ros.mapping.checking.places import RADIUS_M
-from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, refused_spans
-from cliploc_ros.mapping.checking.report import CheckReport
+from cliploc_ros.mapping.check.places import RADIUS_M
+from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts, refused_spans
+from cliploc_ros.mapping.check.report import CheckReport
 
 _DPI = 110
 _MARGIN_M = 0.4

@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.mapping.checking.landmark_faults import Witness
+from cliploc_ros.mapping.check.landmark_faults import Witness
 from cliploc_ros.mapping.evidence import REACH, best_ious, explained, is_expected
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes

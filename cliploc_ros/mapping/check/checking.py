@@ -12,15 +12,15 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.building import Progress
-from cliploc_ros.mapping.checking.advice import give_advice
-from cliploc_ros.mapping.checking.landmark_faults import (
+from cliploc_ros.mapping.check.advice import give_advice
+from cliploc_ros.mapping.check.landmark_faults import (
     Witness,
     check_landmarks,
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.mapping.checking.places import Grid, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import (
+from cliploc_ros.mapping.check.places import Grid, find_look_alikes, make_grid
+from cliploc_ros.mapping.check.relocalization import (
     PosedObservation,
     Trial,
     box_quality,
@@ -31,7 +31,7 @@ from cliploc_ros.mapping.checking.relocalization import (
     try_poses,
     try_recording,
 )
-from cliploc_ros.mapping.checking.report import (
+from cliploc_ros.mapping.check.report import (
     BlockQuality,
     CheckReport,
     GridCheck,

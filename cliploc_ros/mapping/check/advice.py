@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.mapping.checking.places import RADIUS_M, LookAlike
-from cliploc_ros.mapping.checking.relocalization import Trial, refused_spans
-from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, GridCheck
+from cliploc_ros.mapping.check.places import RADIUS_M, LookAlike
+from cliploc_ros.mapping.check.relocalization import Trial, refused_spans
+from cliploc_ros.mapping.check.report import SERIOUS, CheckReport, GridCheck
 
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # A shorter run of refused frames is no side of a room.

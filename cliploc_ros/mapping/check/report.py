@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
-from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck, Overlap
-from cliploc_ros.mapping.checking.places import LookAlike
-from cliploc_ros.mapping.checking.relocalization import BoxQuality, Trial, count_verdicts
+from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck, Overlap
+from cliploc_ros.mapping.check.places import LookAlike
+from cliploc_ros.mapping.check.relocalization import BoxQuality, Trial, count_verdicts
 from cliploc_ros.mapping.options import Thresholds
 from cliploc_ros.mapping.systematic import Correction
 
