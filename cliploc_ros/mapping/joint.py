@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-A process of errors holds on to the given poses (cliploc_ros.mapping.joint). Odometry, where
+A process of errors holds on to the given poses (Prior). Odometry, where
 there is any, joins successive frames (cliploc_ros.mapping.odometry). Box edges give the same
 residuals as in cliploc_ros.mapping.fitting.
 
