@@ -18,6 +18,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.joint import Anchors, pose_changes, refine_jointly
+from cliploc_ros.mapping.labelling import classes_of
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views, camera_from_map, map_from_cameras
@@ -71,9 +72,8 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...], options: Upd
     """Return the landmarks of a map for a recording with some classes."""
     details = old.details or (LandmarkDetails(),) * len(old)
     numbers = {name: number for number, name in enumerate(class_names)}
-    names = [(row, numbers[name]) for row, one in enumerate(details)
-             for name in dict.fromkeys((old.class_ids[row], *dict(one.class_weights or ())))
-             if name in numbers]
+    names = [(row, numbers[name]) for row in range(len(old))
+             for name in classes_of(old, row) if name in numbers]
     owners, classes = np.array(names, dtype=np.int64).reshape(-1, 2).T
     landmarks = landmarks_of_map(old, class_names)
     first = np.full(len(old), -1, dtype=np.int64)

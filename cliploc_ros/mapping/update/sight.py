@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.landmarks import Landmarks, project_box
+from cliploc_ros.mapping.landmarks import Landmarks, is_in_image, project_box
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views
 
-# Share of a place's box that must lie in the image.
-_SHOWN_SHARE = 0.6
 # A landmark as near as this share of a place's distance is beside the place, not before it.
 _BESIDE_SHARE = 0.8
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
@@ -116,8 +114,11 @@ def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, besi
                 was_seen[shown[row]] = True
         for i in range(in_front):
             place = near[i]
-            if distances[place] > reaches[place] or not _is_whole(
-                    boxes[place], views.bounds, least[place]):
+            box = boxes[place]
+            if distances[place] > reaches[place] or not is_in_image(box, views.bounds):
+                continue
+            # large enough to be detected
+            if (box[2] - box[0]) * (box[3] - box[1]) < least[place] * least[place]:
                 continue
             if not _has_beside(place, near[:in_front], was_seen, offsets, distances,
                                beside_cosine):
@@ -161,16 +162,6 @@ def _project_near(rotation, translation, centers, bases, farthest, boxes, offset
         near[count] = place
         count += 1
     return count
-
-
-@compiled
-def _is_whole(box, bounds, least):
-    """Tell whether most of a box is in the image, and the box large enough to be detected."""
-    area = (box[2] - box[0]) * (box[3] - box[1])
-    width = min(box[2], bounds[2]) - max(box[0], bounds[0])
-    height = min(box[3], bounds[3]) - max(box[1], bounds[1])
-    return (width > 0.0 and height > 0.0 and width * height > _SHOWN_SHARE * area
-            and area >= least * least)
 
 
 @compiled
