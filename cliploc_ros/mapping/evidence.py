@@ -164,11 +164,7 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                     ) -> tuple[float, float]:
     """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int, optional
-        The landmark that each box shows, -1 for none: explains a box although the landmark's
-        class is another one.
+    The landmark that a box shows explains it although its class is another one.
     """
     ious = best_ious(views, landmarks)
     if shown is not None:

@@ -15,7 +15,8 @@ from walk import CAMERA, make_table, see, walk_around
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
-from cliploc_ros.evaluation.map_check.output import DATA, PAGE, write_report
+from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
+from cliploc_ros.evaluation.map_check.pictures import draw_pictures
 from cliploc_ros.mapping.checking.advice import give_advice
 from cliploc_ros.mapping.checking.checking import check_map
 from cliploc_ros.mapping.checking.detector_model import measure_detector
@@ -379,7 +380,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     named = replace(doubled, frame_id=hostile, labels=(hostile, *doubled.labels[1:]),
                     landmark_ids=(hostile, *doubled.landmark_ids[1:]))
     report = check_map(named, detections, options=QUICK)
-    write_report(tmp_path, hostile, named, report)
+    write_report(tmp_path, hostile, report, draw_pictures(named, report))
     page = (tmp_path / PAGE).read_text()
     tags = _Tags()
     tags.feed(page)

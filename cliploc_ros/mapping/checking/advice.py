@@ -6,7 +6,7 @@ Causes come before what they lead to: a robot that is misled in a place with a d
 an advice of its own.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,16 +33,69 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 def give_advice(report: CheckReport) -> list[str]:
     """Return what to do, one sentence or two each."""
-    advice = [*_on_look_alikes(report), *_on_duplicates(report), *_on_few_views(report),
-              *_on_landmarks(report), *_on_corrections(report), *_on_misled(report),
-              *_on_spans(report), *_on_grid(report), *_on_keyframes(report)]
+    advice = [*_on_look_alikes(report), *_on_landmarks(report), *_on_corrections(report),
+              *_on_misled(report), *_on_spans(report), *_on_grid(report)]
     return advice or ['nothing to do: the map reaches all thresholds that were checked']
 
 
-def _misled(report: CheckReport) -> list[Trial]:
-    trials = [*(report.recording.trials if report.recording else ()), *report.queries,
-              *report.grid.trials]
-    return [one for one in trials if one.verdict == 'misled']
+def _some(texts: Sequence[str], what: str) -> list[str]:
+    """Return the first texts, and how many more there are."""
+    more = [f'and {len(texts) - _MOST_OF_A_KIND} more {what}']
+    return [*texts[:_MOST_OF_A_KIND], *(more if len(texts) > _MOST_OF_A_KIND else [])]
+
+
+def _on_look_alikes(report: CheckReport) -> list[str]:
+    texts = []
+    for one in report.look_alikes:
+        matched = len(one.matched)
+        told_apart = ('their labels are equal, so nothing tells them apart: map an object that '
+                      'only one of them has, or describe what differs') \
+            if one.same_labels == matched else (
+            f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
+        mistaken = sum(_takes_for(trial, one) for trial in _misled(report))
+        distance_m = np.hypot(one.first[0] - one.second[0], one.first[1] - one.second[1])
+        alike = (f'the place around {_place(one.first)} looks the same when turned by '
+                 f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
+            f'the places around {_place(one.first)} and {_place(one.second)} look alike')
+        texts.append(f'{alike} ({matched} of {one.landmarks} landmarks)'
+                     + (f', and {mistaken} of the checked views are accepted in the wrong one'
+                        if mistaken else '') + f': {told_apart}')
+    return _some(texts, 'pairs of places that look alike')
+
+
+def _on_landmarks(report: CheckReport) -> Iterator[str]:
+    """Yield advice on duplicates, on too few views, and on faults of single landmarks."""
+    yield from _some([
+        f'{report.map_ids[one.first]} and {report.map_ids[one.second]} are the same object '
+        f'(normalized distance {one.distance:.2f}): delete one of them'
+        for one in report.overlaps if one.is_duplicate], 'pairs of duplicates')
+    if report.recording is not None:
+        frames = float(np.median([one.support or 0 for one in report.landmarks]))
+        unexplained = 1.0 - report.recording.as_given.explained
+        if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
+            yield (f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
+                   f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
+                   f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+    yield from _some([
+        f'{one.landmark_id} {one.faults[0]}' for one in report.landmarks
+        if one.severity >= SERIOUS and one.faults and 'same object as' not in one.faults[0]],
+        'landmarks with a serious fault: record the place again, and update the map')
+
+
+def _on_corrections(report: CheckReport) -> Iterator[str]:
+    found = [one for one in (report.recording.corrections if report.recording else ())
+             if one.is_significant]
+    if not found:
+        return
+    what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
+            'stamps': 'check the clock and the delay of the images'}
+    cause = max(found, key=lambda one: one.explained).cause
+    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
+               f'{one.deviation:.2f})'
+               for one in sorted(found, key=lambda one: -one.effect_px) if one.cause == cause]
+    others = sorted({one.cause for one in found} - {cause})
+    rivals = f'; an error of the {" or the ".join(others)} would look similar' if others else ''
+    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{rivals}'
 
 
 def _on_misled(report: CheckReport) -> Iterator[str]:
@@ -53,6 +106,45 @@ def _on_misled(report: CheckReport) -> Iterator[str]:
                f'{one.error_m:.1f} m: raise min_confidence, or map more distinct objects there')
     if len(wrong) > _MOST_MISLED:
         yield f'and {len(wrong) - _MOST_MISLED} more views that mislead'
+
+
+def _on_spans(report: CheckReport) -> Iterator[str]:
+    if report.recording is None:
+        return
+    for run in list(refused_spans(report.recording.trials))[:_MOST_OF_A_KIND]:
+        seen, halfway = int(np.median([one.landmarks for one in run])), run[len(run) // 2]
+        if len(run) < _MIN_SPAN or run[0].stamp_s is None or run[-1].stamp_s is None:
+            continue
+        if seen > _FEW_LANDMARKS and _sees_double(halfway.position, report):
+            continue
+        first = report.recording.trials[0].stamp_s or 0.0
+        middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
+        center = np.mean([one.position for one in run], axis=0)
+        what = 'record this side' if seen <= _FEW_LANDMARKS else (
+            'give these objects better labels, or record this side again')
+        yield (f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} looking '
+               f'{_heading(halfway)}, see {_landmarks(seen)} and none is accepted')
+
+
+def _on_grid(report: CheckReport) -> Iterator[str]:
+    """Yield advice on areas without an accepted heading, and on those without a keyframe."""
+    grid = report.grid
+    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
+        if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) <= 0.5:
+            yield (f'no heading is accepted at {_area(grid, rows)}: at most '
+                   f'{_landmarks(int(grid.visible[rows].max()))} can be expected in one view; map '
+                   'more objects that can be seen from there')
+    if report.keyframes is not None:
+        yield from _some([
+            f'no keyframe is within reach of {_area(grid, rows)}: drive there when the layer is '
+            'made again, or rely on the landmarks'
+            for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
+
+
+def _misled(report: CheckReport) -> list[Trial]:
+    trials = [*(report.recording.trials if report.recording else ()), *report.queries,
+              *report.grid.trials]
+    return [one for one in trials if one.verdict == 'misled']
 
 
 def _takes_for(trial: Trial, pair: LookAlike) -> bool:
@@ -74,112 +166,6 @@ def _sees_double(position: NDArray[np.float64], report: CheckReport) -> bool:
                for pair in report.look_alikes for place in (pair.first, pair.second))
 
 
-def _on_duplicates(report: CheckReport) -> Iterator[str]:
-    pairs = [one for one in report.overlaps if one.is_duplicate]
-    for one in pairs[:_MOST_OF_A_KIND]:
-        yield (f'{report.map_ids[one.first]} and {report.map_ids[one.second]} are the same object '
-               f'(normalized distance {one.distance:.2f}): delete one of them')
-    yield from _more(len(pairs), 'pairs of duplicates')
-
-
-def _on_few_views(report: CheckReport) -> Iterator[str]:
-    if report.recording is None:
-        return
-    frames = float(np.median([one.support or 0 for one in report.landmarks]))
-    unexplained = 1.0 - report.recording.as_given.explained
-    if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
-        yield (f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
-               f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass all '
-               f'objects slowly, until {_FEW_FRAMES} frames or more show each of them')
-
-
-def _on_landmarks(report: CheckReport) -> Iterator[str]:
-    faulty = [one for one in report.landmarks if one.severity >= SERIOUS and one.faults
-              and 'same object as' not in one.faults[0]]
-    for one in faulty[:_MOST_OF_A_KIND]:
-        yield f'{one.landmark_id} {one.faults[0]}'
-    yield from _more(len(faulty), 'landmarks with a serious fault: record the place again, and '
-                     'update the map')
-
-
-def _on_corrections(report: CheckReport) -> Iterator[str]:
-    found = [one for one in (report.recording.corrections if report.recording else ())
-             if one.is_significant]
-    if not found:
-        return
-    what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
-            'stamps': 'check the clock and the delay of the images'}
-    cause = max(found, key=lambda one: one.explained).cause
-    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
-               f'{one.deviation:.2f})'
-               for one in sorted(found, key=lambda one: -one.effect_px) if one.cause == cause]
-    others = sorted({one.cause for one in found} - {cause})
-    rivals = f'; an error of the {" or the ".join(others)} would look similar' if others else ''
-    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{rivals}'
-
-
-def _on_look_alikes(report: CheckReport) -> Iterator[str]:
-    for one in report.look_alikes[:_MOST_OF_A_KIND]:
-        matched = len(one.matched)
-        told_apart = ('their labels are equal, so nothing tells them apart: map an object that '
-                      'only one of them has, or describe what differs') \
-            if one.same_labels == matched else (
-            f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
-        mistaken = sum(_takes_for(trial, one) for trial in _misled(report))
-        distance_m = np.hypot(one.first[0] - one.second[0], one.first[1] - one.second[1])
-        alike = (f'the place around {_place(one.first)} looks the same when turned by '
-                 f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
-            f'the places around {_place(one.first)} and {_place(one.second)} look alike')
-        yield (f'{alike} ({matched} of {one.landmarks} landmarks)'
-               + (f', and {mistaken} of the checked views are accepted in the wrong one'
-                  if mistaken else '') + f': {told_apart}')
-    yield from _more(len(report.look_alikes), 'pairs of places that look alike')
-
-
-def _on_spans(report: CheckReport) -> Iterator[str]:
-    if report.recording is None:
-        return
-    for run in list(refused_spans(report.recording.trials))[:_MOST_OF_A_KIND]:
-        seen = int(np.median([one.landmarks for one in run]))
-        if len(run) < _MIN_SPAN or run[0].stamp_s is None or run[-1].stamp_s is None:
-            continue
-        if seen > _FEW_LANDMARKS and _sees_double(run[len(run) // 2].position, report):
-            continue
-        first = report.recording.trials[0].stamp_s or 0.0
-        middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
-        center = np.mean([one.position for one in run], axis=0)
-        what = 'record this side' if seen <= _FEW_LANDMARKS else (
-            'give these objects better labels, or record this side again')
-        yield (f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} looking '
-               f'{_heading(run[len(run) // 2])}, see {_landmarks(seen)} and none is '
-               'accepted')
-
-
-def _on_grid(report: CheckReport) -> Iterator[str]:
-    grid = report.grid
-    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
-        if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) > 0.5:
-            continue
-        low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
-        yield (f'no heading is accepted at {len(rows)} positions near the recording, x '
-               f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: at most '
-               f'{_landmarks(int(grid.visible[rows].max()))} can be expected in one view; map '
-               'more objects that can be seen from there')
-
-
-def _on_keyframes(report: CheckReport) -> Iterator[str]:
-    if report.keyframes is None:
-        return
-    areas = _areas(report.grid, report.keyframes.without)
-    for rows in areas[:_MOST_OF_A_KIND]:
-        places = report.grid.positions[rows]
-        low, high = places.min(axis=0), places.max(axis=0)
-        yield (f'no keyframe is within reach of {len(rows)} positions near the recording, x '
-               f'{low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}: drive there when '
-               'the layer is made again, or rely on the landmarks')
-    yield from _more(len(areas), 'areas that no keyframe reaches')
-
-
 def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Return rows of a grid as areas of neighbours, the largest first."""
     if len(dead) == 0:
@@ -193,9 +179,10 @@ def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return sorted((rows for rows in found if len(rows) >= _MIN_SPAN), key=len, reverse=True)
 
 
-def _more(count: int, what: str) -> Iterator[str]:
-    if count > _MOST_OF_A_KIND:
-        yield f'and {count - _MOST_OF_A_KIND} more {what}'
+def _area(grid: GridCheck, rows: NDArray[np.int64]) -> str:
+    low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
+    return (f'{len(rows)} positions near the recording, x {low[0]:.1f} to {high[0]:.1f}, y '
+            f'{low[1]:.1f} to {high[1]:.1f}')
 
 
 def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
@@ -204,8 +191,7 @@ def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
 
 def _heading(trial: Trial) -> str:
     """Return where a camera looks, as an angle from the map's x axis."""
-    angle = np.degrees(np.arctan2(trial.forward[1], trial.forward[0]))
-    return f'to {angle:.0f} degrees'
+    return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'
 
 
 def _count(number: int) -> str:

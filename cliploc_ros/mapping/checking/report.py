@@ -51,6 +51,17 @@ class RecordingCheck:
     corrections: tuple[Correction, ...]
     edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'frames': self.frames, 'boxes': self.boxes, 'duration_s': self.duration_s,
+            'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
+            'folds': [asdict(one) for one in self.folds], 'edge_scale': self.edge_scale,
+            'verdicts': count_verdicts(self.trials),
+            'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
+            'corrections': [asdict(one) for one in self.corrections],
+            'trials': [one.as_dict() for one in self.trials]}
+
 
 @dataclass(frozen=True)
 class GridCheck:
@@ -81,6 +92,20 @@ class GridCheck:
         """Return the share of the positions near the recording with an accepted heading."""
         near = self.accepted[self.is_near]
         return float((near > 0).mean()) if len(near) else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'headings': self.headings, 'spacing_m': self.spacing_m,
+            'accepted_positions_near_recording': self.accepted_positions,
+            'verdicts': count_verdicts(self.trials),
+            'positions': [
+                {'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
+                 'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
+                for row, near, accepted, misled, visible in zip(
+                    self.positions.round(3).tolist(), self.is_near, self.accepted, self.misled,
+                    self.visible, strict=True)],
+            'misled': [one.as_dict() for one in self.trials if one.verdict == 'misled']}
 
 
 @dataclass(frozen=True)
@@ -156,14 +181,13 @@ class CheckReport:
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
             'landmarks': [asdict(one) for one in self.landmarks],
-            'overlaps': [{'first': self.map_ids[one.first],
-                          'second': self.map_ids[one.second], 'distance': one.distance,
-                          'is_duplicate': one.is_duplicate}
+            'overlaps': [{'first': self.map_ids[one.first], 'second': self.map_ids[one.second],
+                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
                          for one in self.overlaps],
             'look_alikes': [asdict(one) for one in self.look_alikes],
-            'grid': _grid_dict(self.grid),
-            'recording': None if self.recording is None else _recording_dict(self.recording),
-            'queries': [_trial_dict(one) for one in self.queries],
+            'grid': self.grid.as_dict(),
+            'recording': None if self.recording is None else self.recording.as_dict(),
+            'queries': [one.as_dict() for one in self.queries],
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
 
 
@@ -214,39 +238,6 @@ def _percent(value: float) -> str:
 def share(trials: Sequence[Trial], verdict: str) -> float:
     """Return the share of the trials with a verdict; 0 of none."""
     return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
-
-
-def _grid_dict(grid: GridCheck) -> dict[str, Any]:
-    return {
-        'headings': grid.headings, 'spacing_m': grid.spacing_m,
-        'accepted_positions_near_recording': grid.accepted_positions,
-        'verdicts': count_verdicts(grid.trials),
-        'positions': [{'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
-                       'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
-                      for row, near, accepted, misled, visible in zip(
-                          grid.positions.round(3).tolist(), grid.is_near, grid.accepted,
-                          grid.misled, grid.visible, strict=True)],
-        'misled': [_trial_dict(one) for one in grid.trials if one.verdict == 'misled']}
-
-
-def _recording_dict(recording: RecordingCheck) -> dict[str, Any]:
-    return {
-        'frames': recording.frames, 'boxes': recording.boxes,
-        'duration_s': recording.duration_s, 'as_given': asdict(recording.as_given),
-        'held_out': asdict(recording.held_out), 'folds': [asdict(one) for one in recording.folds],
-        'edge_scale': recording.edge_scale, 'verdicts': count_verdicts(recording.trials),
-        'verdicts_with_simulated_boxes': count_verdicts(recording.simulated),
-        'corrections': [asdict(one) for one in recording.corrections],
-        'trials': [_trial_dict(one) for one in recording.trials]}
-
-
-def _trial_dict(trial: Trial) -> dict[str, Any]:
-    return {
-        'verdict': trial.verdict, 'stamp_s': trial.stamp_s,
-        'position': trial.position.round(4).tolist(), 'forward': trial.forward.round(4).tolist(),
-        'detections': trial.detections, 'landmarks': trial.landmarks,
-        'estimate': None if trial.estimate is None else trial.estimate.round(4).tolist(),
-        'error_m': trial.error_m, 'reason': trial.reason}
 
 
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
