@@ -14,7 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.update.updating import update_map
 
 ENCODER = 'test:0'
@@ -202,8 +202,8 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     detections = see(later, POSES, noise_px=2.0).with_poses(wrong).select_frames(kept)
     with pytest.raises(MappingError, match='give --pose-noise if the poses have errors'):
         update_map(things, detections)
-    joint = update_map(things, detections, UpdateOptions(
-        MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0))))
+    joint = update_map(things, detections,
+                       MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0)))
     assert ids(joint.report.missing) == {'thing_6'}
     assert ids(joint.report.moved) == {'thing_12'}
     assert joint.report.new == ()

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.landmarks import Landmarks, is_in_image, project_box
-from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.views import Views
 
+# A place is in view if the frame shows another landmark this close to its direction, and not
+# nearer: otherwise a wall may hide it. It is out of view if landmarks or boxes hide this share.
+# Guesses.
+_BESIDE_DEG, _HIDDEN_SHARE = 20.0, 0.4
 # A landmark as near as this share of a place's distance is beside the place, not before it.
 _BESIDE_SHARE = 0.8
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
@@ -49,7 +52,7 @@ class Sight(NamedTuple):
 
 
 def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
-             is_solid: NDArray[np.bool_], options: UpdateOptions) -> Sight:
+             is_solid: NDArray[np.bool_]) -> Sight:
     """Return in which frames places were in view, and in which of them their landmark was seen.
 
     Class -1 is one that no box has. Solid places have an object, which may hide others.
@@ -60,7 +63,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
     frames, rows = _in_view(
         views, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6), least,
-        is_solid, shown, np.cos(np.radians(options.beside_deg)), options.hidden_share)
+        is_solid, shown, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
     seen_rows = np.nonzero(shown >= 0)[0]
     seen_keys = np.unique(views.frames[seen_rows] * count + shown[seen_rows])
     keys = np.union1d(frames * count + rows, seen_keys)
