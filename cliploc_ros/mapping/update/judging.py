@@ -35,7 +35,7 @@ _RATIO_RANGE = (0.02, 0.95)
 # Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
 # that a usual ratio is worth [views]. Guesses.
 _MEDIAN_SQUARE = 0.455  # of a standard normal variable
-_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_VIEWS = 5, 3, 0.5
+_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
 # Share of the objects that are usually still in their place; of the views in which an object is
 # detected, where neither map nor recording tell; and of those in which a wrong box appears in an
 # empty place. Guesses, as all below.
@@ -158,7 +158,7 @@ def _probability_there(known: Known, sight: Sight) -> NDArray[np.float64]:
         shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
         # the median, since objects that are gone are no scatter
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_VIEWS,
+        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
                                   _PRIOR_VIEWS))
     there = _log_evidence(sight, ratios, certainty)
     away = _log_evidence(sight, np.full(len(ratios), _CHANCE_RATIO), _PRIOR_VIEWS)
