@@ -11,7 +11,6 @@ landmark through merge, split, delete, undo and redo.
 
 import base64
 import hashlib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -155,11 +154,6 @@ class Landmark:
     def basis(self) -> NDArray[np.float64]:
         """The basis (3, 3), whose columns are the semi-axes in the map [m]."""
         return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
-
-    @property
-    def volume(self) -> float:
-        """The volume [m^3]."""
-        return float(4.0 / 3.0 * math.pi * self.semi_axes.prod())
 
     def changed(self, **fields: Any) -> 'Landmark':
         """Return the landmark with other values; a field that is None is left out."""
