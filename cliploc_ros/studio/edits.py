@@ -58,10 +58,7 @@ class Change:
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
         """Return the landmarks after the change.
 
-        Raises
-        ------
-        EditError
-            They are not those that the change starts from.
+        EditError: they are not those that the change starts from.
         """
         for landmark_id, landmark in self.before.items():
             if landmarks.get(landmark_id) != landmark:
@@ -84,10 +81,7 @@ class Change:
 def change_from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
     """Return a change from JSON; looks are found by key, and missing ones are left out.
 
-    Raises
-    ------
-    ValueError, MapError
-        It is none, or a landmark is invalid.
+    ValueError, MapError: it is none, or a landmark is invalid.
     """
     try:
         what = tree['what']

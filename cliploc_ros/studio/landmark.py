@@ -170,10 +170,7 @@ def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> LandmarkMap:
     """Return landmarks as the relocalizer knows them, without unknown fields.
 
-    Raises
-    ------
-    MapError
-        There are none, or one is invalid. Names the source, the landmark and the field.
+    MapError: there are none, or one is invalid. Names the source, the landmark and the field.
     """
     known = {landmark_id: {name: value for name, value in one.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}

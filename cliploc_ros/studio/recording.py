@@ -187,11 +187,8 @@ def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
 
     The boxes (n, 4) lie in undistorted images [px] of n poses (n, 4, 4).
 
-    Raises
-    ------
-    EditError
-        There are fewer than two boxes, one is too small, or their rays do not meet in front of
-        the cameras.
+    EditError: there are fewer than two boxes, one is too small, or their rays do not meet in front
+    of the cameras.
     """
     count = len(bboxes_xyxy)
     if count < 2:
