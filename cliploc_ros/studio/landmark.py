@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.labelling import choose_medoids, embed_landmarks
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.labelling import choose_medoids
 
 KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
 #: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
@@ -88,15 +87,6 @@ def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look 
                              for look, weight in known])
     return Look((mean / length).astype(np.float16),
                 crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
-
-
-def look_of_boxes(detections: PosedDetections, rows: NDArray[np.int64]) -> Look | None:
-    """Return the look of the objects in some boxes of a recording; None without embeddings."""
-    if detections.embeddings is None or not len(rows):
-        return None
-    shown = np.full(len(detections.classes), -1, dtype=np.int64)
-    shown[rows] = 0
-    return looks_of(embed_landmarks([''], detections, shown)).get('')
 
 
 def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
