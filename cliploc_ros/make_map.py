@@ -19,8 +19,8 @@ from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_lan
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import MountCorrection
-from cliploc_ros.mapping.updating.renewal import UpdateReport
-from cliploc_ros.mapping.updating.updating import update_map as update_landmarks
+from cliploc_ros.mapping.update.renewal import UpdateReport
+from cliploc_ros.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.phrase_embeddings import phrases_of_classes
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
@@ -57,15 +57,8 @@ class Labeller:
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
         """Return the map with labels, and its image embeddings.
 
-        Parameters
-        ----------
-        shown : ndarray (n,) of int
-            Row of the landmark that each box shows, -1 for none.
-
-        Raises
-        ------
-        CliplocError
-            The text tower cannot be loaded.
+        The array shown (n,) has the row of the landmark that each box shows, -1 for none.
+        CliplocError: the text tower cannot be loaded.
         """
         if not _has_embeddings(detections):
             return landmark_map, None

@@ -25,7 +25,7 @@ from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import TrueFrame, read_frames
-from cliploc_ros.evaluation.evaluation import Evaluation
+from cliploc_ros.evaluation.evaluation import compare_methods
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.output import make_folder
 from cliploc_ros.evaluation.recording import make_queries_of
@@ -110,10 +110,10 @@ def run(arguments: list[str]) -> int:
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
-    Evaluation(landmark_map, make_queries(queries, landmark_map), options.out, options.trials,
-               options.workers).compare(
-        parse_methods(['all', 'auto'], paper, len(landmark_map)), resume=True,
-        frames=queries.frames)
+    compare_methods(landmark_map, make_queries(queries, landmark_map),
+                    parse_methods(['all', 'auto'], paper, len(landmark_map)), options.out,
+                    trials=options.trials, workers=options.workers, resume=True,
+                    frames=queries.frames)
     return 0
 
 

@@ -27,7 +27,7 @@ LAYERS = (
     ('core.fit',),
     ('core.acceptance',),
     ('core',),
-    ('simulation.labels',),
+    ('simulation.detector', 'simulation.labels'),
     ('mapping',),
     ('messages', 'command'),
     ('models', 'datasets', 'vocabulary'),
@@ -84,6 +84,15 @@ def test_imports_point_downwards():
             if there != here and RANKS[there] >= RANKS[here]:
                 upward.append(f'{module} ({here}) imports {imported} ({there})')
     assert not upward, '\n' + '\n'.join(upward)
+
+
+def test_the_acceptance_names_its_modules():
+    folder = PROJECT / ROOT / 'core/acceptance'
+    text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text()))
+    named = [name for line in text.splitlines() if line and not line.startswith((' ', 'Whether'))
+             for name in line.split(', ') if line[0].islower()]
+    assert sorted(named) == sorted(path.stem for path in folder.glob('*.py')
+                                   if path.stem != '__init__')
 
 
 def test_importing_the_package_imports_no_library():

@@ -152,7 +152,7 @@ def evaluate(options: argparse.Namespace) -> int:
     # imported late, so that --help is fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.evaluation.evaluation import Evaluation
+    from cliploc_ros.evaluation.evaluation import compare_methods
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.output import make_folder
     from cliploc_ros.evaluation.recording import with_features
@@ -194,11 +194,10 @@ def evaluate(options: argparse.Namespace) -> int:
     is_noisy = (options.gravity and options.gravity_noise_deg) or (
         options.fuse and (noise_m or noise_deg))
     draws = [sensed(options.seed + trial) for trial in range(options.trials if is_noisy else 1)]
-    evaluation = Evaluation(landmark_map, draws[0], options.out, options.trials,
-                            options.workers or _cores(), options.scheduler, layer,
-                            draws if is_noisy else ())
-    evaluation.compare(methods, sweep=options.sweep, resume=options.resume,
-                       figures=options.figures, frames=recorded.frames)
+    compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
+                    workers=options.workers or _cores(), scheduler=options.scheduler,
+                    layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
+                    resume=options.resume, figures=options.figures, frames=recorded.frames)
     return 0
 
 

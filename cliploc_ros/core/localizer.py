@@ -54,6 +54,9 @@ _CONTRADICTION = float(chi2.ppf(0.99, 6))
 # An answer keeps this share of its information in directions in which it says nothing new: a
 # covariance must be finite.
 _LEAST_SHARE = 1e-4
+#: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
+BATCH = 4
+_NO_LOOKS = Looks()
 
 
 class Known(NamedTuple):
@@ -105,11 +108,6 @@ def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
             float(Rotation.from_matrix(motion[:3, :3]).magnitude())]
     return Known(odom_from_camera, pose,
                  covariance + np.diag(np.repeat(_DRIFT ** 2 * np.array(ways), 3)))
-
-
-#: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
-BATCH = 4
-_NO_LOOKS = Looks()
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.candidates import join_frames
 from cliploc_ros.core.acceptance.comparison import (
     Comparison,
     compare,
     evidence_of,
     pose_of,
 )
+from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.fit.finalists import find_with_rivals
@@ -146,12 +146,12 @@ class Relocalizer:
         finalists, is_upright = find_with_rivals(frames, joined.rig, self._options.refine,
                                                  budget.refinement_end)
         compared = compare(joined, finalists, is_upright, recognizer)
-        if not compared.candidates:
+        if not compared.contenders:
             return _nothing_found(frames, budget)
         pose, covariance = pose_of(joined, compared)
         evidence = evidence_of(joined, compared, covariance, looks, recognizer)
         refused = refusal(evidence, self._options)
-        shown = compared.by_objects or compared.candidates[0]
+        shown = compared.by_objects or compared.contenders[0]
         return Relocalization(
             accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
@@ -166,7 +166,7 @@ def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evide
                 ) -> tuple[Hypothesis, ...]:
     """Return the pose that leads, and the best one of each other place."""
     found: list[Hypothesis] = []
-    for one, its_pose, likely in zip(compared.candidates, [pose, *compared.poses[1:]],
+    for one, its_pose, likely in zip(compared.contenders, [pose, *compared.poses[1:]],
                                      compared.likely, strict=True):
         if not any(SAME_PLACE.agree(its_pose, other.map_from_camera) for other in found):
             found.append(Hypothesis(

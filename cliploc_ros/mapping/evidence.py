@@ -15,10 +15,10 @@ from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
+from cliploc_ros.simulation.detector import SHOWN_SHARE
 
-#: A landmark is expected in a frame that shows this share of its box, from no farther away than
-#: this times the greatest distance at which it was detected.
-SHOWN_SHARE = 0.6
+#: A landmark is expected from no farther away than this times the greatest distance at which it
+#: was detected.
 REACH = 1.2
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
@@ -164,11 +164,7 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                     ) -> tuple[float, float]:
     """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int, optional
-        The landmark that each box shows, -1 for none: explains a box although the landmark's
-        class is another one.
+    The landmark that a box shows explains it although its class is another one.
     """
     ious = best_ious(views, landmarks)
     if shown is not None:

@@ -38,14 +38,8 @@ _COLUMNS = np.array([0, 1, 2, 1, 2, 2])
 def project_box(rotation, translation, center, basis, box):
     """Write the box of an ellipsoid on the plane z = 1; return whether it is wholly in front.
 
-    Parameters
-    ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
-    center, basis : ndarray (3,), (3, 3)
-        Of the ellipsoid in the map.
-    box : ndarray (4,)
-        Left, top, right, bottom. Untouched where the ellipsoid is not wholly in front.
+    Rotation and translation are those of camera_from_map. The box (4,) is left, top, right,
+    bottom; it is untouched where the ellipsoid is not wholly in front.
     """
     r = rotation
     x = r[0, 0] * center[0] + r[0, 1] * center[1] + r[0, 2] * center[2] + translation[0]
@@ -79,14 +73,8 @@ def project_box(rotation, translation, center, basis, box):
 def linearize_box(rotation, translation, center, basis, box, by_landmark, by_pose):
     """Write the box of an ellipsoid and its derivatives; return whether it is wholly in front.
 
-    Parameters
-    ----------
-    rotation, translation, center, basis, box
-        As in project_box.
-    by_landmark : ndarray (4, 9)
-        Derivatives of the edges by the centre in the map and by D.
-    by_pose : ndarray (4, 6)
-        By a small motion of the map in the camera's coordinate frame: p' = p + v + w x p.
+    The derivatives of the edges are by_landmark (4, 9) by the centre in the map and by D, and
+    by_pose (4, 6) by a small motion of the map in the camera: p' = p + v + w x p.
     """
     if not project_box(rotation, translation, center, basis, box):
         return False

@@ -92,12 +92,6 @@ def _at_border(detections: PosedDetections, border_px: float
     return boxes, is_open, np.where(is_open.any(axis=0), reach, border)
 
 
-def with_depths(views: Views, depths: NDArray[np.float64], stiffness: NDArray[np.float64]
-                ) -> Views:
-    """Return the views with measured depths (n,) and their inverse standard deviations (n,)."""
-    return views._replace(depths=depths, depth_stiffness=stiffness)
-
-
 def camera_from_map(map_from_camera: NDArray[np.float64]
                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (F, 3, 3) and translations (F, 3) of the inverses of poses (F, 4, 4)."""

@@ -6,11 +6,12 @@ The file's name depends on all that its content depends on: source, networks and
 that is stopped leaves its partial results beside it, and the next run goes on.
 """
 
+import base64
 import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -27,11 +28,11 @@ from cliploc_ros.datasets.frames import Frames, RawFrame, Wanted
 from cliploc_ros.datasets.observations import Recorded, load_recorded, save_recorded
 from cliploc_ros.datasets.poses import Poses
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.yolo_weights import YoloOptions
-from cliploc_ros.recording.journal import Journal
 from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -162,12 +163,12 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             logger.warning('recording again, with other options: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
-    frame_fields = ' '.join(SeenFrame.__dataclass_fields__)  # another release may have others
-    with Journal(file.with_name(f'.{file.name}.unfinished'),
-                 f'{described} {frame_fields}'.encode()) as journal:
-        recorded = _with_odometry(_record(frames, options, journal), odometry)
+    with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
+                     'make room or name another file with --record-to, then run again: it goes '
+                     'on from here', _parse_entry)) as log:
+        recorded = _with_odometry(_record(frames, options, described, log), odometry)
         save_recorded(file, recorded)
-        journal.remove()
+        log.remove()
     logger.warning('wrote %s', file)
     return recorded
 
@@ -194,9 +195,16 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) ->
     return _assemble(seen, frames.source, keyframes, '', '')
 
 
-def _record(frames: Frames, options: RecordingOptions, journal: Journal) -> Recorded:
-    """Look at all keyframes that are not in the journal."""
-    seen = {one.place: one for one in map(SeenFrame.from_bytes, journal.chunks())}
+def _record(frames: Frames, options: RecordingOptions, described: str, log: Log) -> Recorded:
+    """Look at all keyframes that are not in the log of an unfinished run."""
+    # another release may have other fields
+    run = {'run': described, 'fields': list(SeenFrame.__dataclass_fields__)}
+    entries, _ = log.read()
+    seen: dict[int, SeenFrame] = {}
+    if entries[:1] == [run]:
+        seen = {one.place: one for one in entries[1:]}
+    else:
+        log.restart([run])
     if seen:
         logger.warning('going on after %d frames of an unfinished run', len(seen))
     keyframes = KeyframeFilter(options.keyframes)
@@ -205,12 +213,17 @@ def _record(frames: Frames, options: RecordingOptions, journal: Journal) -> Reco
         for _, result in run_tasks(options.networks, tasks, workers=options.workers,
                                    scheduler=options.scheduler):
             if result is not None:
-                journal.add(result.to_bytes())
+                log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
                 seen[result.place] = result
                 _judge_depth(seen, frames.source)
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(list(seen.values()), frames.source, keyframes, encoder_key,
-                     describe(frames, options))
+    return _assemble(list(seen.values()), frames.source, keyframes, encoder_key, described)
+
+
+def _parse_entry(line: bytes) -> Any:
+    """Return the first entry, which says what run it is, or the frame of any other one."""
+    entry = json.loads(line)
+    return SeenFrame.from_bytes(base64.b64decode(entry['frame'])) if 'frame' in entry else entry
 
 
 @contextmanager

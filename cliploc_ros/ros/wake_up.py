@@ -35,6 +35,15 @@ _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'canc
 
 #: Spins the node until a condition holds or a number of seconds is over; returns whether it holds.
 Wait = Callable[[Callable[[], bool], float], bool]
+#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
+SILENT_S = 5.0
+_SPIN_S = 0.05
+# What is there is not seen at once.
+_DISCOVERY_S = 2.0
+# Between looks of a robot that does not turn.
+_PAUSE_S = 1.0
+# What an answer may take on its way beyond the relocalizer's own limit.
+_ON_ITS_WAY_S = 5.0
 
 
 class Turn(NamedTuple):
@@ -135,17 +144,6 @@ def _reason(result: Any) -> str:
              for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
     words = [names.get(code, ''), getattr(result, 'error_msg', '')]
     return ', '.join([*filter(None, words), f'code {code}'])
-
-
-#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
-SILENT_S = 5.0
-_SPIN_S = 0.05
-# What is there is not seen at once.
-_DISCOVERY_S = 2.0
-# Between looks of a robot that does not turn.
-_PAUSE_S = 1.0
-# What an answer may take on its way beyond the relocalizer's own limit.
-_ON_ITS_WAY_S = 5.0
 
 
 @dataclass(frozen=True)

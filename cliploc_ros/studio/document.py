@@ -6,6 +6,7 @@ All threads share one document. Each method holds its lock; a caller that needs 
 once holds it, too.
 """
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,9 @@ from threading import RLock
 from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import CliplocError, MapError
+from cliploc_ros.errors import CliplocError, DatasetError, MapError
+from cliploc_ros.files.log import Log
 from cliploc_ros.studio.edits import Change, EditError, Landmarks, change_from_json
-from cliploc_ros.studio.journal import Journal
 from cliploc_ros.studio.landmark import KNOWN_FIELDS, Landmark, Look, look_from_json, map_of
 from cliploc_ros.studio.map_file import (
     NO_FILE,
@@ -59,9 +60,15 @@ class Document:
         self._look_file = self._read_looks()
         self.landmarks: Landmarks = self._landmarks_of_file()
         self._saved: Landmarks = self.landmarks
-        self._journal = Journal(self.path.with_name(f'.{self.path.name}.studio'))
+        # Edits that the file does not hold yet. Before the map is written, the journal gets the
+        # digest of its next content: replay starts at the right edit with either content.
+        self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
+                            "make room, and the map's folder writable", _parse_entry)
         try:
-            self._replay(self._journal.read())
+            entries, is_damaged = self._journal.read()
+            if is_damaged:
+                self._journal.set_aside()
+            self._replay(entries)
         except BaseException:
             self._journal.close()
             raise
@@ -352,3 +359,10 @@ class Document:
 def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
     """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
     return {key: one.fields for key, one in landmarks.items()}
+
+
+def _parse_entry(line: bytes) -> dict[str, Any]:
+    entry = json.loads(line)
+    if not isinstance(entry, dict):
+        raise ValueError('an entry is a mapping')
+    return entry

@@ -16,17 +16,18 @@ import numpy as np
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.mapping.checking.checking import judge_grid
-from cliploc_ros.mapping.checking.detector_model import (
-    DetectorModel,
-    guess_detector,
+from cliploc_ros.mapping.check.checking import judge_grid
+from cliploc_ros.mapping.check.landmark_faults import hear_witness
+from cliploc_ros.mapping.check.places import Grid, LookAlike, find_look_alikes, make_grid
+from cliploc_ros.mapping.check.relocalization import (
+    Trial,
+    count_verdicts,
+    each_pose,
     measure_detector,
 )
-from cliploc_ros.mapping.checking.landmark_faults import hear_witness
-from cliploc_ros.mapping.checking.places import Grid, LookAlike, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, each_pose
-from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.mapping.options import CheckOptions
+from cliploc_ros.simulation.detector import DetectorModel, guess_detector
 from cliploc_ros.studio.document import fields_of
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of
@@ -98,7 +99,8 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
-    guess = guess_detector(landmark_map, _OPTIONS.mapping)
+    guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
+                                          _OPTIONS.mapping.edge_sigma_share))
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections

@@ -23,7 +23,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.checking.landmark_faults import (
+from cliploc_ros.mapping.check.landmark_faults import (
     LandmarkCheck,
     check_landmarks,
     find_map_overlaps,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.candidates import candidates_of, join_frames, unrefined
+from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
@@ -59,7 +59,7 @@ def place_rows(case: StoredCase) -> list[Row]:
         look = record.looks[-1]
         joined = join_frames(case.landmark_map, record.options, [look.searched])
         places = look.seen.places
-        for place, one in zip(places, candidates_of(joined, [
+        for place, one in zip(places, contenders_of(joined, [
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [

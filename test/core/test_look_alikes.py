@@ -10,8 +10,8 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Setting,
-    Support,
-    confidences,
-    none_right,
-    support,
-    utilities,
-)
+from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
 from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
@@ -299,7 +292,7 @@ def test_garbage_is_never_accepted(kind, office_map, rng):
                                                              algorithm='ransac'))
     classes = np.array(sorted(set(office_map.class_ids)))
     accepted = 0
-    for _ in range(200):
+    for _ in range(100):
         detections = Detections(garbage(rng, kind), tuple(map(str, rng.choice(classes, 10))),
                                 np.full(10, 0.9)).usable(640, 480, 50)
         accepted += relocalizer.relocalize([Observation(

@@ -31,7 +31,7 @@ NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
            'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')
-IMAGES = 16
+IMAGES = 8
 TIMEOUT_S = 900.0  # with networks, on a machine under load
 
 
@@ -108,24 +108,6 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
         assert image.std() > 10
 
 
-def test_five_frames_at_a_time(shared_data, tmp_path):
-    """On real data: higher success than with one frame, and no false accept."""
-    office = shared_data / 'tum_fr3_office'
-    given = ('--queries', office / 'queries.npz', '--map', office / 'map.yaml', '--methods',
-             'auto', '--no-figures', '--trials', 1)
-    found = {}
-    for name, more in (('one', ()), ('five', ('--fuse', '--odometry-noise', 0.01, 0.5))):
-        done = evaluate(*given, *more, '--out', tmp_path / name)
-        assert done.returncode == 0, done.stderr
-        found[name] = results_of(tmp_path / name)
-    assert [list(row) for row in found['one']] == [list(row) for row in found['five']]
-    success = {name: np.mean([row['solved'] and row['error_m'] <= 1.0 for row in rows])
-               for name, rows in found.items()}
-    print(f'\nwithin 1 m: {success}')
-    assert success['five'] >= max(0.90, success['one'] + 0.05)
-    assert not [row for row in found['five'] if row['accepted'] and row['error_m'] > 1.0]
-
-
 def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
     """Twelve views of one place: some are refused alone, all are accepted together."""
     recorded = changed(files, tmp_path, query_group=np.zeros(12, dtype=np.int64),
@@ -184,13 +166,13 @@ def test_one_worker_or_two(files, tmp_path):
 def long_run(files, tmp_path_factory):
     """The arguments of a run of seconds, and its results."""
     arguments = small(files, '--methods', 'hybrid_b-prosac', 'class_ransac', '--iterations', 20000,
-                      '--trials', 3, '--sweep', '--workers', 2, '--no-figures')
+                      '--trials', 2, '--sweep', '--workers', 2, '--no-figures')
     whole = tmp_path_factory.mktemp('whole')
     assert evaluate(*arguments, '--out', whole).returncode == 0
     return arguments, results_of(whole)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
 def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     arguments, whole = long_run
     broken = tmp_path / 'broken'
@@ -231,11 +213,11 @@ def test_a_scheduler_that_is_not_there(files, tmp_path, evaluate_here):
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """Every third image of the demo's walk, the last without its true pose; also as a bag."""
+    """Every sixth image of the demo's walk, the last without its true pose; also as a bag."""
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'tum')
     images, truth = folder / 'tum/rgb.txt', folder / 'tum/groundtruth.txt'
-    rows = [line for line in images.read_text().splitlines() if not line.startswith('#')][::3]
+    rows = [line for line in images.read_text().splitlines() if not line.startswith('#')][::6]
     assert len(rows) == IMAGES
     images.write_text('\n'.join(rows) + '\n')
     last = float(rows[-1].split()[0])

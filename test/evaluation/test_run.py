@@ -4,8 +4,8 @@
 
 import multiprocessing
 import os
-import resource
 import signal
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -16,12 +16,13 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.evaluation.journal import Journal
+from cliploc_ros.evaluation.evaluation import read_results
 from cliploc_ros.evaluation.methods import parse_methods
 from cliploc_ros.evaluation.paper_table import notes
 from cliploc_ros.evaluation.run import RunError, count_trials, run_all, run_methods
 from cliploc_ros.evaluation.summary import summarize
 from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.files.log import Log
 
 PAPER = RelocalizerOptions(iterations=60)
 
@@ -156,37 +157,27 @@ def test_queries_of_another_map(room, recording):
         make_queries(recording, larger)
 
 
-def test_a_journal_forgets_only_a_line_cut_off(results, tmp_path):
-    journal = Journal(tmp_path / 'journal')
-    with journal.writing({'trials': 3}, results[:2]):
-        journal.add(results[2:5])
-    assert journal.read({'trials': 3}) == results[:5]
-    whole = journal._path.read_text()
-    journal._path.write_text(whole[:-20])
-    assert journal.read({'trials': 3}) == results[:2]
+def test_an_unfinished_run_goes_on_if_it_is_the_same(results, tmp_path):
+    path = tmp_path / 'log'
+
+    def read(run):
+        with closing(Log(path, OptionsError, 'make room')) as log:
+            return read_results(log, run)
+    with closing(Log(path, OptionsError, 'make room')) as log:
+        assert read_results(log, {'trials': 3}) == []
+        log.append([result.as_dict() for result in results[:2]])
+        log.append([result.as_dict() for result in results[2:5]])
+    assert read({'trials': 3}) == results[:5]
+    whole = path.read_text()
+    path.write_text(whole[:-20])
+    assert read({'trials': 3}) == results[:2]
     with pytest.raises(OptionsError, match='begun with another trials'):
-        journal.read({'trials': 4})
+        read({'trials': 4})
     lines = whole.splitlines()
-    journal._path.write_text('\n'.join([lines[0], 'rubbish', lines[1]]))
-    with pytest.raises(OptionsError, match='damaged'):
-        journal.read({'trials': 3})
-
-
-def test_a_journal_survives_a_full_disk(results, tmp_path):
-    journal = Journal(tmp_path / 'journal')
-    with journal.writing({'trials': 3}, results[:2]):
-        pass
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
-    try:
-        with (pytest.raises(OptionsError, match='make room and continue with --resume'),
-              journal.writing({'trials': 3}, journal.read({'trials': 3}))):
-            pass
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert journal.read({'trials': 3}) == results[:2]
+    for damaged in (['rubbish', lines[1]], ['[{"method": 1}]'], ['3']):
+        path.write_text('\n'.join([lines[0], *damaged, '']))
+        with pytest.raises(OptionsError, match='damaged'):
+            read({'trials': 3})
 
 
 def test_crops_on_demand_are_a_part_of_all(room, questions):

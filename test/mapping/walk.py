@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A walk around a table of known ellipsoids, as a perfect detector sees it: simulated."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -28,6 +30,29 @@ def make_table(count=9) -> LandmarkMap:
     names = tuple(CLASSES[i % 3] for i in range(count))
     return LandmarkMap('map', tuple(f'thing_{i}' for i in range(count)), names, names, centers,
                        rng.uniform(0.06, 0.15, (count, 3)), quats)
+
+
+def join_maps(*maps: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks of several maps in one; ids of those after the first get a mark."""
+    ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
+    labels, classes, details = (sum((getattr(one, name) for one in maps), ())
+                                for name in ('labels', 'class_ids', 'details'))
+    arrays = (np.concatenate([getattr(one, name) for one in maps])
+              for name in ('centers', 'semi_axes', 'quats_xyzw'))
+    return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
+
+
+def moved(table: LandmarkMap, places) -> LandmarkMap:
+    """Return the map with some landmarks at other places: {row: (x, y, z)}."""
+    centers = table.centers.copy()
+    for row, place in places.items():
+        centers[row] = place
+    return replace(table, centers=centers)
+
+
+def without(table: LandmarkMap, *rows) -> LandmarkMap:
+    """Return the map without some landmarks."""
+    return table.select([row for row in range(len(table)) if row not in rows])
 
 
 def look_at(position, target=(0.0, 0.0, 0.8)):

@@ -20,9 +20,16 @@ from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import load_recorded
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.yolo_weights import YoloOptions
-from cliploc_ros.recording.recorder import RecordingOptions, observation_file
+from cliploc_ros.recording.recorder import (
+    EVERY_FRAME,
+    KeyframeFilter,
+    KeyframeOptions,
+    RecordingOptions,
+    observation_file,
+)
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -242,3 +249,30 @@ def test_a_truncated_observation_file_is_recorded_again(walk, recorded, tmp_path
                           '--record-to', file, '--out', tmp_path / 'map.yaml')) in (0, 1)
     assert 'recording again' in caplog.text
     assert len(load_recorded(file).detections) > 0
+
+
+def pose(x=0.0, turn_deg=0.0):
+    turn = np.radians(turn_deg)
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    transform[0, 3] = x
+    return transform
+
+
+def test_keyframes_by_distance_angle_and_pose():
+    is_keyframe = KeyframeFilter(KeyframeOptions(0.1, 5.0))
+    walk = [None, pose(), pose(0.06), pose(0.11), None, pose(0.11, 4.0), pose(0.11, 6.0),
+            pose(0.205, 6.0), pose(0.215, 6.0)]
+    assert [is_keyframe(place, place, one) for place, one in enumerate(walk)] == [
+        False, True, False, True, False, False, True, False, True]
+    assert (is_keyframe.asked, is_keyframe.without_pose, is_keyframe.keyframes) == (9, 2, 4)
+
+
+def test_every_frame():
+    is_keyframe = KeyframeFilter(EVERY_FRAME)
+    assert [is_keyframe(0, 0, one) for one in (pose(), pose(), None)] == [True, True, False]
+
+
+def test_impossible_keyframes():
+    with pytest.raises(OptionsError, match='give 0 or more'):
+        KeyframeOptions(-0.1, 5.0)

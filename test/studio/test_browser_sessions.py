@@ -17,9 +17,8 @@ from browser import Person, value_of, wait_for
 from studio_map import ASSETS, open_page, person_at
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.checking.detector_model import guess_detector
-from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.simulation.detector import guess_detector
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.recording import Recording
@@ -32,7 +31,7 @@ PROJECT = Path(__file__).parents[2]
 
 def with_simulated_boxes(detections, landmark_map):
     """Return views with the boxes that a detector might find in them."""
-    model, rng = guess_detector(landmark_map, MappingOptions()), np.random.default_rng(0)
+    model, rng = guess_detector(landmark_map, (2.0, 0.04)), np.random.default_rng(0)
     names = tuple(sorted(set(landmark_map.class_ids)))
     found = [model.detect(pose, rng)[0] for pose in detections.map_from_camera]
     return PosedDetections(

@@ -156,4 +156,4 @@ def test_a_full_disk(tmp_path):
     saving, saved, editing = done.stdout.splitlines()
     assert 'cannot be written: No space left on device; nothing was changed' in saving
     assert saved == 'saved'
-    assert 'the edit cannot be kept: No space left on device; make room' in editing
+    assert 'office.yaml.studio: cannot be written: No space left on device; make room' in editing

@@ -1,21 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether to accept a pose: what speaks for it, how likely it is, and the decision.
+"""Whether to accept a pose.
 
-comparison
-    The best poses of a search: which is the likeliest, and the evidence for it.
-support, attitude
-    What speaks for a pose, and what its tilt says against it.
-agreement
-    Which poses are the same answer.
+The modules in the order in which a pose passes them:
+
+contenders
+    The poses that may be right, of objects and of keyframes, and the odds of each.
+support
+    The evidence of the objects for a pose.
 confidence
-    How likely each pose is, given its support and its rivals.
-look_alikes, spread
-    Places that look like its own, and hypotheses near it.
-recognition
-    How likely a pose from keyframes is, and why it is refused.
+    From odds to the probability of each pose, given its rivals.
+comparison
+    The contenders in one list: which one leads, and all evidence about it.
+look_alikes, mirror, genuine
+    Other reasons to be wrong: a place that looks alike, a mirror image, a picture or a change.
 looks
-    What earlier frames say of it.
+    The earlier looks of a moving robot.
 verdict
     Accept or refuse, with the reason.
+calibration
+    The numbers of calibration.yaml.
 """

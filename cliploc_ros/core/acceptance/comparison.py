@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.candidates import (
-    Candidate,
-    JoinedFrames,
-    candidates_of,
-    chance_not_mirrored,
-    refined,
-    supports_of,
-    unrefined,
-)
 from cliploc_ros.core.acceptance.confidence import (
     chance_by_points,
     confidences,
@@ -32,9 +23,18 @@ from cliploc_ros.core.acceptance.confidence import (
     objects_utility,
     points_utility,
 )
+from cliploc_ros.core.acceptance.contenders import (
+    Contender,
+    JoinedFrames,
+    contenders_of,
+    refined,
+    supports_of,
+    unrefined,
+)
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
@@ -84,17 +84,17 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
 
 
 class Comparison(NamedTuple):
-    """The candidates, and what decides between them."""
+    """The contenders, and what decides between them."""
 
     #: The leading one first; of those of one source, one of each place
-    candidates: list[Candidate]
+    contenders: list[Contender]
     poses: NDArray[np.float64]  #: (m, 4, 4)
     likely: NDArray[np.float64]  #: (m,): probability of each, shared by those that agree
     recognition: Recognition | None  #: What keyframes say
 
     @property
     def leading(self) -> NDArray[np.bool_]:
-        """Return which candidates (m,) agree with the leading one."""
+        """Return which contenders (m,) agree with the leading one."""
         return SAME_ANSWER.agreeing(self.poses)[0]
 
     @property
@@ -105,54 +105,54 @@ class Comparison(NamedTuple):
         return 'objects' if self.by_keyframes is None else 'both'
 
     @property
-    def by_objects(self) -> Candidate | None:
-        """Return the best candidate of the leading place that the search of objects met."""
-        return next((one for one, near in zip(self.candidates, self.leading, strict=True)
+    def by_objects(self) -> Contender | None:
+        """Return the best contender of the leading place that the search of objects met."""
+        return next((one for one, near in zip(self.contenders, self.leading, strict=True)
                      if near and one.recognized is None), None)
 
     @property
-    def by_keyframes(self) -> Candidate | None:
-        """Return the best candidate of the leading place that keyframes propose."""
-        return next((one for one, near in zip(self.candidates, self.leading, strict=True)
+    def by_keyframes(self) -> Contender | None:
+        """Return the best contender of the leading place that keyframes propose."""
+        return next((one for one, near in zip(self.contenders, self.leading, strict=True)
                      if near and one.recognized is not None), None)
 
 
 def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDArray[np.bool_],
             recognizer: ImageRecognizer | None = None) -> Comparison:
-    """Return the candidates compared; none where neither source has any.
+    """Return the contenders compared; none where neither source has any.
 
     Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement the
     greatest score is first, as in the paper. The recognizer is of the keyframes, for the last
     image.
     """
-    candidates = candidates_of(joined, finalists, is_upright.tolist())
+    contenders = contenders_of(joined, finalists, is_upright.tolist())
     if joined.options.refine:
-        order = sorted(range(len(candidates)), key=lambda row: -candidates[row].odds)
-        candidates = [candidates[row] for known in (True, False) for row in first_of_each_place(
-            [row for row in order if candidates[row].is_upright == known], finalists,
+        order = sorted(range(len(contenders)), key=lambda row: -contenders[row].odds)
+        contenders = [contenders[row] for known in (True, False) for row in first_of_each_place(
+            [row for row in order if contenders[row].is_upright == known], finalists,
             MAX_DISTINCT)]
     seen = None
     if recognizer is not None:
-        seen = recognizer.recognize([one.pose for one in candidates[:_MOST_GUESSES]],
+        seen = recognizer.recognize([one.pose for one in contenders[:_MOST_GUESSES]],
                                     prior_of(joined.frames[-1].observation, joined.options))
-        candidates = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
-                      for one in candidates]
-        candidates += _proposed(joined, seen, candidates)
-        candidates.sort(key=lambda one: (not one.is_upright, -one.odds))
-    poses = np.array([one.pose for one in candidates]).reshape(-1, 4, 4)
-    return Comparison(candidates, poses, confidences(
-        np.array([one.odds for one in candidates]), poses, none_right(joined.setting)), seen)
+        contenders = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
+                      for one in contenders]
+        contenders += _proposed(joined, seen, contenders)
+        contenders.sort(key=lambda one: (not one.is_upright, -one.odds))
+    poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)
+    return Comparison(contenders, poses, confidences(
+        np.array([one.odds for one in contenders]), poses, none_right(joined.setting)), seen)
 
 
-def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Candidate]
-              ) -> list[Candidate]:
-    """Return the places that keyframes recognize, as candidates.
+def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Contender]
+              ) -> list[Contender]:
+    """Return the places that keyframes recognize, as contenders.
 
     Points add to the odds of the pose that the search of objects met there, if there is one. They
     never take any: a dozen points agree by chance.
     """
     none, most = none_right(joined.setting), CALIBRATION.attitude.vertical_sigmas
-    found = candidates_of(joined, [unrefined(one.map_from_camera) for one in seen.places],
+    found = contenders_of(joined, [unrefined(one.map_from_camera) for one in seen.places],
                           [one.tilt_error <= most for one in seen.places])
     proposed = []
     for one, place in zip(found, seen.places, strict=True):
@@ -186,7 +186,7 @@ def pose_of(joined: JoinedFrames, compared: Comparison
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
                                    by_objects.matches, joined.landmark_map.shared_sigmas)
         if by_objects.finalist.information is not None:
-            others = [one for one in compared.candidates if one.recognized is None]
+            others = [one for one in compared.contenders if one.recognized is None]
             others.sort(key=lambda one: one is not by_objects)
             covariance = covariance + spread(np.array([one.pose for one in others]),
                                              np.array([one.odds for one in others]))
@@ -210,27 +210,30 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     covariance : ndarray (6, 6)
         Of the leading pose.
     """
-    best, place = compared.by_objects or compared.candidates[0], compared.by_keyframes
+    best, place = compared.by_objects or compared.contenders[0], compared.by_keyframes
     coverage, last = coverage_of(joined.frames), joined.frames[-1].observation
     distinct, twin = _distinct(joined, compared, recognizer)
     by_points = _by_points(joined, compared)
     return Evidence(
-        best.support.inliers, float(compared.likely[0]), by_points,
-        _rival(joined, compared), distinct,
-        place_of(joined.landmark_map, compared.poses[0]).position, twin and twin.position,
-        twin.name if twin else '',
+        best.support.inliers, float(compared.likely[0]), by_points=by_points,
+        rival=_rival(joined, compared), distinct=distinct,
+        place=place_of(joined.landmark_map, compared.poses[0]).position,
+        twin=twin and twin.position, twin_map=twin.name if twin else '',
         # the covariance of a minimal sample is too rough to decide
-        1.0 if place is None and best.finalist.information is None
+        near=1.0 if place is None and best.finalist.information is None
         else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
-        math.sqrt(np.trace(covariance[:3, :3])), coverage,
-        sum(one.known_tried for one in joined.frames),
-        math.inf if is_exhaustive(coverage, joined.options) or compared.by_objects is None
+        deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
+        tried=sum(one.known_tried for one in joined.frames),
+        meetings=math.inf if is_exhaustive(coverage, joined.options)
+        or compared.by_objects is None
         else meetings_of(joined.frames, best.finalist, best.matches),
-        best.support.unexplained, _signs(joined, compared),
-        _motion(joined, compared, looks, recognizer), _not_mirrored(joined, compared, by_points),
-        _uncontradicted(joined, compared), place and place.recognized,
-        looks.confidences_in(last, compared.poses[0]),
-        0 if last.compared is None else len(last.detections) - len(last.compared))
+        unexplained=best.support.unexplained, signs=_signs(joined, compared),
+        motion=_motion(joined, compared, looks, recognizer),
+        not_mirrored=_not_mirrored(joined, compared, by_points),
+        uncontradicted=_uncontradicted(joined, compared),
+        recognized=place and place.recognized,
+        earlier=looks.confidences_in(last, compared.poses[0]),
+        crops_left=0 if last.compared is None else len(last.detections) - len(last.compared))
 
 
 def _signs(joined: JoinedFrames, compared: Comparison) -> Signs | None:
@@ -278,7 +281,7 @@ def _uncontradicted(joined: JoinedFrames, compared: Comparison) -> float:
 
     They count where they are sure. What a dozen points say is in the comparison.
     """
-    chance = max((chance_by_points(one.recognized) for one in compared.candidates
+    chance = max((chance_by_points(one.recognized) for one in compared.contenders
                   if one.recognized is not None), default=0.0)
     if compared.by_keyframes is not None or chance < joined.options.min_confidence:
         return 1.0
@@ -292,7 +295,7 @@ def _rival(joined: JoinedFrames, compared: Comparison) -> Rival | None:
         return None
     row = others[np.argmax(compared.likely[others])]
     place = place_of(joined.landmark_map, compared.poses[row])
-    same_source = compared.by_objects if compared.candidates[row].recognized is None \
+    same_source = compared.by_objects if compared.contenders[row].recognized is None \
         else compared.by_keyframes
     return Rival(min(float(compared.likely[row]), 1.0 - float(compared.likely[0])),
                  place.position, place.name, same_source is None)
@@ -302,11 +305,11 @@ def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
     """Return the probability of the leading place without what objects say for it."""
     if compared.by_keyframes is None:
         return 0.0
-    rows = [row for row, (one, near) in enumerate(zip(compared.candidates, compared.leading,
+    rows = [row for row, (one, near) in enumerate(zip(compared.contenders, compared.leading,
                                                       strict=True))
             if one.recognized is not None or not near]
     odds = [one.by_points if near else one.odds for one, near in zip(
-        compared.candidates, compared.leading, strict=True)]
+        compared.contenders, compared.leading, strict=True)]
     found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
     return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
 
@@ -318,7 +321,7 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     Next to it is where the camera would be at the likeliest of these places. Keyframes tell a
     twin apart as far as they cover it.
     """
-    best, (low, high) = compared.candidates[0], joined.options.height_range_m
+    best, (low, high) = compared.contenders[0], joined.options.height_range_m
     matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
                        dtype=np.int64)
     found, are_rooms = find_twins(joined.landmark_map, best.pose, matched,
@@ -350,6 +353,6 @@ def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],
     covered = np.array([recognizer.coverage(pose) for pose in [leading.pose, *twins]])
     known = np.where(are_rooms, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)), 1.0)
     theirs = np.array([max([0.0] + [
-        points_utility(one.recognized) for one in compared.candidates
+        points_utility(one.recognized) for one in compared.contenders
         if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)]) for pose in twins])
     return np.maximum(0.0, known * max(0.0, points_utility(leading.recognized)) - theirs)

@@ -1,159 +1,31 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks for a pose, and the probability that it is right."""
+"""The confidence of each pose: what supports it, weighed against what supports the others.
+
+A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice Behavior", 1974):
+each distinct pose has a utility, linear in its support. So has the case that none of them is
+right: the more landmarks the map has, the more wrong poses fit by chance; a known vertical leaves
+fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of an
+ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
+
+The search of objects chooses its poses among many by their support. Keyframes propose theirs by
+points: what the objects say of such a pose counts from the utility of none being right, whatever
+the size of the map. Points and objects that lead to one place add up theirs: by chance, features
+and boxes do so independently. Where they see one picture, see
+cliploc_ros.core.acceptance.genuine.
+"""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform
+from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
-from cliploc_ros.core.map.similarities import (
-    Similarities,
-    pair_similarities,
-    sampled_spread,
-)
-from cliploc_ros.core.search.scene import Scene
-
-# Boxes that overlap more than this show the same object, detected twice.
-_SAME_BOX_IOU = 0.8
-# Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
-# .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
-_EDGE_DEVIATION = (0.2, 0.003)
-
-
-@dataclass(frozen=True)
-class Support:
-    """The support of a pose; each object counts once."""
-
-    inliers: int = 0  #: Number of objects that are where the map has them
-    score: float = 0.0  #: Sum of their IoUs
-    #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
-    misfit: float = 0.0
-    #: How much more similar their crops are to the labels of their landmarks than to the map's
-    #: labels on average, in standard deviations, summed
-    likeness: float = 0.0
-    #: Summed over the objects that have a class of their landmark: the logarithm of the map's
-    #: number of landmarks for each landmark of this class. A rare class is matched by chance less
-    #: often than a common one. A class that the detector takes the landmark for at times counts
-    #: by its share, see ClassIndex.shares.
-    rarity: float = 0.0
-    unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
-    #: Number of other detected objects of the map's classes, which no landmark explains
-    unexplained: float = 0.0
-
-
-class ComparedFrame(NamedTuple):
-    """A frame to measure supports in."""
-
-    bboxes_xyxy: NDArray[np.float64]  #: (n, 4) [px]
-    class_ids: tuple[str, ...]  #: Class of each detection, n of them
-    similarities: Similarities | None  #: None where classes alone are matched
-    scene: Scene  #: Of the same detections
-    #: (n,): row of similarities of each detection; -1 where its class alone is matched
-    similarity_rows: NDArray[np.int64]
-
-
-def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
-            map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
-    """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
-
-    Several boxes on one landmark, or several landmarks behind one box, count as the best of them.
-    Frames that show the same object share the error of its shape in the map, so their agreement is
-    no more evidence than one of them: the object counts with their mean.
-    """
-    rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
-    for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):
-        distinct = _each_object_once(found, frame.bboxes_xyxy, landmark_map.objects)
-        if distinct:
-            for match, row in zip(distinct, _contributions(landmark_map, frame, map_from_camera,
-                                                           distinct), strict=True):
-                rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
-    if not rows:
-        return Support()
-    total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
-    views_of_each = sum(map(len, rows.values())) / len(rows)
-    # A class that a landmark is only taken for does not count: a real person is not expected in a
-    # map because a teddy bear sometimes looks like one.
-    index, unexplained = landmark_map.classes, 0
-    for frame, found in zip(frames, matches, strict=True):
-        known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
-        unexplained += len(known - {match.detection for match in found})
-    return Support(len(rows), *map(float, [*total, unexplained / views_of_each]))
-
-
-def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
-                   map_from_camera: NDArray[np.float64], matches: Sequence[Match]
-                   ) -> NDArray[np.float64]:
-    """Return the terms of each match (m, 5) in a support."""
-    detections = np.array([match.detection for match in matches])
-    landmarks = np.array([match.landmark for match in matches])
-    rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
-    compared = rows >= 0
-    if frame.similarities is not None and compared.any():
-        means, deviations = sampled_spread(frame.similarities, rows[compared])
-        likenesses[compared] = (
-            pair_similarities(frame.similarities, rows[compared], landmarks[compared])
-            - means) / np.maximum(deviations, 1e-6)
-    index = landmark_map.classes
-    classes = index.classes_of(frame.class_ids)[detections]
-    # 0 if the class of a detection is none of its landmark
-    rarities = index.shares(landmarks, classes) * -np.log(
-        np.maximum(index.sizes_of(classes), 1) / len(landmark_map))
-    return np.column_stack([
-        [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks,
-                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared])
-
-
-def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
-                      objects: NDArray[np.int64]) -> list[Match]:
-    """Return the best match of each landmark's object and of each box."""
-    distinct, boxes, taken = [], list[list[float]](), set[int]()
-    for match in sorted(matches, key=lambda match: -match.iou):
-        owner, box = int(objects[match.landmark]), bboxes_xyxy[match.detection].tolist()
-        if owner in taken or any(_box_iou(box, other) > _SAME_BOX_IOU for other in boxes):
-            continue
-        distinct.append(match)
-        boxes.append(box)
-        taken.add(owner)
-    return distinct
-
-
-def _box_iou(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the IoU of two boxes; a few plain numbers are faster than arrays here."""
-    width = min(one[2], other[2]) - max(one[0], other[0])
-    height = min(one[3], other[3]) - max(one[1], other[1])
-    if width <= 0.0 or height <= 0.0:
-        return 0.0
-    overlap = width * height
-    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
-    return overlap / (areas - overlap)
-
-
-def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
-             landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    camera_from_map = invert_transform(map_from_camera)
-    outlines = project_ellipsoids(camera_from_map, scene.centers[landmarks],
-                                  scene.shapes[landmarks])
-    boxes, halves = scene.box_ellipses[detections], np.sqrt(outlines[:, [2, 4]])
-    depths = scene.centers[landmarks] @ camera_from_map[2, :3] + camera_from_map[2, 3]
-    # the calibration's maps are no worse than the default
-    more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
-    deviations = np.hypot(_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1],
-                          more)[:, None]
-    edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
-                            outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
-    return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
-
 
 # Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
 _BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
@@ -33,6 +33,13 @@ SURE_MOTION = float(chi2.ppf(0.95, 6))
 _PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
 # A camera sees points that are further ahead than this [m].
 _AHEAD_M = 0.1
+# Errors of the intrinsics count from the first number of deviations on, up to the second.
+_SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25
+# Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
+_CENTRAL = (5.0, 95.0)
+# Pictures that are recognized show many features, places also a few. More than these say no more:
+# the rooms of the fit have few features.
+_MANY = 40
 
 
 class Motion(NamedTuple):
@@ -91,15 +98,6 @@ def _on_picture(first: RecognizedPlace, first_from_second: NDArray[np.float64], 
     moved = (shown - first_from_second[:3, 3]) @ first_from_second[:3, :3]
     ahead = moved[:, 2] > _AHEAD_M
     return find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
-
-
-# Errors of the intrinsics count from the first number of deviations on, up to the second.
-_SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25
-# Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
-_CENTRAL = (5.0, 95.0)
-# Pictures that are recognized show many features, places also a few. More than these say no more:
-# the rooms of the fit have few features.
-_MANY = 40
 
 
 class Signs(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_MOVE, invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.pairs import find_repeats

@@ -3,7 +3,7 @@
 """The decision to accept or refuse the leading pose. A wrong pose is worse than none."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum, auto
 from typing import NamedTuple
 
@@ -73,7 +73,8 @@ class Evidence:
     #: Probability that it is right, given all poses found, see
     #: cliploc_ros.core.acceptance.confidence
     likely: float
-    #: The same without what objects say for it; 0 where keyframes do not propose it
+    _: KW_ONLY
+    #: The same without the objects; 0 where keyframes do not propose it
     by_points: float = 0.0
     rival: Rival | None = None
     distinct: float = 1.0  #: Probability that its place is not mistaken for one that looks alike
@@ -92,7 +93,7 @@ class Evidence:
     #: That the place is there and no picture of it; None where keyframes do not propose it
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
-    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.candidates
+    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.contenders
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0

@@ -63,6 +63,17 @@ _ODOMETRY_DRIFT = 0.03
 _STANDS_STILL = 1e-9
 # Weights of the first pose that covariance intersection tries.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
+# Probability that an object is not where its match says. Chosen on simulated worlds (seeds 0 to
+# 59) together with the TUM frames.
+_WRONG_SHARE = 0.07
+# Deviation of a pose that lost an object [m and rad]: the others are not arbitrarily far, since an
+# accepted pose is right to 1 m and 45 degrees.
+_WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
+# Mean square of the residuals before any is seen, how many residuals this counts as, and the most
+# that a residual counts. Three boxes alone would seem to fit perfectly.
+_PRIOR_SQUARE, _PRIOR_RESIDUALS, _MOST_RESIDUAL = 2.8, 6.0, 4.0
+#: Of a pose whose boxes do not fix it.
+POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64],
@@ -198,21 +209,6 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
     moved = _WEIGHTS[best] * covariance @ informations[0] @ step
     turn = Rotation.from_rotvec(moved[3:]).as_matrix()
     return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance
-
-
-# Probability that an object is not where its match says. Chosen on simulated worlds (seeds 0 to
-# 59) together with the TUM frames.
-_WRONG_SHARE = 0.07
-# Deviation of a pose that lost an object [m and rad]: the others are not arbitrarily far, since an
-# accepted pose is right to 1 m and 45 degrees.
-_WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
-# Mean square of the residuals before any is seen, how many residuals this counts as, and the most
-# that a residual counts. Three boxes alone would seem to fit perfectly.
-_PRIOR_SQUARE, _PRIOR_RESIDUALS, _MOST_RESIDUAL = 2.8, 6.0, 4.0
-
-
-#: Of a pose whose boxes do not fix it.
-POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 class _Fit(NamedTuple):

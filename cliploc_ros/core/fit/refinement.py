@@ -38,6 +38,16 @@ LEAST_DEVIATION = 0.003
 
 # Residuals beyond this many deviations lose influence: some edges of maps and boxes are far off.
 _CAUCHY = 1.0
+# A round may lower the score to this share of the best so far: a fit of many edges is nearer to
+# the truth than the greatest overlap. A pose that loses its landmarks is dropped.
+LEAST_SHARE = 0.9
+_ROUNDS = 4
+_STEPS = 5
+_TRIALS = 4
+_FIRST_DAMPING = 1e-3
+_SETTLED = 1e-5
+# Beyond a step of this length, in metres and radians, the residuals are far from linear.
+_LONGEST_STEP = 1.0
 
 
 @compiled
@@ -210,18 +220,6 @@ def _normal_equations(jacobian, residuals):
                 total += jacobian[row, i] * weights[row] * jacobian[row, j]
             information[i, j] = information[j, i] = total
     return information, gradient
-
-
-# A round may lower the score to this share of the best so far: a fit of many edges is nearer to
-# the truth than the greatest overlap. A pose that loses its landmarks is dropped.
-LEAST_SHARE = 0.9
-_ROUNDS = 4
-_STEPS = 5
-_TRIALS = 4
-_FIRST_DAMPING = 1e-3
-_SETTLED = 1e-5
-# Beyond a step of this length, in metres and radians, the residuals are far from linear.
-_LONGEST_STEP = 1.0
 
 
 class Refined(NamedTuple):

@@ -19,6 +19,10 @@ from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
 _DOUBLE_ROOT = 1e-12
 _ROUNDING = 4e-16
+MAX_SOLUTIONS = 4
+_NEWTON_STEPS = 3
+# Triangles whose normalized cross product is below this are degenerate.
+_MIN_SINE = 1e-9
 
 
 @compiled
@@ -49,12 +53,6 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
             break  # near a double root, the next step would be arbitrary
         root -= value / ((3.0 * root + 2.0 * c2) * root + c1)
     return root
-
-
-MAX_SOLUTIONS = 4
-_NEWTON_STEPS = 3
-# Triangles whose normalized cross product is below this are degenerate.
-_MIN_SINE = 1e-9
 
 
 def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]

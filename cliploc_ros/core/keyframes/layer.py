@@ -42,6 +42,13 @@ _SAME_FOCAL = 0.02
 FROM_DEPTH, TRIANGULATED = 0.1, 0.02
 #: A pixel of the layer is kept in sixteenths.
 PIXEL_SCALE = 16.0
+VERSION = 1
+_CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
+_HASH_DIGITS = 12
+_MOST_DEVIATION = 1.0
+# A map whose landmarks of the same name have moved so far in general is another map [m]. An update
+# or an edit moves few of them.
+_MOST_MOVED_M = 0.25
 
 
 @dataclass(frozen=True)
@@ -168,9 +175,6 @@ def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float
     return np.concatenate(found)
 
 
-VERSION = 1
-
-
 def _check_words(name: str, arrays: Arrays) -> None:
     if (arrays[name] >= len(arrays['vocabulary'])).any():
         raise ArrayError(f'array {name} names a word that the vocabulary lacks')
@@ -195,12 +199,6 @@ _SCHEMA = Schema('file of keyframes', {
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
     {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True, checks_sums=False,
     largest_read=256_000_000)
-_CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
-_HASH_DIGITS = 12
-_MOST_DEVIATION = 1.0
-# A map whose landmarks of the same name have moved so far in general is another map [m]. An update
-# or an edit moves few of them.
-_MOST_MOVED_M = 0.25
 
 
 def layer_path(map_path: str | os.PathLike[str]) -> Path:

@@ -36,6 +36,20 @@ _QUOTED_STYLES = ('"', "'", '|', '>')
 # Longer text is no measured number; 300 digits would overflow a float.
 _MAX_NUMBER_LENGTH = 40
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+# Quoted text whose escapes mean the same in JSON and in YAML; halves of a pair of code units do
+# not. A key of YAML has at most 1024 characters.
+_ESCAPE = r'\\(?:["\\nrtbf]|u(?!d[89a-f])[0-9a-f]{4})'
+_TEXT = rf'"(?:[ !#-\[\]-~]|{_ESCAPE})*+"'
+_KEY = rf'"(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"'
+_FLOAT = r'(?:0|[1-9]\d{0,14})\.\d{1,9}'
+_SIGNED = rf'-?{_FLOAT}'
+_HEAD = re.compile(
+    r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
+    rf'      frame_id: ({_TEXT})\n'
+    r'      landmarks:\n')
+_INDENT = ' ' * 10
+# Groups of _LANDMARK before those of the details.
+_PLAIN = 6
 
 
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -149,24 +163,10 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
         text.lower(), text)
 
 
-# Quoted text whose escapes mean the same in JSON and in YAML; halves of a pair of code units do
-# not. A key of YAML has at most 1024 characters.
-_ESCAPE = r'\\(?:["\\nrtbf]|u(?!d[89a-f])[0-9a-f]{4})'
-_TEXT = rf'"(?:[ !#-\[\]-~]|{_ESCAPE})*+"'
-_KEY = rf'"(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"'
-_FLOAT = r'(?:0|[1-9]\d{0,14})\.\d{1,9}'
-_SIGNED = rf'-?{_FLOAT}'
-
-
 def _row(count: int) -> str:
     return rf'\[({_SIGNED}{rf", {_SIGNED}" * (count - 1)})\]'
 
 
-_HEAD = re.compile(
-    r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
-    rf'      frame_id: ({_TEXT})\n'
-    r'      landmarks:\n')
-_INDENT = ' ' * 10
 _LANDMARK = re.compile(''.join([
     rf'        ({_KEY}):\n', rf'{_INDENT}label: ({_TEXT})\n', rf'{_INDENT}class_id: ({_TEXT})\n',
     rf'{_INDENT}center: {_row(3)}\n', rf'{_INDENT}semi_axes: {_row(3)}\n',
@@ -179,8 +179,6 @@ _LANDMARK = re.compile(''.join([
       for name in ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'seen_ratio',
                    'baseline_deg', 'last_seen')),
     rf'(?:{_INDENT}source: ({_TEXT})\n)?+']))
-# Groups of _LANDMARK before those of the details.
-_PLAIN = 6
 
 
 class WrittenMap(NamedTuple):

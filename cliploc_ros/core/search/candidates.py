@@ -24,6 +24,13 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.errors import OptionsError
 
+#: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a
+#: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
+#: iterations do: candidates of equal class are hardly ever neighbours.
+MAX_CANDIDATES = 1_500
+# Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
+_FARTHEST = 1e6
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -136,15 +143,6 @@ def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candid
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return concatenated([first, second.select(new)])
-
-
-#: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a
-#: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
-#: iterations do: candidates of equal class are hardly ever neighbours.
-MAX_CANDIDATES = 1_500
-
-# Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
-_FARTHEST = 1e6
 
 
 def match_frame(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions

@@ -23,6 +23,10 @@ _MAX_STEPS = 500_000
 # A draw without a valid sample in this many attempts is skipped (its row is -1): the first
 # candidates of PROSAC may not have any.
 _MAX_ATTEMPTS = 100
+# Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
+# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
+# boxes are larger than the ellipsoid, or cut by the border.
+NEAREST, FARTHEST = 0.55, 2.5
 
 
 def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
@@ -206,12 +210,6 @@ def enumerate_compatible_pairs(compatible, cursor, samples):
         first += 1
     cursor[0], cursor[1] = newest, first
     return found
-
-
-# Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
-# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
-# boxes are larger than the ellipsoid, or cut by the border.
-NEAREST, FARTHEST = 0.55, 2.5
 
 
 def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:

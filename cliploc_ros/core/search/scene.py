@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.culling import Groups, SortedLandmarks, make_groups, no_landmarks
 
+#: A vertical (7,) holds up in the camera (3,) and in the map (3,), unit vectors, and the standard
+#: deviation of the angle between them [rad]. This one is unknown.
+VERTICAL_UNKNOWN = np.zeros(7)
+
 
 class Potential(NamedTuple):
     """Landmarks that single detections may show: u landmarks, p pairs."""
@@ -78,11 +82,6 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
                  by_landmark, np.ascontiguousarray(pairs), float(iou_threshold),
                  sorted_landmarks, make_groups(sorted_landmarks, classes, boxes, iou_threshold))
-
-
-#: A vertical (7,) holds up in the camera (3,) and in the map (3,), unit vectors, and the standard
-#: deviation of the angle between them [rad]. This one is unknown.
-VERTICAL_UNKNOWN = np.zeros(7)
 
 
 class Prior(NamedTuple):

@@ -32,6 +32,18 @@ MAX_DISTINCT = 8
 _PLACE_M, _PLACE_TRACE = SAME_PLACE.distance_m, SAME_PLACE.least_trace
 # Scores nearer than this differ by rounding only: the hypothesis found first stays.
 _TIE = 1e-9
+# search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries every
+# sample, so a better one of the same place follows.
+_MIN_SAMPLED_IOU = 0.9
+# The same of two pairs, whose poses inherit the noise of the vertical.
+_MIN_SAMPLED_PAIR_IOU = 0.2
+# How search_progressively enumerates samples of each size.
+_ORDERED = {3: (enumerate_compatible_triples, _MIN_SAMPLED_IOU),
+            2: (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU)}
+# A block of a search takes about this long, so that it keeps time limits.
+_BLOCK_S = 1e-3
+# Samples in a block.
+_FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 class Leaders(NamedTuple):
@@ -117,20 +129,6 @@ def are_near(rotation_a, translation_a, rotation_b, translation_b, distance_m, l
             center_b -= rotation_b[j, i] * translation_b[j]
         square += (center_a - center_b) ** 2
     return trace >= least_trace and square <= distance_m * distance_m
-
-
-# search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries every
-# sample, so a better one of the same place follows.
-_MIN_SAMPLED_IOU = 0.9
-# The same of two pairs, whose poses inherit the noise of the vertical.
-_MIN_SAMPLED_PAIR_IOU = 0.2
-# How search_progressively enumerates samples of each size.
-_ORDERED = {3: (enumerate_compatible_triples, _MIN_SAMPLED_IOU),
-            2: (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU)}
-# A block of a search takes about this long, so that it keeps time limits.
-_BLOCK_S = 1e-3
-# Samples in a block.
-_FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 class Progress(NamedTuple):

@@ -27,6 +27,17 @@ from cliploc_ros.units import NS_PER_S
 _EXPECTED = 4
 # Detections may come this much later than the last ones.
 _SPARE = 1.5
+#: A robot that is refused retries at once: discovering its publishers again would cost it a tenth
+#: of a second.
+LINGER_S = 1.0
+_CHECK_PERIOD_S = 0.5
+# Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
+# detector, and every n-th of larger ones.
+_MAX_WAITING = 2000
+_MAX_IMAGE_BYTES = 256 * 2**20
+_MAX_DETECTIONS_BYTES = 16 * 2**20
+# A guess at the memory of one detection in Python.
+_DETECTION_BYTES = 2000
 
 
 class ExactPairing:
@@ -143,19 +154,6 @@ class ExactPairing:
         _, size = self._waiting[topic].pop(stamp_ns)
         self._bytes[topic] -= size
         self.dropped[topic] += 1
-
-
-#: A robot that is refused retries at once: discovering its publishers again would cost it a tenth
-#: of a second.
-LINGER_S = 1.0
-_CHECK_PERIOD_S = 0.5
-# Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
-# detector, and every n-th of larger ones.
-_MAX_WAITING = 2000
-_MAX_IMAGE_BYTES = 256 * 2**20
-_MAX_DETECTIONS_BYTES = 16 * 2**20
-# A guess at the memory of one detection in Python.
-_DETECTION_BYTES = 2000
 
 
 class NoFrameError(CliplocError):

@@ -44,6 +44,15 @@ MOMENT_NS = 300_000_000
 LONG_NS = 3 * NS_PER_S
 # A robot that stands seems to move by less: its way counts in longer steps.
 _STEP_M = 0.02
+# The boxes of a slow detector arrive long after their image was taken.
+_LENGTH_S = 30.0
+# The message that follows an image arrives within this time: wheels publish faster.
+_PATIENCE_S = 0.2
+# Odometry that ends or begins this close to an image may cover the next image.
+_NEARLY_NS = 2_000_000_000
+#: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
+#: taking a moving robot on a busy machine for one at rest.
+MOMENT_PATIENCE_S = 2.0
 
 
 class NoOdometryError(CliplocError):
@@ -242,17 +251,6 @@ def _goes_on(poses: Sequence[_Pose], pose: _Pose) -> bool:
 
 def _turn_rad(one: _Pose, other: _Pose) -> float:
     return float(2.0 * np.arccos(min(1.0, abs(float(one.quat_xyzw @ other.quat_xyzw)))))
-
-
-# The boxes of a slow detector arrive long after their image was taken.
-_LENGTH_S = 30.0
-# The message that follows an image arrives within this time: wheels publish faster.
-_PATIENCE_S = 0.2
-# Odometry that ends or begins this close to an image may cover the next image.
-_NEARLY_NS = 2_000_000_000
-#: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
-#: taking a moving robot on a busy machine for one at rest.
-MOMENT_PATIENCE_S = 2.0
 
 
 class BodyPose(NamedTuple):

@@ -20,10 +20,10 @@ from cliploc_ros.mapping.building import LeftOut
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
 from cliploc_ros.mapping.options import UpdateOptions
-from cliploc_ros.mapping.updating.alignment import Known, deviations
-from cliploc_ros.mapping.updating.identity import Fates
-from cliploc_ros.mapping.updating.judging import Judged, Objects
-from cliploc_ros.mapping.updating.sight import Sight
+from cliploc_ros.mapping.update.alignment import Known, deviations
+from cliploc_ros.mapping.update.identity import Fates
+from cliploc_ros.mapping.update.judging import Judged, Objects
+from cliploc_ros.mapping.update.sight import Sight
 from cliploc_ros.mapping.views import Views
 
 _ROWS_SHOWN = 40

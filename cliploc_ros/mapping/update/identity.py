@@ -21,8 +21,8 @@ from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.alignment import Known, has_moved
-from cliploc_ros.mapping.updating.judging import Judged, Objects
+from cliploc_ros.mapping.update.alignment import Known, has_moved
+from cliploc_ros.mapping.update.judging import Judged, Objects
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.

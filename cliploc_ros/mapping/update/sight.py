@@ -54,17 +54,10 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
              is_solid: NDArray[np.bool_], options: UpdateOptions) -> Sight:
     """Return in which frames places were in view, and in which of them their landmark was seen.
 
-    Parameters
-    ----------
-    places : Landmarks
-        Class -1: of a class that no box has.
-    shown : ndarray (n,) of int
-        The place that each box shows, -1 for none.
-    is_solid : ndarray (L,) of bool
-        Places with an object, which may hide others.
+    Class -1 is one that no box has. Solid places have an object, which may hide others.
     """
     count = len(places.centers)
-    extents = least_extents(views, int(places.classes.max(initial=0)))
+    extents = _least_extents(views, int(places.classes.max(initial=0)))
     least = np.where(places.classes < 0, extents[-1], extents[places.classes])
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
     frames, rows = _in_view(
@@ -73,20 +66,18 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
     seen_rows = np.nonzero(shown >= 0)[0]
     seen_keys = np.unique(views.frames[seen_rows] * count + shown[seen_rows])
     keys = np.union1d(frames * count + rows, seen_keys)
-    (expected, expected_frames), (seen, seen_frames) = (
-        _per_viewpoint(views, keys, count), _per_viewpoint(views, seen_keys, count))
+
+    def per_viewpoint(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the numbers of viewpoints and of frames (L,) among keys frame * L + place."""
+        frames, rows = np.divmod(keys, max(count, 1))
+        distinct = np.unique(views.viewpoints[frames] * count + rows) % max(count, 1)
+        return np.bincount(distinct, minlength=count), np.bincount(rows, minlength=count)
+
+    (expected, expected_frames), (seen, seen_frames) = map(per_viewpoint, (keys, seen_keys))
     return Sight(expected, seen, expected_frames, seen_frames)
 
 
-def _per_viewpoint(views: Views, keys: NDArray[np.int64], count: int
-                   ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the numbers of viewpoints and of frames (L,) among keys frame * L + place."""
-    frames, rows = np.divmod(keys, max(count, 1))
-    distinct = np.unique(views.viewpoints[frames] * count + rows) % max(count, 1)
-    return np.bincount(distinct, minlength=count), np.bincount(rows, minlength=count)
-
-
-def least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
+def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
     """Return from which size on boxes are detected, by class, on the plane z = 1.
 
     The last entry is that of all classes together.

@@ -25,8 +25,8 @@ from cliploc_ros.mapping.landmarks import (
 )
 from cliploc_ros.mapping.options import MappingOptions, UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.alignment import Known, Refits, has_moved, refit
-from cliploc_ros.mapping.updating.sight import Sight, look_for
+from cliploc_ros.mapping.update.alignment import Known, Refits, has_moved, refit
+from cliploc_ros.mapping.update.sight import Sight, look_for
 from cliploc_ros.mapping.views import Views, map_from_cameras
 
 # A recording in which objects are seen less or more often than before changes all ratios.

@@ -12,15 +12,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.updating.alignment import Alignment, Known, align, known_landmarks
-from cliploc_ros.mapping.updating.identity import (
+from cliploc_ros.mapping.update.alignment import Alignment, Known, align, known_landmarks
+from cliploc_ros.mapping.update.identity import (
     compare_looks,
     decide_fates,
     renew_embeddings,
     why_not_comparable,
 )
-from cliploc_ros.mapping.updating.judging import Judged, gather_objects, judge
-from cliploc_ros.mapping.updating.renewal import UpdateReport, describe, renew
+from cliploc_ros.mapping.update.judging import Judged, gather_objects, judge
+from cliploc_ros.mapping.update.renewal import UpdateReport, describe, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
 
