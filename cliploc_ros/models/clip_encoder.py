@@ -114,30 +114,15 @@ class ClipEncoder:
 
     def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-        """Return one embedding for each box of an image.
+        """Return one embedding (n, d), of unit length, for each box of an image (h, w, 3).
 
-        A crop holds every pixel that its box touches. open_clip's own preprocessing prepares the
-        crops; the tower takes at most ``max_batch`` of them at once.
+        The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
+        cropped. A crop holds every pixel that its box touches. open_clip's own preprocessing
+        prepares the crops; the tower takes at most ``max_batch`` of them at once.
 
-        Parameters
-        ----------
-        image_rgb : ndarray (h, w, 3) uint8
-        bboxes_xyxy : ndarray (n, 4)
-            Left, top, right, bottom [px]; `visible_boxes` finds those that can be cropped.
-
-        Returns
-        -------
-        ndarray (n, d) float32
-            Rows of unit length.
-
-        Raises
-        ------
-        ImageError
-            For an image of another shape or type, or without pixels.
-        CliplocError
-            For boxes that are not finite, are empty, or lie outside the image.
-        ModelError
-            When memory runs out, or the tower gives no finite numbers.
+        ImageError: for an image of another shape or type, or without pixels. CliplocError: for
+        boxes that are not finite, are empty, or lie outside the image. ModelError: when memory
+        runs out, or the tower gives no finite numbers.
         """
         import torch
         from PIL import Image
