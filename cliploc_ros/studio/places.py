@@ -73,18 +73,10 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
                 tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Places:
     """Return the places of a map where a robot would be accepted, refused or misled.
 
-    Parameters
-    ----------
-    landmarks : mapping of str to Landmark
-        One at least, or else MapError is raised.
-    recording : Recording, optional
-        Gives the camera's height and the detector's errors.
-    before : Places, optional
-        Its positions are tried again where they suit, so that only edits change the figures.
-    tell : callable
-        Called with the share that is done; an error that it raises ends the search.
-    limit_s : float
-        No position is begun after this [s].
+    The recording gives the camera's height and the detector's errors. The positions of the time
+    before are tried again where they suit, so that only edits change the figures. ``tell`` is
+    called with the share that is done; an error that it raises ends the search. No position is
+    begun after the limit. MapError: there are no landmarks.
     """
     tell(0.0)
     landmark_map = map_of(landmarks, 'map', 'studio')
