@@ -16,11 +16,11 @@ from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.errors import ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
 from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import MountCorrection
-from cliploc_ros.mapping.updating.renewal import UpdateReport
-from cliploc_ros.mapping.updating.updating import update_map as update_landmarks
+from cliploc_ros.mapping.update.renewal import UpdateReport
+from cliploc_ros.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.phrase_embeddings import phrases_of_classes
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
@@ -57,15 +57,8 @@ class Labeller:
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
         """Return the map with labels, and its image embeddings.
 
-        Parameters
-        ----------
-        shown : ndarray (n,) of int
-            Row of the landmark that each box shows, -1 for none.
-
-        Raises
-        ------
-        CliplocError
-            The text tower cannot be loaded.
+        The array shown (n,) has the row of the landmark that each box shows, -1 for none.
+        CliplocError: the text tower cannot be loaded.
         """
         if not _has_embeddings(detections):
             return landmark_map, None
@@ -185,7 +178,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
     if options.pose_errors is None and options.estimate_pose_errors:
         options = replace(options, pose_errors=_USUAL_NOISE)
-    updated = update_landmarks(old, detections, UpdateOptions(mapping=options), old_embeddings)
+    updated = update_landmarks(old, detections, options, old_embeddings)
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):
         return MadeMap(landmark_map, updated.report, updated.embeddings)

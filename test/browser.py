@@ -65,6 +65,31 @@ class Person:
     def find(self, text):
         self.field('Find').fill(text)
 
+    def select(self, document, landmark_id):
+        """Find a landmark in the table, and click it."""
+        self.find(landmark_id)
+        self.click(re.compile(f'^{landmark_id} '))
+        wait_for(lambda: document.selection == (landmark_id,), 'the selection')
+
+    def draw_box(self, studio, server, view, box):
+        """Type the corners of a box (4,) [px] in a view."""
+        self.type('View', str(view))
+        wait_for(lambda: studio.view == view, 'the view')
+        for place, pixel in enumerate(round(float(edge)) for edge in box):
+            label, number = ('Left, top [px]', 'Right, bottom [px]')[place // 2], place % 2
+            self.type(label, str(pixel), number)
+            # viser's page loses a value if another one follows within milliseconds
+            wait_for(lambda label=label, number=number, pixel=pixel: value_of(
+                server, label)[number] == pixel, 'the corner')
+        self.click('Draw this box')
+        wait_for(lambda: view in studio.drawn, 'the box')
+
+    def name_new(self, server, label, class_id):
+        """Type label and class of the landmark that is to be created."""
+        for field, text in (('New label', label), ('New class', class_id)):
+            self.type(field, text)
+            wait_for(lambda field=field, text=text: value_of(server, field) == text, field)
+
     def picture(self, name):
         """Keep a picture of the page where the environment names a folder for it."""
         if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):

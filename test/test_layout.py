@@ -27,7 +27,7 @@ LAYERS = (
     ('core.fit',),
     ('core.acceptance',),
     ('core',),
-    ('simulation.labels',),
+    ('simulation.detector', 'simulation.labels'),
     ('mapping',),
     ('messages', 'command'),
     ('models', 'datasets', 'vocabulary'),

@@ -25,7 +25,7 @@ from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.checking.relocalization import PosedObservation
+    from cliploc_ros.mapping.check.relocalization import PosedObservation
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -107,10 +107,10 @@ def check(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.evaluation.map_check.output import PAGE, write_report
-    from cliploc_ros.evaluation.map_check.page import summary_lines
+    from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
+    from cliploc_ros.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.mapping.checking.checking import check_map
+    from cliploc_ros.mapping.check.checking import check_map
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
@@ -133,7 +133,8 @@ def check(options: argparse.Namespace) -> int:
     with StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer)
-        write_report(options.out, options.map.name, landmark_map, report)
+        write_report(options.out, options.map.name, report,
+                     draw_pictures(landmark_map, report))
     print('\n'.join(summary_lines(report)))
     print('what to do:')
     print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
@@ -147,7 +148,7 @@ def check(options: argparse.Namespace) -> int:
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:
     from cliploc_ros.datasets.queries import load_queries
     from cliploc_ros.evaluation.trials import make_queries
-    from cliploc_ros.mapping.checking.relocalization import PosedObservation
+    from cliploc_ros.mapping.check.relocalization import PosedObservation
 
     found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
     return [PosedObservation(one.observation, one.map_from_camera,

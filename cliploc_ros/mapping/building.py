@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of mapping: posed detections in, a map and a report out.
-
-Throughout mapping, ``shown`` (n,) has the row of the landmark that each box shows, -1 for none.
-"""
+"""The entry point of mapping: posed detections in, a map and a report out."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -12,13 +12,12 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps, ious_with
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, is_in_image, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
 
-#: A landmark is expected in a frame that shows this share of its box, from no farther away than
-#: this times the greatest distance at which it was detected.
-SHOWN_SHARE = 0.6
+#: A landmark is expected from no farther away than this times the greatest distance at which it
+#: was detected.
 REACH = 1.2
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
@@ -112,19 +111,15 @@ def widest_angle_deg(directions: NDArray[np.float64]) -> float:
 def is_expected(views, cameras, center, basis, reach):
     """Return the frames (F,) that show an ellipsoid, from no farther away than reach [m]."""
     expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
-    left, top, right, bottom = views.bounds
     for frame in range(len(cameras)):
         distance_2 = 0.0
         for i in range(3):
             distance_2 += (center[i] - cameras[frame, i]) ** 2
         if distance_2 > reach * reach:
             continue
-        if not project_box(views.rotations[frame], views.translations[frame], center, basis, box):
-            continue
-        width = min(box[2], right) - max(box[0], left)
-        height = min(box[3], bottom) - max(box[1], top)
-        expected[frame] = width > 0.0 and height > 0.0 and width * height > (
-            SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
+        expected[frame] = project_box(
+            views.rotations[frame], views.translations[frame], center, basis, box
+        ) and is_in_image(box, views.bounds)
     return expected
 
 
@@ -164,11 +159,7 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                     ) -> tuple[float, float]:
     """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int, optional
-        The landmark that each box shows, -1 for none: explains a box although the landmark's
-        class is another one.
+    The landmark that a box shows explains it although its class is another one.
     """
     ious = best_ious(views, landmarks)
     if shown is not None:

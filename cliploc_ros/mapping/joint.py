@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-A process of errors holds on to the given poses (cliploc_ros.mapping.joint). Odometry, where
+A process of errors holds on to the given poses (Prior). Odometry, where
 there is any, joins successive frames (cliploc_ros.mapping.odometry). Box edges give the same
 residuals as in cliploc_ros.mapping.fitting.
 
@@ -89,16 +89,8 @@ def pose_bands(of_poses: NDArray[np.float64], prior: Prior,
                of_steps: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the poses' part of the equations with the prior, as lower bands.
 
-    Parameters
-    ----------
-    of_poses : ndarray (F, 6, 6)
-        A block for each pose.
-    of_steps : ndarray (F, 6, 6), optional
-        The block below each of these: the rows of the next pose, the columns of this one.
-
-    Returns
-    -------
-    ndarray (7, 6 F), or (12, 6 F) with blocks below
+    Each pose has a block (6, 6), and with odometry one below: the rows of the next pose, the
+    columns of this one. The bands are (7, 6 F), or (12, 6 F) with blocks below.
     """
     count = POSE_SIZE + 1 if of_steps is None else 2 * POSE_SIZE
     bands = np.zeros((count, len(of_poses), POSE_SIZE))
@@ -136,20 +128,9 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
                    steps: Steps | None = None) -> tuple[Views, Landmarks]:
     """Return the views with refined poses, and the refined landmarks.
 
-    Parameters
-    ----------
-    given : Views
-        With the given poses, which the prior holds on to.
-    views : Views
-        With the poses to start from.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    iterations : int
-        The most steps of Levenberg and Marquardt.
-    anchors : Anchors, optional
-        Where the landmarks are known to be from before.
-    steps : Steps, optional
-        Odometry between successive frames.
+    The prior holds on to the given poses, anchors to the landmarks' known places, and steps to the
+    odometry between successive frames; views has the poses to start from. It takes at most this
+    number of steps of Levenberg and Marquardt.
     """
     rows = np.nonzero(shown >= 0)[0]
     problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors, steps)
@@ -229,16 +210,20 @@ class Problem(NamedTuple):
                            state.landmarks.bases, *arrays)
         equations = Equations(*arrays)
         if self.anchors is not None:
-            cost += _hold(self.anchors, state.landmarks, equations)
+            weights = 1.0 / np.square(self.anchors.sigmas)[:, None]
+            offsets = state.landmarks.centers - self.anchors.centers
+            equations.landmark_gradient[:, :3] += weights * offsets
+            equations.of_landmarks[:, np.arange(3), np.arange(3)] += weights
+            cost += 0.5 * float((weights * np.square(offsets)).sum())
         pull = self.prior.gradient(state.errors)
         equations.pose_gradient[:] += pull
         cost += 0.5 * float((pull * state.errors).sum())
         if self.steps is None:
             return cost, equations
-        moved = self.steps.linearize(state.views)
-        return cost + moved.cost, equations._replace(
-            of_poses=equations.of_poses + moved.of_poses, of_steps=moved.of_steps,
-            pose_gradient=equations.pose_gradient + moved.gradient)
+        own_cost, of_poses, of_steps, gradient = self.steps.linearize(state.views)
+        return cost + own_cost, equations._replace(
+            of_poses=equations.of_poses + of_poses, of_steps=of_steps,
+            pose_gradient=equations.pose_gradient + gradient)
 
     def solve(self, equations: Equations, damping: float
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -278,16 +263,6 @@ class Problem(NamedTuple):
         starts = np.searchsorted(self.views.frames[self.rows][order], np.arange(frames + 1))
         return bsr_matrix((of_boxes[order], self.landmarks[order], starts),
                           shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
-
-
-def _hold(anchors: Anchors, landmarks: Landmarks, equations: Equations) -> float:
-    """Add the anchors to the normal equations; return their cost."""
-    weights = 1.0 / np.square(anchors.sigmas)[:, None]
-    offsets = landmarks.centers - anchors.centers
-    equations.landmark_gradient[:, :3] += weights * offsets
-    for axis in range(3):
-        equations.of_landmarks[:, axis, axis] += weights[:, 0]
-    return 0.5 * float((weights * np.square(offsets)).sum())
 
 
 @compiled

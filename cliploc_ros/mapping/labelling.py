@@ -43,14 +43,7 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
                     shown: NDArray[np.int64]) -> LandmarkEmbeddings:
     """Return what the encoder saw of each landmark.
 
-    Frames of one viewpoint share the weight of one.
-
-    Parameters
-    ----------
-    detections : PosedDetections
-        With embeddings. Rows of the length 0 are no crops.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
+    Frames of one viewpoint share the weight of one. Embeddings of the length 0 are no crops.
     """
     assert detections.embeddings is not None
     viewpoints = number_viewpoints(detections.map_from_camera)
@@ -77,12 +70,7 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
                     phrases: Mapping[str, Sequence[Phrases]]) -> LandmarkMap:
     """Return the map with the phrases that fit each landmark best, and their weights.
 
-    Parameters
-    ----------
-    embeddings : LandmarkEmbeddings
-        In any order. A landmark without one keeps its label.
-    phrases : mapping of str to sequence of Phrases
-        Of each class that a landmark has.
+    A landmark without embeddings keeps its label. Each class of a landmark has its phrases.
     """
     embeddings = embeddings.in_order(landmark_map.landmark_ids)
     labels = list(landmark_map.labels)

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.simulation.detector import SHOWN_SHARE
 
 #: Numbers of a landmark: centre, then the upper triangle of D, row by row.
 LANDMARK_SIZE = 9
@@ -38,14 +39,8 @@ _COLUMNS = np.array([0, 1, 2, 1, 2, 2])
 def project_box(rotation, translation, center, basis, box):
     """Write the box of an ellipsoid on the plane z = 1; return whether it is wholly in front.
 
-    Parameters
-    ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
-    center, basis : ndarray (3,), (3, 3)
-        Of the ellipsoid in the map.
-    box : ndarray (4,)
-        Left, top, right, bottom. Untouched where the ellipsoid is not wholly in front.
+    Rotation and translation are those of camera_from_map. The box (4,) is left, top, right,
+    bottom; it is untouched where the ellipsoid is not wholly in front.
     """
     r = rotation
     x = r[0, 0] * center[0] + r[0, 1] * center[1] + r[0, 2] * center[2] + translation[0]
@@ -79,14 +74,8 @@ def project_box(rotation, translation, center, basis, box):
 def linearize_box(rotation, translation, center, basis, box, by_landmark, by_pose):
     """Write the box of an ellipsoid and its derivatives; return whether it is wholly in front.
 
-    Parameters
-    ----------
-    rotation, translation, center, basis, box
-        As in project_box.
-    by_landmark : ndarray (4, 9)
-        Derivatives of the edges by the centre in the map and by D.
-    by_pose : ndarray (4, 6)
-        By a small motion of the map in the camera's coordinate frame: p' = p + v + w x p.
+    The derivatives of the edges are by_landmark (4, 9) by the centre in the map and by D, and
+    by_pose (4, 6) by a small motion of the map in the camera: p' = p + v + w x p.
     """
     if not project_box(rotation, translation, center, basis, box):
         return False
@@ -150,6 +139,15 @@ def _chain(rotation, p, g, axis, by_p, by_n, by_landmark, by_pose):
     by_pose[across] += turn * (2.0 * by_n[0] * naz + by_n[1] * (nzz - naa) - 2.0 * by_n[2] * naz)
     by_pose[own] += turn * (by_n[1] * nab + 2.0 * by_n[2] * nbz)
     by_pose[5] += turn * (-2.0 * by_n[0] * nab - by_n[1] * nbz)
+
+
+@compiled
+def is_in_image(box, bounds):
+    """Tell whether an image shows enough of a box (4,) for a detector."""
+    width = min(box[2], bounds[2]) - max(box[0], bounds[0])
+    height = min(box[3], bounds[3]) - max(box[1], bounds[1])
+    return width > 0.0 and height > 0.0 and width * height > (
+        SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
 
 
 @compiled

@@ -13,7 +13,7 @@ of the process of pose errors e (see cliploc_ros.mapping.joint),
              + log det (H / s^2 + Q) / 2 - log det Q / 2.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from scipy.sparse import csr_matrix
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.mapping.fitting import edge_residual, robust_weight
 from cliploc_ros.mapping.joint import (
-    Equations,
     Prior,
     Problem,
     State,
@@ -60,10 +59,7 @@ _BENDING = 1.6
 
 def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                             ) -> PoseErrors | None:
-    """Return how the errors of the given poses seem to behave; None where they do no harm.
-
-    Parameters as in estimate_pose_errors.
-    """
+    """Return how the errors of the given poses seem to behave; None where they do no harm."""
     errors = estimate_pose_errors(given, landmarks, shown, given)
     if errors is None or (errors.sigma_m < _HARMLESS.sigma_m
                           and errors.sigma_deg < _HARMLESS.sigma_deg):
@@ -75,84 +71,29 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
                          start: Views) -> PoseErrors | None:
     """Return how the errors of the given poses seem to behave; None with too few boxes.
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    start : Views
-        With the poses that the landmarks were fitted to.
+    The landmarks were fitted to the poses of start.
     """
     frames, rows = _sample(given)
-    numbers, landmarks = _most_seen(landmarks, shown[rows])
-    if len(frames) < _MIN_FRAMES or len(landmarks.centers) < _MIN_LANDMARKS:
+    counts = np.bincount(shown[rows][shown[rows] >= 0], minlength=len(landmarks.centers))
+    chosen = np.argsort(-counts, kind='stable')[:_MAX_LANDMARKS]
+    chosen = chosen[counts[chosen] >= _MIN_BOXES]
+    if len(frames) < _MIN_FRAMES or len(chosen) < _MIN_LANDMARKS:
         return None
+    numbers = np.full(len(counts) + 1, -1)  # the last one is that of no landmark
+    numbers[chosen] = np.arange(len(chosen))
+    shown, landmarks = numbers[shown[rows]], landmarks.select(chosen)
     views, refined = _pick(given, frames, rows), _pick(start, frames, rows)
-    shown = numbers[shown[rows]]
     errors, logs = _START, np.log([_START.sigma_m, _START.sigma_deg, _START.correlation_s, 1.0])
     for _ in range(_ROUNDS):
         refined, landmarks = refine_jointly(views, refined, landmarks, shown, errors,
                                             _REFINEMENTS)
-        evidence = _Linearized.of(views, refined, landmarks, shown)
-        found = minimize(evidence.cost, logs, method='Nelder-Mead',
-                         bounds=list(zip(_LOWEST, _HIGHEST, strict=True)),
+        found = minimize(_cost_function(views, refined, landmarks, shown), logs,
+                         method='Nelder-Mead', bounds=list(zip(_LOWEST, _HIGHEST, strict=True)),
                          options={'maxfev': _EVALUATIONS, 'xatol': 0.05, 'fatol': 0.1,
                                   'initial_simplex': logs + 0.7 * np.eye(5, 4, -1)})
         logs = found.x
         errors = PoseErrors(*map(float, np.exp(logs[:3])))
     return errors
-
-
-class _Linearized(NamedTuple):
-    """The boxes about the best poses and landmarks."""
-
-    stamps_s: NDArray[np.float64]  #: (F,)
-    errors: NDArray[np.float64]  #: (F, 6)
-    equations: Equations  #: Of the boxes alone
-    coupling: NDArray[np.float64]  #: (6 F, 9 L)
-    #: Sum of the weighted squares of the residuals, and of their weights
-    squares: float
-    weight: float
-
-    @staticmethod
-    def of(given: Views, refined: Views, landmarks: Landmarks, shown: NDArray[np.int64]
-           ) -> '_Linearized':
-        """Linearize the boxes at refined poses and landmarks."""
-        rows = np.nonzero(shown >= 0)[0]
-        frames, count = len(given.rotations), len(landmarks.centers)
-        nothing = Prior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
-        problem = Problem(refined, rows, shown[rows], nothing)
-        errors = pose_errors(given, refined)
-        _, equations = problem.linearize(State(refined, landmarks, errors))
-        coupling = problem.coupling(equations.of_boxes, frames, count).toarray()
-        squares, weights = _sum_squares(refined, rows, shown[rows], landmarks.centers,
-                                        landmarks.bases)
-        return _Linearized(given.stamps_s, errors, equations, coupling, squares, weights)
-
-    def cost(self, logs: NDArray[np.float64]) -> float:
-        """Return -log p for the logarithms of sigma [m] [deg], time [s] and scale."""
-        sigma_m, sigma_deg, correlation_s, scale = np.exp(logs)
-        prior = Prior.of(self.stamps_s, PoseErrors(sigma_m, sigma_deg, correlation_s))
-        gain, size = scale ** -2, len(self.equations.of_landmarks)
-        bands = pose_bands(gain * self.equations.of_poses, prior)
-        of_landmarks = np.zeros((size, 9, size, 9))
-        every = np.arange(size)
-        of_landmarks[every, :, every] = gain * self.equations.of_landmarks + 1e-6 * np.eye(9)
-        pull = prior.gradient(self.errors)
-        by_pose = (gain * self.equations.pose_gradient + pull).ravel()
-        coupling = gain * self.coupling
-        try:
-            factor = cholesky_banded(bands, lower=True)
-            held = cho_solve_banded((factor, True), np.column_stack([coupling, by_pose]))
-            schur = of_landmarks.reshape(9 * size, -1) - coupling.T @ held[:, :-1]
-            right = gain * self.equations.landmark_gradient.ravel() - coupling.T @ held[:, -1]
-            root = cho_factor(schur, lower=True)
-        except LinAlgError:
-            return np.inf
-        gained = by_pose @ held[:, -1] + right @ cho_solve(root, right)
-        return float(0.5 * gain * self.squares + self.weight * logs[3]
-                     + 0.5 * (pull * self.errors).sum() - 0.5 * gained
-                     + np.log(factor[0]).sum() + np.log(np.diag(root[0])).sum()
-                     - 0.5 * prior.log_determinant())
 
 
 def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -166,20 +107,6 @@ def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return frames, np.nonzero(np.isin(views.frames, frames))[0]
 
 
-def _most_seen(landmarks: Landmarks, shown: NDArray[np.int64]
-               ) -> tuple[NDArray[np.int64], Landmarks]:
-    """Return the landmarks seen most, and the new number of each old one, -1 for none.
-
-    The last number is that of the old number -1.
-    """
-    counts = np.bincount(shown[shown >= 0], minlength=len(landmarks.centers))
-    chosen = np.argsort(-counts, kind='stable')[:_MAX_LANDMARKS]
-    chosen = chosen[counts[chosen] >= _MIN_BOXES]
-    numbers = np.full(len(landmarks.centers) + 1, -1)
-    numbers[chosen] = np.arange(len(chosen))
-    return numbers, landmarks.select(chosen)
-
-
 def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> Views:
     """Return some frames with their rows, each of full weight."""
     offsets = np.searchsorted(rows, views.offsets)
@@ -190,6 +117,46 @@ def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> V
         frames=np.searchsorted(frames, views.frames[rows]), classes=views.classes[rows],
         edges=views.edges[rows], stiffness=views.stiffness[rows], is_open=views.is_open[rows],
         depths=views.depths[rows], depth_stiffness=views.depth_stiffness[rows])
+
+
+def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: NDArray[np.int64]
+                   ) -> Callable[[NDArray[np.float64]], float]:
+    """Return -log p as a function of the logarithms of sigma [m] [deg], time [s] and scale.
+
+    The boxes are linearized at refined poses and landmarks.
+    """
+    rows = np.nonzero(shown >= 0)[0]
+    frames, size = len(given.rotations), len(landmarks.centers)
+    nothing = Prior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
+    problem = Problem(refined, rows, shown[rows], nothing)
+    errors = pose_errors(given, refined)
+    _, equations = problem.linearize(State(refined, landmarks, errors))
+    joint = problem.coupling(equations.of_boxes, frames, size).toarray()
+    squares, weights = _sum_squares(refined, rows, shown[rows], landmarks.centers, landmarks.bases)
+
+    def cost(logs: NDArray[np.float64]) -> float:
+        sigma_m, sigma_deg, correlation_s, scale = np.exp(logs)
+        prior = Prior.of(given.stamps_s, PoseErrors(sigma_m, sigma_deg, correlation_s))
+        gain, every = scale ** -2, np.arange(size)
+        bands = pose_bands(gain * equations.of_poses, prior)
+        of_landmarks = np.zeros((size, 9, size, 9))
+        of_landmarks[every, :, every] = gain * equations.of_landmarks + 1e-6 * np.eye(9)
+        pull, coupling = prior.gradient(errors), gain * joint
+        by_pose = (gain * equations.pose_gradient + pull).ravel()
+        try:
+            factor = cholesky_banded(bands, lower=True)
+            held = cho_solve_banded((factor, True), np.column_stack([coupling, by_pose]))
+            schur = of_landmarks.reshape(9 * size, -1) - coupling.T @ held[:, :-1]
+            right = gain * equations.landmark_gradient.ravel() - coupling.T @ held[:, -1]
+            root = cho_factor(schur, lower=True)
+        except LinAlgError:
+            return np.inf
+        gained = by_pose @ held[:, -1] + right @ cho_solve(root, right)
+        return float(0.5 * gain * squares + weights * logs[3] + 0.5 * (pull * errors).sum()
+                     - 0.5 * gained + np.log(factor[0]).sum() + np.log(np.diag(root[0])).sum()
+                     - 0.5 * prior.log_determinant())
+
+    return cost
 
 
 @compiled
@@ -216,17 +183,9 @@ def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.
                   count: int) -> NDArray[np.float64]:
     """Return by how much errors of the poses displace each landmark on each axis (count,) [m].
 
-    What a landmark's frames have in common stays: the mean of as many independent errors as there
-    are spans of time in which it was seen.
-
-    Parameters
-    ----------
-    changes : ndarray (F, 6)
-        Squares of what refinement changed; 0 where the poses were taken as they are.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    count : int
-        Number of landmarks.
+    The part that a landmark's frames have in common stays: the mean of as many independent errors
+    as there are spans of time in which it was seen. Changes (F, 6) are the squares of the changes
+    by refinement; 0 where the poses were taken as they are.
     """
     squares = np.zeros(count)
     for row, boxes in enumerate(group_boxes(shown, count)):
@@ -241,16 +200,12 @@ def shared_by_neighbours(views: Views, shown: NDArray[np.int64], count: int, err
                          ) -> NDArray[np.float64]:
     """Return by how much each landmark's part of the map is off as a whole (count, 2) [m] [deg].
 
-    On each axis. The part is displaced, and turned about the cameras that saw it.
+    The part is the landmarks that some frame shows together with it, and the frames that saw any
+    of them. It is displaced on each axis, and turned about the cameras that saw it. The mean of
+    errors of a stationary process of deviation sigma that forgets itself as exp(-|t - s| / tau)
+    has, over n frames, the variance
 
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    count : int
-        Number of landmarks.
-    errors : PoseErrors
-        Of the poses that were refined.
+        sigma^2 / n_eff,   1 / n_eff = sum of exp(-|t_i - t_j| / tau) over i and j, over n^2.
     """
     rows = np.nonzero(shown >= 0)[0]
     seen = csr_matrix((np.ones(len(rows), dtype=np.int32), (views.frames[rows], shown[rows])),

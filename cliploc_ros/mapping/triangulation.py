@@ -10,7 +10,6 @@ next. Every box is the seed of some hypotheses, so that rare objects get their s
 
 from dataclasses import replace
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from cliploc_ros.mapping.landmarks import (
 )
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.views import Views, with_depths
+from cliploc_ros.mapping.views import Views
 
 # How far the centre lies behind the surface, in radii that the box suggests, and the standard
 # deviation of this share. Guesses: 1 for a ball, 0 for a picture on a wall.
@@ -68,15 +67,9 @@ def options_with_depth(options: MappingOptions) -> MappingOptions:
 def add_depths(views: Views, detections: PosedDetections, scale: float = 1.0) -> Views:
     """Return views that know how deep the centre of each box's object lies.
 
-    Parameters
-    ----------
-    detections : PosedDetections
-        The same boxes. Without depth the views stay as they are.
-    scale : float
-        True depth divided by measured depth.
+    The scale is true depth divided by measured depth.
     """
-    if detections.depths is None:
-        return views
+    assert detections.depths is not None
     surfaces = scale * detections.depths.astype(np.float64)
     spreads = (np.zeros_like(surfaces) if detections.depth_spreads is None
                else scale * detections.depth_spreads)
@@ -86,8 +79,8 @@ def add_depths(views: Views, detections: PosedDetections, scale: float = 1.0) ->
     sigmas = np.sqrt(np.square(_DEPTH_SIGMA * centers) + np.square(spreads)
                      + np.square(_CENTER_SIGMA * radii * centers))
     known = np.isfinite(centers) & np.isfinite(sigmas)
-    return with_depths(views, np.where(known, centers, 0.0),
-                       np.where(known, 1.0 / np.where(known, sigmas, 1.0), 0.0))
+    return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
+        known, 1.0 / np.where(known, sigmas, 1.0), 0.0))
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -111,21 +104,9 @@ def depth_hypotheses(views: Views, rows: NDArray[np.int64]
 
 def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                 baselines_deg: NDArray[np.float64]) -> float | None:
-    """Return true depth divided by measured depth, by landmarks that need no depth.
+    """Return true depth divided by measured depth; None where too few landmarks tell.
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        Fitted to boxes only.
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    baselines_deg : ndarray (L,)
-        Of the landmarks.
-
-    Returns
-    -------
-    float or None
-        None where too few landmarks tell.
+    The landmarks are fitted to boxes only; those with enough parallax tell.
     """
     ratios = []
     for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
@@ -162,12 +143,9 @@ def correct_scale(views: Views, detections: PosedDetections, scale: float | None
 
 def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
                 rng: np.random.Generator) -> Landmarks:
-    """Return landmarks that explain boxes of one class.
+    """Return landmarks that explain boxes of one class, given in the order of time.
 
-    Parameters
-    ----------
-    rows : ndarray (m,) of int
-        Boxes of one class, in the order of time. A box belongs to at most one landmark.
+    Each is the hypothesis that covers the most free boxes; a box belongs to at most one.
     """
     if len(rows) < options.min_viewpoints:
         return no_landmarks()
@@ -175,61 +153,35 @@ def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
     of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
     centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows),
                                              strict=True))
-    hypotheses = _Hypotheses.of(views, rows, centers, bases)
-    found = _take_greatest(views, rows, hypotheses, options.min_viewpoints)
+    frames, starts = np.unique(views.frames[rows], return_index=True)
+    starts = np.append(starts, len(rows))
+    supports = [_support(views, rows, frames, starts, center, basis)
+                for center, basis in zip(centers, bases, strict=True)]
+    boxes = np.concatenate([np.empty(0, dtype=np.int64), *supports])
+    of_boxes = np.repeat(np.arange(len(centers)), [len(support) for support in supports])
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    is_free = np.zeros(len(views.frames), dtype=np.bool_)
+    is_free[rows] = True
+    viewpoints = views.viewpoints[views.frames]
+    discarded = np.zeros(len(centers), dtype=np.bool_)
+    while len(centers):
+        gains = np.bincount(of_boxes[is_free[boxes]], minlength=len(centers))
+        gains[discarded] = 0
+        best = int(np.argmax(gains))
+        if gains[best] < options.min_viewpoints:
+            break
+        discarded[best] = True
+        own = supports[best]
+        center, basis, support = _settle(views, rows[is_free[rows]], own[is_free[own]],
+                                         centers[best], bases[best])
+        if len(np.unique(viewpoints[support])) >= options.min_viewpoints:
+            found.append((center, basis))
+            is_free[support] = False
     if not found:
         return no_landmarks()
     return Landmarks(np.array([center for center, _ in found]),
                      np.array([basis for _, basis in found]),
                      np.full(len(found), views.classes[rows[0]]))
-
-
-class _Hypotheses(NamedTuple):
-    """Ellipsoids and the boxes that support each: those from offsets[h] up to offsets[h + 1]."""
-
-    centers: NDArray[np.float64]
-    bases: NDArray[np.float64]
-    offsets: NDArray[np.int64]
-    boxes: NDArray[np.int64]
-
-    @staticmethod
-    def of(views: Views, rows: NDArray[np.int64], centers: NDArray[np.float64],
-           bases: NDArray[np.float64]) -> '_Hypotheses':
-        """Return hypotheses with their support among the boxes of some rows."""
-        frames, starts = np.unique(views.frames[rows], return_index=True)
-        starts = np.append(starts, len(rows))
-        support = [_support(views, rows, frames, starts, center, basis)
-                   for center, basis in zip(centers, bases, strict=True)]
-        offsets = np.cumsum([0, *map(len, support)])
-        return _Hypotheses(centers, bases, offsets,
-                           np.concatenate([np.empty(0, dtype=np.int64), *support]))
-
-
-def _take_greatest(views: Views, rows: NDArray[np.int64], hypotheses: _Hypotheses,
-                   min_viewpoints: int) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the ellipsoids that cover the most boxes, one after the other."""
-    found = []
-    is_free = np.zeros(len(views.frames), dtype=np.bool_)
-    is_free[rows] = True
-    of_boxes = np.repeat(np.arange(len(hypotheses.centers)), np.diff(hypotheses.offsets))
-    viewpoints = views.viewpoints[views.frames]
-    discarded = np.zeros(len(hypotheses.centers), dtype=np.bool_)
-    while len(hypotheses.centers):
-        gains = np.bincount(of_boxes[is_free[hypotheses.boxes]],
-                            minlength=len(hypotheses.centers))
-        gains[discarded] = 0
-        best = int(np.argmax(gains))
-        if gains[best] < min_viewpoints:
-            break
-        discarded[best] = True
-        boxes = hypotheses.boxes[hypotheses.offsets[best]:hypotheses.offsets[best + 1]]
-        center, basis, support = _settle(views, rows[is_free[rows]], boxes[is_free[boxes]],
-                                         hypotheses.centers[best], hypotheses.bases[best])
-        if len(np.unique(viewpoints[support])) < min_viewpoints:
-            continue
-        found.append((center, basis))
-        is_free[support] = False
-    return found
 
 
 def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int64],

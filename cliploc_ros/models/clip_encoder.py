@@ -53,29 +53,21 @@ def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder
     tower is never loaded. Otherwise the text tower is loaded first, alone, and freed before the
     image tower is loaded. Labels may repeat.
 
-    Raises
-    ------
-    ModelError
-        When the weights cannot be found or loaded.
-    OptionsError
-        When the device is not there.
+    ModelError: when the weights cannot be found or loaded. OptionsError: when the device is not
+    there.
     """
     started = time.monotonic()
     weights = resolve_clip_weights(options)
-    embeddings = _embed_labels(weights, options, labels)
+    embeddings = embed_labels(weights, options, labels)
     encoder = ClipEncoder(weights, options)
     logger.info('CLIP %s is ready after %.1f s (%s, %s)', weights.model,
                 time.monotonic() - started, encoder.inference, encoder.device)
     return LoadedEncoder(encoder, embeddings)
 
 
-def embed_labels(options: ClipOptions, labels: Sequence[Label]) -> LabelEmbeddings:
-    """Return the embeddings of other labels for an encoder that stays, see `load_encoder`."""
-    return _embed_labels(resolve_clip_weights(options), options, labels)
-
-
-def _embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
-                  ) -> LabelEmbeddings:
+def embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
+                 ) -> LabelEmbeddings:
+    """Return the embeddings of labels, see `load_encoder`; they need no encoder of crops."""
     described = [((one, 1.0),) if isinstance(one, str) else one for one in labels]
     # Once each and sorted: moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(described))
@@ -101,12 +93,8 @@ def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[s
 class ClipEncoder:
     """An `ImageTextEncoder` that keeps the image tower alone in memory.
 
-    Raises
-    ------
-    ModelError
-        When the file does not hold the weights of the model, or they give no finite numbers.
-    OptionsError
-        When the device or the inference engine is not there.
+    ModelError: when the file does not hold the weights of the model, or they give no finite
+    numbers. OptionsError: when the device or the inference engine is not there.
     """
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
@@ -126,30 +114,15 @@ class ClipEncoder:
 
     def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-        """Return one embedding for each box of an image.
+        """Return one embedding (n, d), of unit length, for each box of an image (h, w, 3).
 
-        A crop holds every pixel that its box touches. open_clip's own preprocessing prepares the
-        crops; the tower takes at most ``max_batch`` of them at once.
+        The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
+        cropped. A crop holds every pixel that its box touches. open_clip's own preprocessing
+        prepares the crops; the tower takes at most ``max_batch`` of them at once.
 
-        Parameters
-        ----------
-        image_rgb : ndarray (h, w, 3) uint8
-        bboxes_xyxy : ndarray (n, 4)
-            Left, top, right, bottom [px]; `visible_boxes` finds those that can be cropped.
-
-        Returns
-        -------
-        ndarray (n, d) float32
-            Rows of unit length.
-
-        Raises
-        ------
-        ImageError
-            For an image of another shape or type, or without pixels.
-        CliplocError
-            For boxes that are not finite, are empty, or lie outside the image.
-        ModelError
-            When memory runs out, or the tower gives no finite numbers.
+        ImageError: for an image of another shape or type, or without pixels. CliplocError: for
+        boxes that are not finite, are empty, or lie outside the image. ModelError: when memory
+        runs out, or the tower gives no finite numbers.
         """
         import torch
         from PIL import Image

@@ -82,10 +82,7 @@ def load_image_tower(weights: ClipWeights, options: ClipOptions, device: 'torch.
 
     With 'auto', PyTorch runs a tower that OpenVINO cannot run as PyTorch does.
 
-    Raises
-    ------
-    ModelError, OptionsError
-        See ClipEncoder.
+    ModelError, OptionsError: see ClipEncoder.
     """
     precision = resolve_precision(options.precision, device)
     if resolve_inference(options.inference, device, precision) == 'openvino':
@@ -227,10 +224,7 @@ def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
     form of checkpoint. TorchScript archives (OpenAI's own files) and pickles of PyTorch before
     1.6 cannot be mapped and are read whole.
 
-    Raises
-    ------
-    ModelError
-        For a file that is missing, damaged, or holds something other than tensors.
+    ModelError: for a file that is missing, damaged, or holds something other than tensors.
     """
     import torch
     from open_clip.model import convert_to_custom_text_state_dict

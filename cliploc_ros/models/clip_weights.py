@@ -24,10 +24,7 @@ _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 class ClipOptions:
     """Which CLIP to load, and how to run it.
 
-    Raises
-    ------
-    OptionsError
-        For values out of range.
+    OptionsError: for values out of range.
     """
 
     #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
@@ -73,11 +70,8 @@ class ClipWeights:
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """Find the weights that the options name; download them if they are not here yet.
 
-    Raises
-    ------
-    ModelError
-        For an unknown model or tag (the message lists the nearest names), a missing or damaged
-        file, and a failed download.
+    ModelError: for an unknown model or tag (the message lists the nearest names), a missing or
+    damaged file, and a failed download.
     """
     import open_clip
 

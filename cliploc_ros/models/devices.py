@@ -31,12 +31,8 @@ def check_run(precision: str, inference: str) -> None:
 def resolve_device(device: str) -> 'torch.device':
     """Return the torch device for 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
 
-    Raises
-    ------
-    OptionsError
-        For another name, or a GPU that torch does not see.
-    ModelError
-        Where PyTorch is not installed.
+    OptionsError: for another name, or a GPU that torch does not see. ModelError: where PyTorch is
+    not installed.
     """
     try:
         import torch
@@ -70,10 +66,7 @@ def resolve_inference(inference: str, device: 'torch.device', precision: str) ->
 
     The precision is 'fp16' or 'fp32'.
 
-    Raises
-    ------
-    OptionsError
-        When OpenVINO is required on a GPU, in fp16, or where it is not installed.
+    OptionsError: when OpenVINO is required on a GPU, in fp16, or where it is not installed.
     """
     fits = device.type == 'cpu' and precision == 'fp32'
     if inference == 'pytorch' or (inference == 'auto' and not fits):

@@ -24,20 +24,11 @@ logger = logging.getLogger(__name__)
 
 def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
                          map_files: Sequence[str], compare: str) -> LoadedEncoder:
-    """Load CLIP and the embeddings that it compares crops with.
+    """Load CLIP and the embeddings that it compares crops with; errors as of load_encoder.
 
-    Parameters
-    ----------
-    map_files : sequence of str
-        The file of each map, which has its image embeddings next to it; empty for none.
-    compare : str
-        One of COMPARED. Where one of the maps has no images of this encoder, labels alone are
-        compared: images and labels of different maps would not be rivals on equal terms.
-
-    Raises
-    ------
-    ModelError, OptionsError
-        See load_encoder.
+    The file of each map has its image embeddings next to it; no files for none. ``compare`` is one
+    of COMPARED. Where one of the maps has no images of this encoder, labels alone are compared:
+    images and labels of different maps would not be rivals on equal terms.
     """
     loaded = load_encoder(options, landmark_map.weighted_labels)
     return loaded._replace(label_embeddings=_compared(
@@ -47,8 +38,9 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
 def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequence[str],
               compare: str) -> LabelEmbeddings:
     """Return the embeddings of another map for an encoder that stays, see load_encoder_for_map."""
-    return _compared(embed_labels(options, landmark_map.weighted_labels),
-                     resolve_clip_weights(options).key, landmark_map, map_files, compare)
+    weights = resolve_clip_weights(options)
+    return _compared(embed_labels(weights, options, landmark_map.weighted_labels), weights.key,
+                     landmark_map, map_files, compare)
 
 
 def _compared(labels: LabelEmbeddings, key: str, landmark_map: LandmarkMap,

@@ -90,23 +90,10 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
     a CPU that calculates otherwise, are noticed. Folders are written under another name and
     renamed: any number of processes may share the cache.
 
-    Parameters
-    ----------
-    cache_dir : str
-        See resolve_cache_dir.
-    name : str
-        For people.
-    identity : sequence of str
-        What the network depends on, other than OpenVINO's version.
-    precisions : sequence of tuple
-        See FP32; the first in which the network runs as in PyTorch is taken.
+    The name is for people. The identity is all that the network depends on, other than OpenVINO's
+    version. The first precision in which the network runs as in PyTorch is taken, see FP32.
 
-    Raises
-    ------
-    ConversionError
-        When OpenVINO cannot run the network as PyTorch does.
-    ModelError
-        From convert.
+    ConversionError: OpenVINO cannot run the network as PyTorch does. ModelError: from convert.
     """
     identity = [str(_FORMAT), import_openvino().__version__, *identity]
     digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()

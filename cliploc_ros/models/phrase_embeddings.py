@@ -27,10 +27,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
 
     The text tower is loaded once, and only if the cache lacks a class.
 
-    Raises
-    ------
-    ModelError, OptionsError
-        See cliploc_ros.models.clip_encoder.load_encoder.
+    ModelError, OptionsError: see cliploc_ros.models.clip_encoder.load_encoder.
     """
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
     found, missing = {}, {}

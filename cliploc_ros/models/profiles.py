@@ -32,10 +32,7 @@ PROFILE_NAMES = ('auto', *PROFILES)
 def resolve_profile(profile: str, device: str) -> Profile:
     """Return the profile of a name; 'auto' is accurate on a GPU and balanced on a CPU.
 
-    Raises
-    ------
-    OptionsError
-        For another name, or a device that is missing.
+    OptionsError: for another name, or a device that is missing.
     """
     if profile not in PROFILE_NAMES:
         raise OptionsError(f"profile '{profile}' is none of {', '.join(PROFILE_NAMES)}")

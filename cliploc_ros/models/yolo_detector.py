@@ -186,12 +186,8 @@ class TorchYolo:
 class YoloDetector:
     """An `ObjectDetector`: a detection network of ultralytics.
 
-    Raises
-    ------
-    ModelError
-        When the weights are missing or damaged, or are no detection model.
-    OptionsError
-        When the device or the inference engine is missing.
+    ModelError: when the weights are missing or damaged, or are no detection model. OptionsError:
+    when the device or the inference engine is missing.
     """
 
     def __init__(self, options: YoloOptions) -> None:
@@ -222,10 +218,7 @@ class YoloDetector:
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
-        Raises
-        ------
-        ImageError
-            For an image of another shape or type, or without pixels.
+        ImageError: for an image of another shape or type, or without pixels.
         """
         check_image_rgb(image_rgb)
         rows = self._network.find(np.ascontiguousarray(image_rgb[..., ::-1]), **self._settings)

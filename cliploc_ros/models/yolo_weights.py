@@ -32,10 +32,7 @@ logger = logging.getLogger(__name__)
 class YoloOptions:
     """Which YOLO to load, and how to run it. The names are ultralytics' own.
 
-    Raises
-    ------
-    OptionsError
-        For values out of range.
+    OptionsError: for values out of range.
     """
 
     #: Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
@@ -105,10 +102,7 @@ def _is_restricted(ultralytics: Any) -> bool:
 def resolve_yolo_weights(options: YoloOptions) -> Path:
     """Return the file or folder that the options name; download the file if necessary.
 
-    Raises
-    ------
-    ModelError
-        When it is missing, damaged or unknown, or the download fails.
+    ModelError: when it is missing, damaged or unknown, or the download fails.
     """
     file = Path(options.model).expanduser().absolute()
     if is_export(file):
@@ -161,10 +155,7 @@ def load_yolo(file: Path) -> Any:
     without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only a file that
     the options name by its path is loaded, with a warning to load trusted files only.
 
-    Raises
-    ------
-    ModelError
-        For a file that is damaged or no detection model.
+    ModelError: for a file that is damaged or no detection model.
     """
     ultralytics = import_ultralytics()
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:

@@ -19,7 +19,7 @@ from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.map_services import MapServices
-from cliploc_ros.ros.node.diagnostics import Health, StageTimes
+from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.executor import MAX_REQUESTS, BoundedCallbackGroup
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
@@ -47,9 +47,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                                    self._newest.offer if continuous else lambda frame: None,
                                    parameters.detections_type)
         self._handoff = HandOff(self, self._robot.odometry)
-        self._requests = Requests(self, self._frames, self._robot, self._localize_and_keep,
-                                  self._handoff)
         self._cases = CaseRecorder(bool(parameters.record_folder))
+        self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
+                                  self._handoff)
         self._counters = RequestCounters()
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
@@ -164,12 +164,6 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._counters.add(answer, time.monotonic() - began_at)
         self._cases.end(answer)
         self._record(answer)
-        return answer
-
-    def _localize_and_keep(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
-        """Localize with a frame of a request, in the worker's thread."""
-        answer = self._pipeline.localize(frame, times, deadline)
-        self._cases.add(frame, answer)
         return answer
 
     def _localize_and_log(self, frame: Frame) -> None:

@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -19,6 +19,7 @@ from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
@@ -47,116 +48,6 @@ _REMEDIES = {'image': 'raise the rate of the camera or of the detector',
              'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
              'search': 'lower iterations or time_budget_ms',
              'keyframes': "set keyframes_file to ''"}
-
-
-class Requests:
-    """Answers requests one at a time.
-
-    A request that had to wait shares the previous answer if the image of that answer arrived
-    after the request: clients that ask together cost one search and reset the localizer once.
-    Otherwise it looks at fresh frames itself.
-
-    `localize` takes a frame, its StageTimes and the deadline (monotonic clock) [s]; it returns
-    the frame's Answer. It is called in the worker's thread.
-    """
-
-    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource,
-                 robot: RobotStateSource, localize: Callable[[Frame, StageTimes, float], Answer],
-                 handoff: HandOff) -> None:
-        self._node = node
-        self._frames = frames
-        self._robot = robot
-        self._localize = localize
-        self._handoff = handoff
-        self._turn = threading.Lock()
-        self._previous = Answer(Verdict.FAILED, 'no request yet')
-
-    def answer(self) -> Answer:
-        """Return the answer to a request that arrives now, within timeout_s."""
-        arrived_at = time.monotonic()
-        deadline = arrived_at + self._node.settings.values.timeout_s
-        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
-            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
-        try:
-            if self._previous.received_at <= arrived_at:
-                self._previous = self._guarded(arrived_at, deadline)
-            return self._previous
-        finally:
-            self._turn.release()
-
-    def _guarded(self, arrived_at: float, deadline: float) -> Answer:
-        """Return an answer whatever happens, and log it in one line."""
-        try:
-            # A map or weights that were missing may be there now.
-            self._node.bring_up(deadline)
-            answer = self._look_until(deadline, arrived_at)
-        except CliplocError as error:
-            answer = Answer(Verdict.FAILED, str(error))
-        except Exception as error:
-            self._node.report(traceback.format_exc())
-            answer = Answer(Verdict.FAILED,
-                            f'internal error: {error} (the traceback is in the log)')
-        self._node.get_logger().info(answer.message)
-        return answer
-
-    def _look_until(self, deadline: float, arrived_at: float) -> Answer:
-        """Look at one frame after another while another frame can change the answer."""
-        last: Answer | None = None
-        problem: CliplocError | None = None
-        stages_ms: Counter[str] = Counter()
-        looks, unlinked, after, may_go_on, is_up = 0, 0, arrived_at, True, False
-        while may_go_on and unlinked < _MAX_UNLINKED:
-            times = StageTimes('image', after)
-            try:
-                frame = self._frames.next_frame(after, deadline)
-                times.begin('detection', frame.received_at)
-                times.begin('waiting', frame.detected_at)
-                answer = self._node.worker.run(
-                    partial(self._localize, frame, times, deadline), deadline)
-                answer, may_go_on = self._hand_over(answer, deadline)
-            except (TimeJumpError, NoTransformError) as error:  # a newer frame may do
-                problem, after = error, time.monotonic()
-                if after <= deadline - _GRACE_S:
-                    continue
-                if last is None:
-                    raise
-                is_up = True
-                break
-            except (NoFrameError, TimeUpError) as error:
-                if last is not None:
-                    is_up = True
-                    break
-                if isinstance(error, NoFrameError):
-                    raise problem or error from error
-                return Answer(Verdict.REFUSED, _time_is_up(times.ms), kind=RefusalKind.TIME_UP)
-            may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
-                                                                 deadline)
-            last, is_up, after = answer, answer.is_cut, time.monotonic()
-            looks += 1
-            unlinked += not answer.is_linked
-            stages_ms.update(answer.stages_ms)
-        assert last is not None
-        # more images of a place without objects are no remedy
-        if is_up and last.verdict is Verdict.REFUSED and (
-                last.is_cut or last.kind is not RefusalKind.TOO_FEW_OBJECTS):
-            last = replace(last, detail=f'{last.detail}; {_time_is_up(stages_ms)}')
-        if looks == 1:
-            return last
-        return replace(last, detail=f'{last.detail} [{looks} frames in '
-                                    f'{time.monotonic() - arrived_at:.1f} s]')
-
-    def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
-        """Hand an accepted pose to the localizer; return also whether another frame may help."""
-        if answer.pose is None:
-            return answer, True
-        try:
-            self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
-                                    answer.received_at)
-        except HandOffError as error:
-            return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                            detail=f'{error} ({answer.message})'),
-                    not isinstance(error, NoLocalizerError))
-        return answer, False
 
 
 class Pipeline:
@@ -276,6 +167,120 @@ class Pipeline:
                              detail=f'publish_tf: {error} (accepted: {answer.detail})')
         self._pose.publish(for_filter)
         return answer
+
+
+class Requests:
+    """Answers requests one at a time.
+
+    A request that had to wait shares the previous answer if the image of that answer arrived
+    after the request: clients that ask together cost one search and reset the localizer once.
+    Otherwise it looks at fresh frames itself.
+    """
+
+    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource,
+                 robot: RobotStateSource, pipeline: Pipeline, cases: CaseRecorder,
+                 handoff: HandOff) -> None:
+        self._node = node
+        self._frames = frames
+        self._robot = robot
+        self._pipeline = pipeline
+        self._cases = cases
+        self._handoff = handoff
+        self._turn = threading.Lock()
+        self._previous = Answer(Verdict.FAILED, 'no request yet')
+
+    def answer(self) -> Answer:
+        """Return the answer to a request that arrives now, within timeout_s."""
+        arrived_at = time.monotonic()
+        deadline = arrived_at + self._node.settings.values.timeout_s
+        if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
+            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
+        try:
+            if self._previous.received_at <= arrived_at:
+                self._previous = self._guarded(arrived_at, deadline)
+            return self._previous
+        finally:
+            self._turn.release()
+
+    def _guarded(self, arrived_at: float, deadline: float) -> Answer:
+        """Return an answer whatever happens, and log it in one line."""
+        try:
+            # A map or weights that were missing may be there now.
+            self._node.bring_up(deadline)
+            answer = self._look_until(deadline, arrived_at)
+        except CliplocError as error:
+            answer = Answer(Verdict.FAILED, str(error))
+        except Exception as error:
+            self._node.report(traceback.format_exc())
+            answer = Answer(Verdict.FAILED,
+                            f'internal error: {error} (the traceback is in the log)')
+        self._node.get_logger().info(answer.message)
+        return answer
+
+    def _look_until(self, deadline: float, arrived_at: float) -> Answer:
+        """Look at one frame after another while another frame can change the answer."""
+        last: Answer | None = None
+        problem: CliplocError | None = None
+        stages_ms: Counter[str] = Counter()
+        looks, unlinked, after, may_go_on, is_up = 0, 0, arrived_at, True, False
+        while may_go_on and unlinked < _MAX_UNLINKED:
+            times = StageTimes('image', after)
+            try:
+                frame = self._frames.next_frame(after, deadline)
+                times.begin('detection', frame.received_at)
+                times.begin('waiting', frame.detected_at)
+                answer = self._node.worker.run(
+                    partial(self._look, frame, times, deadline), deadline)
+                answer, may_go_on = self._hand_over(answer, deadline)
+            except (TimeJumpError, NoTransformError) as error:  # a newer frame may do
+                problem, after = error, time.monotonic()
+                if after <= deadline - _GRACE_S:
+                    continue
+                if last is None:
+                    raise
+                is_up = True
+                break
+            except (NoFrameError, TimeUpError) as error:
+                if last is not None:
+                    is_up = True
+                    break
+                if isinstance(error, NoFrameError):
+                    raise problem or error from error
+                return Answer(Verdict.REFUSED, _time_is_up(times.ms), kind=RefusalKind.TIME_UP)
+            may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
+                                                                 deadline)
+            last, is_up, after = answer, answer.is_cut, time.monotonic()
+            looks += 1
+            unlinked += not answer.is_linked
+            stages_ms.update(answer.stages_ms)
+        assert last is not None
+        # more images of a place without objects are no remedy
+        if is_up and last.verdict is Verdict.REFUSED and (
+                last.is_cut or last.kind is not RefusalKind.TOO_FEW_OBJECTS):
+            last = replace(last, detail=f'{last.detail}; {_time_is_up(stages_ms)}')
+        if looks == 1:
+            return last
+        return replace(last, detail=f'{last.detail} [{looks} frames in '
+                                    f'{time.monotonic() - arrived_at:.1f} s]')
+
+    def _look(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
+        """Localize with a frame and keep it, in the worker's thread."""
+        answer = self._pipeline.localize(frame, times, deadline)
+        self._cases.add(frame, answer)
+        return answer
+
+    def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
+        """Hand an accepted pose to the localizer; return also whether another frame may help."""
+        if answer.pose is None:
+            return answer, True
+        try:
+            self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
+                                    answer.received_at)
+        except HandOffError as error:
+            return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
+                            detail=f'{error} ({answer.message})'),
+                    not isinstance(error, NoLocalizerError))
+        return answer, False
 
 
 def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:

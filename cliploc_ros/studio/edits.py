@@ -58,10 +58,7 @@ class Change:
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
         """Return the landmarks after the change.
 
-        Raises
-        ------
-        EditError
-            They are not those that the change starts from.
+        EditError: they are not those that the change starts from.
         """
         for landmark_id, landmark in self.before.items():
             if landmarks.get(landmark_id) != landmark:
@@ -84,10 +81,7 @@ class Change:
 def change_from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
     """Return a change from JSON; looks are found by key, and missing ones are left out.
 
-    Raises
-    ------
-    ValueError, MapError
-        It is none, or a landmark is invalid.
+    ValueError, MapError: it is none, or a landmark is invalid.
     """
     try:
         what = tree['what']
@@ -205,43 +199,32 @@ def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.f
 
 def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
           fit: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> Change:
-    """Make one landmark of several; the first one's id, label and class stay.
+    """Make one landmark of two or more; the first one's id, label and class stay.
 
-    Parameters
-    ----------
-    landmark_ids : sequence of str
-        Two or more.
-    fit : tuple of ndarray (3,), (3, 3), optional
-        Centre and basis that fit the boxes of all. Without it, the ellipsoid has the mean and
-        the second moments of the volume of all.
+    A fit is the centre (3,) and basis (3, 3) that fit the boxes of all. Without it, the ellipsoid
+    has the mean and the second moments of the volume of all.
     """
     ids = list(dict.fromkeys(landmark_ids))
     if len(ids) < 2:
         raise EditError('merge: select two landmarks or more')
     parts = [_get(landmarks, key) for key in ids]
-    center, basis = fit or _moments(parts)
+    if fit is None:
+        # A solid ellipsoid with the shape matrix S has the covariance S / 5.
+        weights = np.array([one.semi_axes.prod() for one in parts])
+        weights = weights / weights.sum()
+        center = weights @ np.array([one.center for one in parts])
+        shape = np.zeros((3, 3))
+        for weight, one in zip(weights, parts, strict=True):
+            offset = one.center - center
+            shape += weight * (one.basis @ one.basis.T + 5.0 * np.outer(offset, offset))
+        squares, directions = np.linalg.eigh(shape)
+        fit = center, directions * np.sqrt(np.maximum(squares, 0.0))
     merged = replace(
-        parts[0].changed(**shape_fields(center, basis), **_NO_EVIDENCE),
+        parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE),
         look=merge_looks([one.look for one in parts],
                          [one.details.support or 1 for one in parts]))
     return _change_of(f'merge {", ".join(ids)}'[:80], landmarks,
                       {ids[0]: merged, **dict.fromkeys(ids[1:])})
-
-
-def _moments(parts: Sequence[Landmark]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return centre and basis of the ellipsoid with the moments of all parts' volume.
-
-    A solid ellipsoid with the shape matrix S has the covariance S / 5.
-    """
-    weights = np.array([one.volume for one in parts])
-    weights = weights / weights.sum()
-    center = weights @ np.array([one.center for one in parts])
-    shape = np.zeros((3, 3))
-    for weight, one in zip(weights, parts, strict=True):
-        offset = one.center - center
-        shape += weight * (one.basis @ one.basis.T + 5.0 * np.outer(offset, offset))
-    squares, directions = np.linalg.eigh(shape)
-    return center, directions * np.sqrt(np.maximum(squares, 0.0))
 
 
 def split(landmarks: Landmarks, landmark_id: str) -> Change:

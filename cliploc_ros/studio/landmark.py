@@ -11,7 +11,6 @@ landmark through merge, split, delete, undo and redo.
 
 import base64
 import hashlib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.labelling import choose_medoids, embed_landmarks
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.labelling import choose_medoids
 
 KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
 #: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
@@ -91,15 +89,6 @@ def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look 
                 crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
 
 
-def look_of_boxes(detections: PosedDetections, rows: NDArray[np.int64]) -> Look | None:
-    """Return the look of the objects in some boxes of a recording; None without embeddings."""
-    if detections.embeddings is None or not len(rows):
-        return None
-    shown = np.full(len(detections.classes), -1, dtype=np.int64)
-    shown[rows] = 0
-    return looks_of(embed_landmarks([''], detections, shown)).get('')
-
-
 def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
     """Return the known looks by id of the landmark."""
     offsets = embeddings.medoid_offsets
@@ -156,11 +145,6 @@ class Landmark:
         """The basis (3, 3), whose columns are the semi-axes in the map [m]."""
         return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
 
-    @property
-    def volume(self) -> float:
-        """The volume [m^3]."""
-        return float(4.0 / 3.0 * math.pi * self.semi_axes.prod())
-
     def changed(self, **fields: Any) -> 'Landmark':
         """Return the landmark with other values; a field that is None is left out."""
         together = {**self.fields, **fields}
@@ -176,10 +160,7 @@ def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> LandmarkMap:
     """Return landmarks as the relocalizer knows them, without unknown fields.
 
-    Raises
-    ------
-    MapError
-        There are none, or one is invalid. Names the source, the landmark and the field.
+    MapError: there are none, or one is invalid. Names the source, the landmark and the field.
     """
     known = {landmark_id: {name: value for name, value in one.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}

@@ -212,10 +212,7 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
 
     ``ros_args`` are '--ros-args' and the arguments after it.
 
-    Raises
-    ------
-    OptionsError
-        The name is invalid, or ROS does not start.
+    OptionsError: the name is invalid, or ROS does not start.
     """
     name = '/' + name.strip('/')
     context = Context()

@@ -127,10 +127,7 @@ class MapFile:
 def read_map_file(path: Path) -> MapFile:
     """Return a map file; an empty map where there is none.
 
-    Raises
-    ------
-    MapError
-        It is no map, or a landmark is invalid. Unknown fields of landmarks are accepted.
+    MapError: it is no map, or a landmark is invalid. Unknown fields of landmarks are accepted.
     """
     path = path.resolve()
     if not path.exists():
@@ -178,17 +175,6 @@ def _sorted(tree: Any) -> Any:
 
 # ---- the text -----------------------------------------------------------------------------------
 
-class _Entry(NamedTuple):
-    """A key of a mapping and its value, with their places in the text."""
-
-    key: yaml.Node
-    value: yaml.Node
-
-    @property
-    def column(self) -> int:
-        return int(self.key.start_mark.column)
-
-
 def patch_landmarks(text: str, path: tuple[str, ...], old: Mapping[str, Mapping[str, Any]],
                     new: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a map's text with other landmarks.
@@ -198,17 +184,23 @@ def patch_landmarks(text: str, path: tuple[str, ...], old: Mapping[str, Mapping[
     """
     node = yaml.compose(text, Loader=_LOADER)
     for name in path:
-        node = _entries(node)[name].value
+        _, node = _entries(node)[name]
     entries = _entries(node)
     # start, end, and the text that takes their place
     patches: list[tuple[int, int, str]] = []
     for landmark_id, fields in old.items():
-        entry = entries[landmark_id]
+        key, value = entries[landmark_id]
         if landmark_id not in new:
-            start, end = _lines_of(text, entry)
-            patches.append((_start_of_comments(text, start, entry.column), end, ''))
+            start = _line_start(text, key)
+            # the comments directly above a landmark are about it
+            while start > 0:
+                above = text.rfind('\n', 0, start - 1) + 1
+                if not text[above:start].startswith(' ' * key.start_mark.column + '#'):
+                    break
+                start = above
+            patches.append((start, _line_end(text, _end(value)), ''))
         elif new[landmark_id] is not fields and new[landmark_id] != fields:
-            patches += _patch_fields(text, entry.value, fields, new[landmark_id])
+            patches += _patch_fields(text, value, fields, new[landmark_id])
     patches += _append(text, node, {key: one for key, one in new.items() if key not in old})
     pieces, done = [], 0
     for start, end, piece in sorted(patches, key=lambda patch: patch[:2]):
@@ -221,11 +213,11 @@ def _patch_fields(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mappi
                   ) -> Iterator[tuple[int, int, str]]:
     entries = _entries(node)
     for name, value in old.items():
-        entry = entries[name]
+        key, written = entries[name]
         if name not in new:
-            yield (*_lines_of(text, entry), '')
+            yield _line_start(text, key), _line_end(text, _end(written)), ''
         elif new[name] != value:
-            colon, end = text.index(':', entry.key.end_mark.index) + 1, _end(entry.value)
+            colon, end = text.index(':', key.end_mark.index) + 1, _end(written)
             line_end = _newline(text) if text[end - 1] == '\n' else ''  # of a text in a block
             yield colon, end, f' {_flow(name, new[name])}{line_end}'
     yield from _append(text, node, {name: one for name, one in new.items() if name not in old})
@@ -236,12 +228,13 @@ def _append(text: str, node: yaml.Node, added: Mapping[str, Any]
     """Yield the patch that adds keys to a mapping, on lines of their own."""
     if added:
         newline, end = _newline(text), _line_end(text, _end(node))
-        lines = [f'{line}{newline}' for line in _emit(added, _Entry(*node.value[0]).column)]
+        lines = [f'{line}{newline}' for line in _emit(added, node.value[0][0].start_mark.column)]
         yield end, end, ('' if text[end - 1] == '\n' else newline) + ''.join(lines)
 
 
-def _entries(node: yaml.Node) -> dict[str, _Entry]:
-    return {key.value: _Entry(key, value) for key, value in node.value}
+def _entries(node: yaml.Node) -> dict[str, tuple[yaml.Node, yaml.Node]]:
+    """Return key and value of each entry of a mapping, with their places in the text."""
+    return {key.value: (key, value) for key, value in node.value}
 
 
 def _end(node: yaml.Node) -> int:
@@ -251,9 +244,8 @@ def _end(node: yaml.Node) -> int:
     return _end(node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1])
 
 
-def _lines_of(text: str, entry: _Entry) -> tuple[int, int]:
-    start = text.rfind('\n', 0, entry.key.start_mark.index) + 1
-    return start, _line_end(text, _end(entry.value))
+def _line_start(text: str, key: yaml.Node) -> int:
+    return text.rfind('\n', 0, key.start_mark.index) + 1
 
 
 def _line_end(text: str, index: int) -> int:
@@ -262,16 +254,6 @@ def _line_end(text: str, index: int) -> int:
         return index
     found = text.find('\n', index)
     return len(text) if found < 0 else found + 1
-
-
-def _start_of_comments(text: str, start: int, column: int) -> int:
-    """Return where the comments directly above a landmark begin, which are about it."""
-    while start > 0:
-        above = text.rfind('\n', 0, start - 1) + 1
-        if not text[above:start].startswith(' ' * column + '#'):
-            break
-        start = above
-    return start
 
 
 def _newline(text: str) -> str:

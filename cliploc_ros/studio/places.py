@@ -16,17 +16,18 @@ import numpy as np
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.mapping.checking.checking import judge_grid
-from cliploc_ros.mapping.checking.detector_model import (
-    DetectorModel,
-    guess_detector,
+from cliploc_ros.mapping.check.checking import judge_grid
+from cliploc_ros.mapping.check.landmark_faults import hear_witness
+from cliploc_ros.mapping.check.places import Grid, LookAlike, find_look_alikes, make_grid
+from cliploc_ros.mapping.check.relocalization import (
+    Trial,
+    count_verdicts,
+    each_pose,
     measure_detector,
 )
-from cliploc_ros.mapping.checking.landmark_faults import hear_witness
-from cliploc_ros.mapping.checking.places import Grid, LookAlike, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts, each_pose
-from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.mapping.options import CheckOptions
+from cliploc_ros.simulation.detector import DetectorModel, guess_detector
 from cliploc_ros.studio.document import fields_of
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.landmark import map_of
@@ -72,18 +73,10 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
                 tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Places:
     """Return the places of a map where a robot would be accepted, refused or misled.
 
-    Parameters
-    ----------
-    landmarks : mapping of str to Landmark
-        One at least, or else MapError is raised.
-    recording : Recording, optional
-        Gives the camera's height and the detector's errors.
-    before : Places, optional
-        Its positions are tried again where they suit, so that only edits change the figures.
-    tell : callable
-        Called with the share that is done; an error that it raises ends the search.
-    limit_s : float
-        No position is begun after this [s].
+    The recording gives the camera's height and the detector's errors. The positions of the time
+    before are tried again where they suit, so that only edits change the figures. ``tell`` is
+    called with the share that is done; an error that it raises ends the search. No position is
+    begun after the limit. MapError: there are no landmarks.
     """
     tell(0.0)
     landmark_map = map_of(landmarks, 'map', 'studio')
@@ -106,7 +99,8 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
-    guess = guess_detector(landmark_map, _OPTIONS.mapping)
+    guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
+                                          _OPTIONS.mapping.edge_sigma_share))
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections

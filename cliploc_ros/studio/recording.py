@@ -23,7 +23,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.checking.landmark_faults import (
+from cliploc_ros.mapping.check.landmark_faults import (
     LandmarkCheck,
     check_landmarks,
     find_map_overlaps,
@@ -31,6 +31,7 @@ from cliploc_ros.mapping.checking.landmark_faults import (
 )
 from cliploc_ros.mapping.evidence import widest_angle_deg
 from cliploc_ros.mapping.fitting import Fit, fit_ellipsoid
+from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.mapping.landmarks import group_boxes
 from cliploc_ros.mapping.options import MappingOptions
@@ -40,7 +41,7 @@ from cliploc_ros.mapping.views import Views, camera_centers, make_views
 from cliploc_ros.simulation.labels import LabelModel
 from cliploc_ros.studio.edits import EditError, Landmarks
 from cliploc_ros.studio.images import outlines_of
-from cliploc_ros.studio.landmark import Landmark, Look, look_of_boxes, map_of
+from cliploc_ros.studio.landmark import Landmark, Look, looks_of, map_of
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
@@ -102,9 +103,12 @@ class Recording:
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Look | None:
         """Return the look that an encoder has of some boxes; None where it saw none of them."""
-        if self.detections.encoder_key != encoder_key:
+        detections = self.detections
+        if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
             return None
-        return look_of_boxes(self.detections, rows)
+        shown = np.full(len(detections.classes), -1, dtype=np.int64)
+        shown[rows] = 0
+        return looks_of(embed_landmarks([''], detections, shown)).get('')
 
     def best_views(self, landmark: Landmark) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the views that show all of a landmark, and the box (4,) there; largest first."""
@@ -187,11 +191,8 @@ def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
 
     The boxes (n, 4) lie in undistorted images [px] of n poses (n, 4, 4).
 
-    Raises
-    ------
-    EditError
-        There are fewer than two boxes, one is too small, or their rays do not meet in front of
-        the cameras.
+    EditError: there are fewer than two boxes, one is too small, or their rays do not meet in front
+    of the cameras.
     """
     count = len(bboxes_xyxy)
     if count < 2:

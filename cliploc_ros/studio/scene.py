@@ -47,9 +47,7 @@ class Ellipsoids:
              ) -> None:
         """Show these landmarks, in the colours of their classes unless one is given."""
         landmarks = tuple(landmarks)
-        if len(landmarks) == len(self._shown) and all(
-                one[0] == old[0] and one[1] is old[1]
-                for one, old in zip(landmarks, self._shown, strict=True)):
+        if landmarks == self._shown:
             return
         count_changed = len(landmarks) != len(self._shown)
         self._shown = landmarks

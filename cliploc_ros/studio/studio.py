@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
-from cliploc_ros.mapping.checking.relocalization import sample_frames
+from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.check.relocalization import sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError

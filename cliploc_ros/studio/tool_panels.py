@@ -17,8 +17,8 @@ from scipy.stats import chi2
 from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
-from cliploc_ros.mapping.checking.places import RADIUS_M
-from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.mapping.check.places import RADIUS_M
+from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio.panels import Actions, paragraph, show_props
 from cliploc_ros.studio.places import Places, PlacesSearch
 from cliploc_ros.studio.scene import some_cameras, wxyz_of

@@ -222,7 +222,7 @@ def test_five_real_frames(case, office_map, queries, thresholds):
         options = replace(options, height_range_m=(0.8, 2.2))
     relocalizer = Relocalizer(office_map, options)
     errors, accepted, normalized, milliseconds = [], [], [], []
-    for seed in range(3):
+    for seed in range(2):
         frames = make_queries(queries, office_map, every_frame=True)
         if knows_up:
             frames = with_vertical(frames, 1.0, seed)

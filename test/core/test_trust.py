@@ -292,7 +292,7 @@ def test_garbage_is_never_accepted(kind, office_map, rng):
                                                              algorithm='ransac'))
     classes = np.array(sorted(set(office_map.class_ids)))
     accepted = 0
-    for _ in range(200):
+    for _ in range(100):
         detections = Detections(garbage(rng, kind), tuple(map(str, rng.choice(classes, 10))),
                                 np.full(10, 0.9)).usable(640, 480, 50)
         accepted += relocalizer.relocalize([Observation(

@@ -33,7 +33,8 @@ def walk(tmp_path_factory):
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), device='cpu', cache_dir=str(folder),
                        pretrained=str(ASSETS / 'clip.safetensors'))
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
-    others = np.roll(np.asarray(embed_labels(clip, landmark_map.labels)), 1, axis=0)
+    others = np.roll(np.asarray(embed_labels(
+        resolve_clip_weights(clip), clip, landmark_map.labels)), 1, axis=0)
     save_landmark_embeddings(embeddings_path(folder / 'map.yaml'), LandmarkEmbeddings(
         resolve_clip_weights(clip).key, landmark_map.landmark_ids, others.astype(np.float16),
         others[:0].astype(np.float16), np.zeros(len(others) + 1, np.int64)))

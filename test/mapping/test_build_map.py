@@ -1,17 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps built from a simulated walk, whose landmarks are known."""
+"""Maps built from a simulated walk, whose landmarks are known; also as a library."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around
+from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around, without
 
-from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.building import build_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.make_map import find_labeller, make_map, update_map
+from cliploc_ros.mapping.building import _windows, build_map
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.views import make_views, number_viewpoints, thin_out
+from studies.speed.pose_errors import disturb, draw_errors
 
 
 def test_every_landmark_is_found_where_it_is():
@@ -54,58 +59,38 @@ def test_equal_seed_and_input_give_an_equal_map():
 
 def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():
     poses = walk_around(frames=12, turn_deg=12.0)
-    with pytest.raises(MappingError, match=r'good enough.*one side only: [\d.]+ degrees, not 20'):
-        build_map(see(make_table(), poses))
+    for options in (None, MappingOptions(refine_mount=True)):
+        with pytest.raises(MappingError, match=r'good enough.*one side only: [\d.]+ degrees, no'):
+            build_map(see(make_table(), poses), options)
     eager = MappingOptions(min_baseline_deg=8.0, max_position_sigma_m=1.0)
     built = build_map(see(make_table(), poses), eager)
     assert nearest_errors(built.landmark_map, make_table()).max() < 0.05
 
 
 def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
-    table, poses = make_table(), walk_around(frames=120)
-    rare = see(table, poses)
-    cup = np.argmin(np.linalg.norm(table.centers - table.centers[2], axis=1))
-    start = np.array([frame for frame in range(len(poses)) if frame < 30])
-    without = see(replace(table, landmark_ids=table.landmark_ids[:2] + table.landmark_ids[3:],
-                          labels=table.labels[:2] + table.labels[3:],
-                          class_ids=table.class_ids[:2] + table.class_ids[3:],
-                          centers=np.delete(table.centers, cup, 0),
-                          semi_axes=np.delete(table.semi_axes, cup, 0),
-                          quats_xyzw=np.delete(table.quats_xyzw, cup, 0)), poses)
-    first = rare.select_frames(start)
-    rest = without.select_frames(np.arange(30, 120))
+    table, poses, taken = make_table(), walk_around(frames=120), 2
+    seen = see(table, poses)
+    later = see(without(table, taken), poses)
+    first, rest = seen.select_boxes(seen.frames < 30), later.select_boxes(later.frames >= 30)
     both = replace(
-        rare, frame_offsets=np.concatenate([first.frame_offsets,
-                                            first.frame_offsets[-1] + rest.frame_offsets[1:]]),
-        bboxes_xyxy=np.concatenate([first.bboxes_xyxy, rest.bboxes_xyxy]),
-        classes=np.concatenate([first.classes, rest.classes]),
-        scores=np.concatenate([first.scores, rest.scores]))
+        seen, frame_offsets=first.frame_offsets + rest.frame_offsets,
+        **{name: np.concatenate([getattr(first, name), getattr(rest, name)])
+           for name in ('bboxes_xyxy', 'classes', 'scores')})
     built = build_map(both, MappingOptions(min_seen_ratio=0.4))
     assert len(built.landmark_map) == len(table) - 1
     (left_out,) = built.report.left_out
-    assert left_out.class_id == table.class_ids[cup]
-    assert left_out.center == pytest.approx(table.centers[cup], abs=0.02)
+    assert left_out.class_id == table.class_ids[taken]
+    assert left_out.center == pytest.approx(table.centers[taken], abs=0.02)
     assert 'rarely detected, or moved' in left_out.reason
     assert built.report.lines()[-2] == 'left out: 1'
 
 
-def slow_errors(count, sigma_m, sigma_deg, seed=1):
-    """Return pose errors (F, 6) that change over about three seconds."""
-    rng = np.random.default_rng(seed)
-    errors, keep = np.zeros((count, 6)), np.exp(-0.2 / 3.0)
-    for frame in range(count):
-        errors[frame] = (keep * errors[frame - 1] + np.sqrt(1 - keep**2) * rng.normal(size=6)
-                         if frame else rng.normal(size=6))
-    return errors * np.repeat([sigma_m, np.radians(sigma_deg)], 3)
-
-
 def test_joint_refinement_corrects_poses_and_landmarks():
     table, poses = make_table(), walk_around(frames=150)
-    errors = slow_errors(len(poses), 0.05, 1.0)
-    wrong = poses.copy()
-    wrong[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
-    wrong[:, :3, 3] += errors[:, :3]
-    detections = see(table, poses, noise_px=2.0).with_poses(wrong)
+    seen = see(table, poses, noise_px=2.0)
+    errors = draw_errors('correlated', seen.stamps_s, PoseErrors(0.05, 1.0, 3.0),
+                         np.random.default_rng(1))
+    detections = disturb(seen, errors)
     plain = build_map(detections)
     joint = build_map(detections, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
 
@@ -147,9 +132,8 @@ def test_objects_behind_one_another_do_not_confuse_it():
     (lambda one: one.select_frames([3]), 'took 1 viewpoints, at least 3 are needed; move it'),
     (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
      'check that the poses are those of the images'),
-    (lambda one: replace(one, frame_offsets=np.zeros(len(one) + 1, dtype=np.int64),
-                         bboxes_xyxy=np.empty((0, 4)), classes=np.empty(0, dtype=np.int64),
-                         scores=np.empty(0)), 'have no detections; check the detector'),
+    (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
+     'have no detections; check the detector'),
     # a base whose x axis looks forward instead of the camera's z
     (lambda one: one.with_poses(one.map_from_camera @ np.array(
         [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
@@ -219,3 +203,57 @@ def test_one_object_under_two_names_becomes_class_weights():
     others = [one for number, one in enumerate(renamed.landmark_map.details) if number != same]
     assert all(one.class_weights is None for one in others)
     assert renamed.report.explained == 1.0
+
+
+@pytest.mark.parametrize(('stamps_s', 'expected'), [
+    ([0.0, 1.0, 2.0], [(0, 3)]),
+    (np.arange(0.0, 200.0), [(0, 90), (60, 150), (120, 200)]),
+    ([0.0, 1.0, 500.0, 501.0], [(0, 2), (2, 4)]),
+    ([0.0, 89.0, 90.0], [(0, 2), (1, 3)]),
+    ([7.0, 7.0, 7.0], [(0, 3)]),
+])
+def test_windows_cover_every_frame(stamps_s, expected):
+    assert _windows(np.array(stamps_s)) == expected
+
+
+def test_a_camera_that_stands_still_gives_few_frames():
+    poses = np.repeat(walk_around(5, turn_deg=90.0), [40, 1, 3, 2, 1], axis=0)
+    assert number_viewpoints(poses).tolist() == np.repeat(range(5), [40, 1, 3, 2, 1]).tolist()
+    views = make_views(see(make_table(), poses), MappingOptions())
+    kept = thin_out(views, 3)
+    assert np.bincount(views.viewpoints[kept]).tolist() == [3, 1, 3, 2, 1]
+    assert views.weights[0] == pytest.approx(1 / 40)
+
+
+def test_a_long_recording_gives_one_landmark_for_each_object():
+    table = make_table()
+    detections = see(table, walk_around(frames=240, turn_deg=1100.0), noise_px=2.0, missed=0.3)
+    slow = replace(detections, stamps_s=2.0 * np.arange(240))
+    assert len(_windows(slow.stamps_s)) == 8
+    built = build_map(slow)
+    assert len(built.landmark_map) == len(table)
+    assert nearest_errors(built.landmark_map, table).max() < 0.01
+
+
+def test_a_map_is_made_written_and_updated(tmp_path):
+    table, file = make_table(), tmp_path / 'map.yaml'
+    detections = see(table, walk_around())
+    stages = []
+    made = make_map(detections, find_labeller(detections, None),
+                    progress=lambda stage, share: stages.append(stage))
+    write_map(file, made.landmark_map, made.report.lines()[:1], made.embeddings)
+    assert nearest_errors(LandmarkMap.from_file(file), table).max() < 0.003
+    assert made.layer is None and stages[-1] == 'done'
+    labeller = find_labeller(detections, None)
+    again = update_map(file, detections, labeller, MappingOptions())
+    assert again.landmark_map.landmark_ids == made.landmark_map.landmark_ids
+    assert not again.report.new
+
+
+def test_labels_are_class_names_where_clip_is_missing(tmp_path):
+    detections = see(make_table(), walk_around())
+    assert find_labeller(detections, None).note.startswith('labels are class names')
+    words = Path(tmp_path / 'our.yaml')
+    words.write_text('cup: [our cup]')
+    with pytest.raises(ModelError, match='no-clip'):
+        find_labeller(detections, None, words)

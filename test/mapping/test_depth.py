@@ -65,11 +65,3 @@ def test_boxes_without_any_depth_map_as_without():
     none = np.full(len(boxes.classes), np.nan, dtype=np.float32)
     built = build_map(replace(boxes, depths=none, depth_spreads=none))
     assert nearest_errors(built.landmark_map, table).max() < 0.003
-
-
-def test_selected_frames_keep_their_depth():
-    table = make_table()
-    seen = measure_depth(see(table, walk_around(frames=4)), table)
-    part = seen.select_frames([2, 0])
-    rows = np.r_[np.arange(*seen.frame_offsets[2:4]), np.arange(*seen.frame_offsets[:2])]
-    assert (part.depths == seen.depths[rows]).all()

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walk import make_table, see, walk_around
+from walk import join_maps, make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.refit import refit_map
 
@@ -33,17 +32,6 @@ def disturb(table, sigma_m=0.05, stretch=1.3, seed=0):
     return replace(table, centers=table.centers + rng.normal(0.0, sigma_m, (len(table), 3)),
                    semi_axes=table.semi_axes * stretch, details=details,
                    labels=tuple(f'label {row}' for row in range(len(table))))
-
-
-def join(first, second, suffix):
-    """Return a map with the landmarks of two."""
-    return LandmarkMap(
-        first.frame_id,
-        first.landmark_ids + tuple(f'{one}{suffix}' for one in second.landmark_ids),
-        first.labels + second.labels, first.class_ids + second.class_ids,
-        np.concatenate([first.centers, second.centers]),
-        np.concatenate([first.semi_axes, second.semi_axes]),
-        np.concatenate([first.quats_xyzw, second.quats_xyzw]), first.details + second.details)
 
 
 def errors_m(found, table):
@@ -87,7 +75,7 @@ def test_only_chosen_landmarks_move(table, detections):
 
 
 def test_a_duplicate_is_part_of_the_other(table, detections):
-    given = join(disturb(table), disturb(table, seed=1).select([2, 5]), '_again')
+    given = join_maps(disturb(table), disturb(table, seed=1).select([2, 5]))
     refit = refit_map(detections, given)
     assert len(set(refit.part_of)) == len(table)
     for first, second in ((2, 9), (5, 10)):
@@ -105,7 +93,7 @@ def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
     ghosts = given.select([0, 1, 2])
     ghosts = replace(ghosts, class_ids=('book', 'book', 'lamp'),
                      centers=np.array([[0.2, -0.3, 1.2], [60.0, 0.0, 40.0], [0.0, 0.0, 2.0]]))
-    refit = refit_map(detections, join(given, ghosts, '_ghost'))
+    refit = refit_map(detections, join_maps(given, ghosts))
     assert refit.reasons[:9] == (None,) * 9
     assert refit.reasons[9].endswith('no box shows it: hidden, missed or gone')
     assert refit.reasons[10] == 'its place is in no image'
@@ -150,7 +138,7 @@ def test_a_landmark_does_not_become_a_distant_object(table):
     detections = see(table, walk_around(turn_deg=50.0))
     stray = replace(table.select([3]), centers=table.centers[[3]] + [-0.6, -0.25, -0.15],
                     semi_axes=np.full((1, 3), 0.2))
-    refit = refit_map(detections, join(table.select([0, 1, 2, 4, 5, 6, 7]), stray, '_stray'))
+    refit = refit_map(detections, join_maps(table.select([0, 1, 2, 4, 5, 6, 7]), stray))
     assert refit.reasons[:-1] == (None,) * 7
     assert refit.reasons[-1].endswith('m away: they show another object')
     assert (refit.landmark_map.centers[-1] == stray.centers[0]).all()

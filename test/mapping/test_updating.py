@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walk import CLASSES, look_at, see, walk_around
+from walk import CLASSES, join_maps, look_at, moved, see, see_rows, walk_around, without
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
-from cliploc_ros.mapping.updating.updating import update_map
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.update.updating import update_map
 
 ENCODER = 'test:0'
 POSES = walk_around(frames=60, turn_deg=320.0, radius=2.6)
@@ -34,18 +34,6 @@ def make_things(count=20, seed=5) -> LandmarkMap:
     return LandmarkMap('map', tuple(f'thing_{row}' for row in range(count)),
                        tuple(f'thing number {row}' for row in range(count)), names, centers,
                        rng.uniform(0.06, 0.12, (count, 3)), quats, details)
-
-
-def moved(things, places):
-    """Return the things with some of them at other places: {row: (x, y, z)}."""
-    centers = things.centers.copy()
-    for row, place in places.items():
-        centers[row] = place
-    return replace(things, centers=centers)
-
-
-def without(things, *rows):
-    return things.select([row for row in range(len(things)) if row not in rows])
 
 
 def ids(landmarks):
@@ -142,10 +130,7 @@ def test_what_a_new_object_hides_is_not_missing():
     screen = replace(things.select([hidden]), landmark_ids=('screen',), class_ids=('book',),
                      centers=things.centers[[hidden]] - (0.0, 0.35, 0.0),
                      semi_axes=np.array([[0.3, 0.05, 0.3]]), quats_xyzw=np.array([[0, 0, 0, 1.0]]))
-    both = LandmarkMap('map', (*later.landmark_ids, 'screen'), (*later.labels, 'screen'),
-                       (*later.class_ids, 'book'), np.concatenate([later.centers, screen.centers]),
-                       np.concatenate([later.semi_axes, screen.semi_axes]),
-                       np.concatenate([later.quats_xyzw, screen.quats_xyzw]))
+    both = join_maps(later, screen)
     assert 'thing_8' in ids(update_map(things, see(later, poses)).report.missing)
     report = update_map(things, see(both, poses)).report
     assert 'thing_8' in ids(report.not_observed)
@@ -154,16 +139,9 @@ def test_what_a_new_object_hides_is_not_missing():
 
 def test_what_was_not_in_view_stays_as_it_is():
     things = make_things()
-    far = replace(moved(things, {}), centers=things.centers + np.array([0.0, 40.0, 0.0]),
-                  landmark_ids=tuple(f'far_{row}' for row in range(len(things))))
-    old = LandmarkMap('map', things.landmark_ids + far.landmark_ids, things.labels + far.labels,
-                      things.class_ids + far.class_ids,
-                      np.concatenate([things.centers, far.centers]),
-                      np.concatenate([things.semi_axes, far.semi_axes]),
-                      np.concatenate([things.quats_xyzw, far.quats_xyzw]),
-                      things.details + far.details)
-    updated = update_map(old, see(things, POSES, missed=0.2))
-    assert ids(updated.report.not_observed) == set(far.landmark_ids)
+    far = replace(things, centers=things.centers + np.array([0.0, 40.0, 0.0]))
+    updated = update_map(join_maps(things, far), see(things, POSES, missed=0.2))
+    assert ids(updated.report.not_observed) == {f'{name}_b' for name in far.landmark_ids}
     np.testing.assert_array_equal(updated.landmark_map.centers[20:], far.centers)
     assert updated.landmark_map.details[20:] == far.details
 
@@ -224,8 +202,8 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     detections = see(later, POSES, noise_px=2.0).with_poses(wrong).select_frames(kept)
     with pytest.raises(MappingError, match='give --pose-noise if the poses have errors'):
         update_map(things, detections)
-    joint = update_map(things, detections, UpdateOptions(
-        MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0))))
+    joint = update_map(things, detections,
+                       MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0)))
     assert ids(joint.report.missing) == {'thing_6'}
     assert ids(joint.report.moved) == {'thing_12'}
     assert joint.report.new == ()
@@ -244,14 +222,6 @@ def test_a_recording_of_another_place_is_refused():
         update_map(make_things(), see(others, POSES))
 
 
-def crops(detections, truth, looks, seed=0):
-    """Return detections with embeddings near the look of the object that each box shows."""
-    rng = np.random.default_rng(seed)
-    rows = looks[truth] + rng.normal(scale=0.1, size=(len(truth), looks.shape[1]))
-    return replace(detections, encoder_key=ENCODER, embeddings=(
-        rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16))
-
-
 def unit_rows(count, size=24, seed=0):
     rows = np.random.default_rng(seed).normal(size=(count, size))
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -264,17 +234,12 @@ def embeddings_of(landmark_ids, looks):
 
 
 def seen_with_looks(later, looks):
-    """Return what is seen of things, whose order gives their looks, with embeddings."""
-    detections = see(later, POSES, noise_px=1.0)
-    rows = [row for pose in POSES for row in visible(later, pose)]
-    assert len(rows) == len(detections.classes)
-    return crops(detections, np.array(rows), looks)
-
-
-def visible(things, pose):
-    """Return the rows that `see` sees from a pose."""
-    return [row for row in range(len(things))
-            if len(see(things.select([row]), [pose]).classes)]
+    """Return what is seen of things, with embeddings near the look of each thing."""
+    detections, truth = see_rows(later, POSES, noise_px=1.0)
+    rows = looks[truth] + np.random.default_rng(0).normal(scale=0.1, size=(len(truth),
+                                                                           looks.shape[1]))
+    return replace(detections, encoder_key=ENCODER, embeddings=(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16))
 
 
 @pytest.mark.parametrize('alike', [False, True])
@@ -346,12 +311,8 @@ def test_new_ids_are_unused():
 def test_a_large_map_of_which_a_part_is_seen():
     things = make_things()
     rows = 250
-    shifts = [(0.0, 30.0 * number, 0.0) for number in range(rows)]
-    old = LandmarkMap(
-        'map', tuple(f'thing_{n}' for n in range(rows * len(things))), things.labels * rows,
-        things.class_ids * rows, np.concatenate([things.centers + shift for shift in shifts]),
-        np.tile(things.semi_axes, (rows, 1)), np.tile(things.quats_xyzw, (rows, 1)),
-        things.details * rows)
+    shifts = np.outer(np.arange(rows), [0.0, 30.0, 0.0])
+    old = join_maps(*(replace(things, centers=things.centers + shift) for shift in shifts))
     report = update_map(old, see(without(things, 5), POSES)).report
     assert len(report.confirmed) == len(things) - 1
     assert ids(report.missing) == {'thing_5'}

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A walk around a table of known ellipsoids, as a perfect detector sees it: simulated."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +32,29 @@ def make_table(count=9) -> LandmarkMap:
                        rng.uniform(0.06, 0.15, (count, 3)), quats)
 
 
+def join_maps(*maps: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks of several maps in one; ids of those after the first get a mark."""
+    ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
+    labels, classes, details = (sum((getattr(one, name) for one in maps), ())
+                                for name in ('labels', 'class_ids', 'details'))
+    arrays = (np.concatenate([getattr(one, name) for one in maps])
+              for name in ('centers', 'semi_axes', 'quats_xyzw'))
+    return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
+
+
+def moved(table: LandmarkMap, places) -> LandmarkMap:
+    """Return the map with some landmarks at other places: {row: (x, y, z)}."""
+    centers = table.centers.copy()
+    for row, place in places.items():
+        centers[row] = place
+    return replace(table, centers=centers)
+
+
+def without(table: LandmarkMap, *rows) -> LandmarkMap:
+    """Return the map without some landmarks."""
+    return table.select([row for row in range(len(table)) if row not in rows])
+
+
 def look_at(position, target=(0.0, 0.0, 0.8)):
     """Return map_from_camera of a camera that looks at a point, upright."""
     forward = np.asarray(target) - position
@@ -49,9 +74,14 @@ def walk_around(frames=60, turn_deg=300.0, radius=2.2):
 
 def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDetections:
     """Return what a detector sees: boxes with noise, clipped to the image; some are missed."""
+    return see_rows(table, poses, noise_px, missed, seed)[0]
+
+
+def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0):
+    """Return what a detector sees, and the row of the landmark that each box shows."""
     rng = np.random.default_rng(seed)
     size = np.array([640.0, 480.0, 640.0, 480.0])
-    classes, boxes, counts = [], [], []
+    rows, boxes, counts = [], [], [0]
     for pose in poses:
         outlines = project_ellipsoids(invert_transform(pose), table.centers, table.shapes)
         full = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
@@ -60,13 +90,13 @@ def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDet
         seen = (clipped[:, 2:] - clipped[:, :2] > 8.0).all(axis=1)
         seen &= rng.random(len(seen)) >= missed
         boxes.append(clipped[seen])
-        classes += [CLASSES.index(name) for name, one in zip(table.class_ids, seen, strict=True)
-                    if one]
+        rows.append(np.nonzero(seen)[0])
         counts.append(int(seen.sum()))
-    bboxes = np.concatenate(boxes)
+    bboxes, shown = np.concatenate(boxes), np.concatenate(rows)
+    classes = np.array([CLASSES.index(name) for name in table.class_ids], dtype=np.int64)
     return PosedDetections(
-        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum([0, *counts]), bboxes,
-        CLASSES, np.array(classes, dtype=np.int64), np.full(len(bboxes), 0.9))
+        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
+        CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
 def nearest_errors(built: LandmarkMap, table: LandmarkMap):

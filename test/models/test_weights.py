@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights that are missing, damaged or of another model."""
+"""Weights and model configs that are missing, damaged or of another model."""
 
 import os
 import pickle
@@ -82,27 +82,37 @@ def test_weights_of_another_clip(small_clip, tmp_path):
     assert 'does not hold the weights' in text
 
 
-@pytest.mark.parametrize('lost', ['visual.proj', 'ln_final.weight'])
-def test_weights_that_lack_a_tensor(small_clip, tmp_path, lost):
-    state = small_clip.model.state_dict()
-    state.pop(lost)
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda state: state.pop('visual.proj'), 'visual.proj is missing'),
+    (lambda state: state.pop('ln_final.weight'), 'ln_final.weight is missing'),
+    (lambda state: state.update({'visual.extra': torch.zeros(3)}),
+     'visual.extra is not part of the model'),
+    (lambda state: state.update({name: torch.full_like(tensor, float('nan'))
+                                 for name, tensor in state.items()}), 'not finite'),
+], ids=['a tensor less', 'one of the text tower', 'one more', 'not finite'])
+def test_weights_that_do_not_fit(small_clip, tmp_path, change, message):
+    state = dict(small_clip.model.state_dict())
+    change(state)
     torch.save(state, tmp_path / 'weights.pt')
-    text = refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
-    assert f'{lost} is missing' in text
+    assert message in refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
 
 
-def test_weights_with_a_tensor_too_many(small_clip, tmp_path):
-    torch.save({**small_clip.model.state_dict(), 'visual.extra': torch.zeros(3)},
-               tmp_path / 'weights.pt')
-    text = refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
-    assert 'visual.extra is not part of the model' in text
-
-
-def test_weights_that_are_not_finite(small_clip, tmp_path):
-    state = {name: torch.full_like(tensor, float('nan'))
-             for name, tensor in small_clip.model.state_dict().items()}
-    torch.save(state, tmp_path / 'weights.pt')
-    assert 'not finite' in refusal(options(small_clip.name, tmp_path / 'weights.pt', tmp_path))
+@pytest.mark.parametrize(('name', 'text', 'complaint'), [
+    ('own_model', '', 'cannot be read as JSON'),
+    ('own_model', '{"embed_dim": 12', 'cannot be read as JSON'),
+    ('own_model', '[1, 2]', 'lacks embed_dim, vision_cfg, text_cfg'),
+    ('own_model', '{"embed_dim": 12, "text_cfg": {}}', 'lacks vision_cfg'),
+    ('nowhere', None, 'does not exist'),
+    ('ViT-B-32', '{"embed_dim": 8, "vision_cfg": {}, "text_cfg": {}}',
+     "another model of the name 'ViT-B-32': rename"),
+])
+def test_model_configs_that_cannot_be_used_are_named(tmp_path, name, text, complaint):
+    config, weights = tmp_path / f'{name}.json', tmp_path / 'own.safetensors'
+    weights.write_bytes(b'x' * 100)
+    if text is not None:
+        config.write_text(text)
+    found = refusal(options(str(config), weights, tmp_path))
+    assert complaint in found and str(config) in found
 
 
 class Hostile:

@@ -8,6 +8,7 @@ import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -47,8 +49,8 @@ class Answering(ManagedNode):
                                              received_at=frame.received_at)
         self.robot = RobotStateSource(self)
         self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
-        self.requests = Requests(self, self.frames, self.robot,
-                                 lambda frame, times, deadline: self.localize(frame),
+        pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame))
+        self.requests = Requests(self, self.frames, self.robot, pipeline, CaseRecorder(False),
                                  HandOff(self, self.robot.odometry))
 
     def load(self):

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from browser import Person
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
@@ -82,6 +83,16 @@ def open_page(studio, host='127.0.0.1'):
             yield url.replace('0.0.0.0', '127.0.0.1'), server
     finally:
         studio.document.close()
+
+
+@contextmanager
+def person_at(chromium, studio):
+    """Serve the page of a studio, and open it; yield the person at it and the server."""
+    with open_page(studio) as (url, server):
+        person = Person(chromium, url)
+        yield person, server
+        person.page.close()
+        assert person.foreign == [], 'no request leaves the machine'
 
 
 def write_two_rooms(path):

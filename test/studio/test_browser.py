@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browser import TIMEOUT_S, Person, value_of, wait_for
+from browser import TIMEOUT_S, Person, wait_for
 from scipy.spatial.transform import Rotation
 from studio_map import ASSETS
 
@@ -23,9 +23,7 @@ pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chrom
 def test_select_type_relabel_undo_save_reload(person, studio, path):
     """The file holds exactly what a person typed, and every other line as it was."""
     document, before = studio.document, path.read_text()
-    person.find('mug_2')
-    person.click(re.compile('^mug_2 '))
-    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    person.select(document, 'mug_2')
     person.type('Position [m]', '5.5')
     wait_for(lambda: document.landmarks['mug_2'].center[0] == 5.5, 'the position')
     person.type('Label', 'a <b>green</b> mug & "brown" dots')
@@ -63,27 +61,13 @@ def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
     directions = np.array([truth.center - poses[view][:3, 3] for view, _ in seen])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     far = np.unravel_index(np.argmin(directions @ directions.T), (len(seen), len(seen)))
-    person.find('mug_2')
-    person.click(re.compile('^mug_2 '))
-    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    person.select(document, 'mug_2')
     person.click('Delete')
     wait_for(lambda: 'mug_2' not in document.landmarks, 'deleting')
     for view, ellipse in [seen[row] for row in (far[0], sum(far) // 2, far[1])]:
         half = np.sqrt(ellipse[[2, 4]])
-        person.type('View', str(view))
-        wait_for(lambda view=view: studio.view == view, 'the view')
-        for label, corner in (('Left, top [px]', ellipse[:2] - half),
-                              ('Right, bottom [px]', ellipse[:2] + half)):
-            for number, pixel in enumerate(np.round(corner)):
-                person.type(label, f'{pixel:.0f}', number)
-                # viser's page loses a value if another one follows within milliseconds
-                wait_for(lambda label=label, number=number, pixel=pixel: value_of(
-                    studio.server, label)[number] == pixel, 'the corner')
-        person.click('Draw this box')
-        wait_for(lambda view=view: view in studio.drawn, 'the box')
-    for label, text in (('New label', 'a green mug'), ('New class', 'mug')):
-        person.type(label, text)
-        wait_for(lambda label=label, text=text: value_of(studio.server, label) == text, label)
+        person.draw_box(studio, studio.server, view, [*ellipse[:2] - half, *ellipse[:2] + half])
+    person.name_new(studio.server, 'a green mug', 'mug')
     person.picture('boxes')
     person.click(re.compile('^Create landmark from 3'))
     wait_for(lambda: document.selection == ('mug_2',), 'the new landmark')
@@ -143,8 +127,7 @@ def test_a_box_is_dragged_on_the_image(person, studio):
 def test_the_gizmo_is_dragged(person, studio):
     """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
     document, server = studio.document, studio.server
-    person.find('mug_2')
-    person.click(re.compile('^mug_2 '))
+    person.select(document, 'mug_2')
     before = document.landmarks['mug_2']
     camera = next(iter(server.get_clients().values())).camera
     wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'looking at it')

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 import yaml
 from browser import Person, value_of, wait_for
-from studio_map import ASSETS, open_page
+from studio_map import ASSETS, open_page, person_at
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.checking.detector_model import guess_detector
-from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.simulation.detector import guess_detector
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.recording import Recording
@@ -32,7 +31,7 @@ PROJECT = Path(__file__).parents[2]
 
 def with_simulated_boxes(detections, landmark_map):
     """Return views with the boxes that a detector might find in them."""
-    model, rng = guess_detector(landmark_map, MappingOptions()), np.random.default_rng(0)
+    model, rng = guess_detector(landmark_map, (2.0, 0.04)), np.random.default_rng(0)
     names = tuple(sorted(set(landmark_map.class_ids)))
     found = [model.detect(pose, rng)[0] for pose in detections.map_from_camera]
     return PosedDetections(
@@ -130,16 +129,13 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
     landmarks['i' * 100_000] = landmarks.pop('can_1')
     path.write_text(yaml.safe_dump(tree))
     studio = Studio(Document(path))
-    with open_page(studio) as (url, _):
-        person = Person(chromium, url)
+    with person_at(chromium, studio) as (person, _):
         for text in ('<img', 'long', 'iiiiiiii'):
             person.find(text)
             person.click(re.compile(f'^{text}'))
             wait_for(lambda text=text: studio.document.selection
                      and studio.document.selection[0].startswith(text), text)
-        person.find('long')
-        person.click(re.compile('^long'))
-        wait_for(lambda: studio.document.selection == ('long',), 'the long label')
+        person.select(studio.document, 'long')
         person.type('Label', 'x' * 100_000)
         person.page.get_by_text('longer than 1000 characters').wait_for()
         person.type('Label', 'short')
@@ -147,7 +143,6 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
         person.picture('hostile')
         assert person.page.evaluate('window.hacked') is None
         assert person.page.locator('img[src=x]').count() == 0
-        person.page.close()
 
 
 def test_a_killed_studio_comes_back_with_the_edits(chromium, path, tmp_path):

@@ -6,8 +6,8 @@ import shutil
 
 import numpy as np
 import pytest
-from browser import Person, value_of, wait_for
-from studio_map import ASSETS, open_page, write_two_rooms
+from browser import value_of, wait_for
+from studio_map import ASSETS, person_at, write_two_rooms
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.studio.document import Document
@@ -22,8 +22,7 @@ def test_coverage_and_look_alikes(chromium, path):
     """They are found, stale after an edit, and found again with what has changed."""
     write_two_rooms(path)
     document = Document(path)
-    with open_page(Studio(document)) as (url, _):
-        person = Person(chromium, url)
+    with person_at(chromium, Studio(document)) as (person, _):
         page = person.page
         person.click('Find coverage and look-alikes')
         person.click('cup_0')
@@ -35,8 +34,6 @@ def test_coverage_and_look_alikes(chromium, path):
         person.click('Find coverage and look-alikes')
         page.get_by_text('(was 1)').wait_for()
         assert page.get_by_text('of the map before the last edits').count() == 0
-        page.close()
-        assert person.foreign == []
 
 
 def studio_with_keyframes(path):
@@ -67,11 +64,9 @@ def nodes_of(server):
 
 def test_keyframes_are_shown_and_hidden(chromium, path):
     studio = studio_with_keyframes(path)
-    with open_page(studio) as (url, server):
-        person = Person(chromium, url)
-        page = person.page
+    with person_at(chromium, studio) as (person, server):
         assert not nodes_of(server), 'nothing is sent before it is wanted'
-        box = page.get_by_label('Show keyframes')
+        box = person.page.get_by_label('Show keyframes')
         box.wait_for()
         box.check(force=True)
         wait_for(lambda: len(nodes_of(server)) == 2, 'frusta and points')
@@ -87,5 +82,3 @@ def test_keyframes_are_shown_and_hidden(chromium, path):
         box.check(force=True)
         wait_for(lambda: all(node.visible for node in nodes.values()), 'they are shown again')
         assert value_of(server, 'Show keyframes') is True
-        page.close()
-        assert person.foreign == []

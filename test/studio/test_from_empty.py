@@ -12,8 +12,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from browser import Person, value_of, wait_for
-from studio_map import ASSETS, open_page
+from browser import wait_for
+from studio_map import ASSETS, person_at
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import tum_frames
@@ -92,31 +92,6 @@ def drawings(walk, views, rng):
     return drawn
 
 
-def draw(person, studio, server, boxes):
-    """Draw boxes by view, as a person types them."""
-    for view, box in boxes.items():
-        person.type('View', str(view))
-        wait_for(lambda view=view: studio.view == view, 'the view')
-        for label, corner in (('Left, top [px]', box[:2]), ('Right, bottom [px]', box[2:])):
-            for number, pixel in enumerate(np.round(corner)):
-                person.type(label, f'{pixel:.0f}', number)
-                wait_for(lambda label=label, number=number, pixel=pixel: value_of(
-                    server, label)[number] == pixel, 'the corner')
-        person.click('Draw this box')
-        wait_for(lambda view=view: view in studio.drawn, 'the box')
-
-
-def create(person, studio, server, one):
-    for label, text in (('New label', one.label), ('New class', one.class_id)):
-        person.type(label, text)
-        wait_for(lambda label=label, text=text: value_of(server, label) == text, label)
-    before = set(studio.document.landmarks)
-    person.click(re.compile('^Create landmark from'))
-    wait_for(lambda: len(studio.document.landmarks) > len(before), 'the new landmark')
-    (made,) = set(studio.document.landmarks) - before
-    return made
-
-
 def fitted(drawn, views):
     """Return the map that the studio makes of drawn boxes."""
     landmarks = {}
@@ -169,16 +144,17 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
     drawn = more[:OBJECTS]
     objects = [one for one, _ in drawn]
     studio = Studio(Document(path), Recording(views), open_images(walk, None))
-    with open_page(studio) as (url, server):
-        person = Person(chromium, url)
+    with person_at(chromium, studio) as (person, server):
         person.page.set_viewport_size({'width': 800, 'height': 240})  # less to render
-        for one, boxes in drawn:
-            draw(person, studio, server, boxes)
-            create(person, studio, server, one)
+        for count, (one, boxes) in enumerate(drawn, start=1):
+            for view, box in boxes.items():
+                person.draw_box(studio, server, view, box)
+            person.name_new(server, one.label, one.class_id)
+            person.click(re.compile('^Create landmark from'))
+            wait_for(lambda count=count: len(studio.document.landmarks) == count, 'the landmark')
         person.picture('from_empty')
         person.click('Save')
         wait_for(lambda: studio.document.is_saved, 'saving')
-        person.page.close()
     made, true = LandmarkMap.from_file(path), LandmarkMap.from_file(ASSETS / 'map.yaml')
     assert len(made) == len(only(made, objects)) == OBJECTS
     offsets_m = np.linalg.norm(made.centers - [one.center for one in objects], axis=1)

@@ -13,7 +13,7 @@ from studio_map import write_hall, write_two_rooms
 
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
-from cliploc_ros.mapping.checking.report import GridCheck
+from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError

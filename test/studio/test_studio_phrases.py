@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Phrases that the demo's CLIP chooses for landmarks, and what it saw of a new one."""
 
-import re
 import shutil
 import time
 
 import numpy as np
 import pytest
-from browser import Person, wait_for
-from studio_map import ASSETS, open_page
+from browser import wait_for
+from studio_map import ASSETS, person_at
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
@@ -75,16 +74,13 @@ def test_a_person_chooses_a_phrase(chromium, path):
     studio = opened(path, '--images', WALK, *CLIP)
     document, truth = studio.document, studio.document.landmarks['bowl_1'].label
     document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
-    with open_page(studio) as (url, _):
-        person = Person(chromium, url)
-        person.find('bowl_1')
-        person.click(re.compile('^bowl_1 '))
+    with person_at(chromium, studio) as (person, _):
+        person.select(document, 'bowl_1')
         wait_for(lambda: truth in studio.phrases(), 'the phrases of CLIP')
         person.field('Phrases').click()
         person.picture('phrases')
         person.page.get_by_role('option', name=truth).click()
         wait_for(lambda: document.landmarks['bowl_1'].label == truth, 'the label')
-        person.page.close()
     studio.finder.close()
 
 

@@ -1,15 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a check: one HTML file with its pictures, without scripts and external requests."""
+"""The files of a check: figures as JSON; a page with pictures, no scripts, no requests."""
 
+import json
+import math
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
+from typing import Any
 
-from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck
-from cliploc_ros.mapping.checking.relocalization import Trial, count_verdicts
-from cliploc_ros.mapping.checking.report import SERIOUS, CheckReport, RecordingCheck, share
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
+from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts
+from cliploc_ros.mapping.check.report import SERIOUS, CheckReport, RecordingCheck, share
 
+PAGE, DATA = 'check.html', 'check.json'
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
 SOUND, MINOR, FAULTY = '#009E73', '#E69F00', '#D55E00'
 LOOK_ALIKE, INK, FAINT = '#CC79A7', '#222222', '#999999'
@@ -46,23 +52,45 @@ def grade(landmark: LandmarkCheck) -> str:
     return 'minor' if landmark.faults else 'sound'
 
 
-def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]]) -> str:
-    """Return the page.
+def write_report(folder: Path, name: str, report: CheckReport,
+                 pictures: Iterable[tuple[str, str, bytes]]) -> None:
+    """Write the page and the JSON file of a check of a named map, each in one step.
 
-    Parameters
-    ----------
-    name : str
-        Of the map.
-    pictures : iterable of (str, str, bytes)
-        Name, caption and PNG of each picture.
+    Pictures have a name, a caption and a PNG each.
+
+    Raises
+    ------
+    OptionsError
+        A file cannot be written; the old one stays.
     """
-    title = f'Check of {name}'
+    data = _finite({'map': name, **report.as_dict()})
+    write_text(folder / DATA, json.dumps(data, indent=1, allow_nan=False))
+    write_text(folder / PAGE, _page(name, report, pictures))
+
+
+def _finite(value: Any) -> Any:
+    """Return a tree with null for numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]]) -> str:
+    title = escape(f'Check of {name}')
+    verdict = '<p class="verdict passed"><b>The map reaches all thresholds.</b></p>' \
+        if report.passed else ('<div class="verdict failed"><b>The map misses these thresholds:'
+                               f'</b>{_list(report.failures)}</div>')
     parts = ['<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
              '<meta name="viewport" content="width=device-width">',
-             f'<title>{escape(title)}</title>', f'<style>{_STYLE}</style>',
-             f'<h1>{escape(title)}</h1>', _verdict(report), '<h2>What to do</h2>',
-             _list(report.advice), '<h2>Figures</h2>', _table(('', ''), _figures(report))]
-    parts += [_picture(*picture) for picture in pictures]
+             f'<title>{title}</title>', f'<style>{_STYLE}</style>', f'<h1>{title}</h1>', verdict,
+             '<h2>What to do</h2>', _list(report.advice), '<h2>Figures</h2>',
+             _table(('', ''), _figures(report))]
+    for picture, caption, png in pictures:
+        data = b64encode(png).decode('ascii')
+        parts.append(f'<figure><img alt="{escape(picture)}" src="data:image/png;base64,{data}">'
+                     f'<figcaption>{escape(caption)}</figcaption></figure>')
     parts += ['<h2>Landmarks, worst first</h2>', _landmarks(report.landmarks)]
     if report.look_alikes:
         parts += ['<h2>Places that look alike</h2>', _look_alikes(report)]
@@ -70,25 +98,19 @@ def make_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str,
         rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
                  f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
                 for number, one in enumerate(report.recording.folds, start=1)]
-        folds = ('<p>Blocks of time take turns in being judged; landmarks are fitted to the other '
-                 'blocks.</p>' + _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
-                                         '#median IoU'), rows))
-        parts += ['<h2>Held-out boxes</h2>', folds,
+        parts += ['<h2>Held-out boxes</h2>',
+                  '<p>Blocks of time take turns in being judged; landmarks are fitted to the '
+                  'other blocks.</p>',
+                  _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
+                          '#median IoU'), rows),
                   '<h2>Systematic residuals</h2>', _corrections(report.recording)]
-    parts += ['<h2>What these figures rest on</h2>', _list(report.notes), '</html>', '']
-    return '\n'.join(parts)
+    return '\n'.join([*parts, '<h2>What these figures rest on</h2>', _list(report.notes),
+                      '</html>', ''])
 
 
 def summary_lines(report: CheckReport) -> list[str]:
     """Return the figures as lines of text, for a terminal."""
     return [f'{name}: {value}' for name, value in _figures(report)]
-
-
-def _verdict(report: CheckReport) -> str:
-    if report.passed:
-        return '<p class="verdict passed"><b>The map reaches all thresholds.</b></p>'
-    return ('<div class="verdict failed"><b>The map misses these thresholds:</b>'
-            + _list(report.failures) + '</div>')
 
 
 def _figures(report: CheckReport) -> list[tuple[str, str]]:
@@ -134,29 +156,30 @@ def _verdicts(trials: Sequence[Trial]) -> str:
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
             '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
-    rows = ''.join(_landmark_row(one) for one in landmarks[:_MOST_LANDMARKS])
+    rows = []
+    for one in landmarks[:_MOST_LANDMARKS]:
+        support = '' if one.support is None else (
+            str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
+        label = one.class_id if one.label == one.class_id else f'{one.label} ({one.class_id})'
+        numbers = [(one.seen_ratio, 100.0, 0), (one.baseline_deg, 1.0, 0),
+                   (one.position_sigma_m, 100.0, 1), (one.offset_m, 100.0, 1),
+                   (one.median_iou, 1.0, 2), (one.thinness, 1.0, 2)]
+        texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
+                            for value, factor, digits in numbers)]
+        faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
+        rows.append('<tr>' + ''.join([
+            _cell(one.landmark_id, grade(one)), _cell(label, 'text'), _cell(faults, 'text'),
+            *(_cell(text, 'number') for text in texts),
+            _cell(', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps))])
+            + '</tr>')
     rest = len(landmarks) - _MOST_LANDMARKS
     more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
-    return (f'<div class="scroll"><table>{_head(head)}{rows}</table></div>{more}'
+    return (f'<div class="scroll"><table>{_head(head)}{"".join(rows)}</table></div>{more}'
             '<p class="note">frames: with the landmark, of those that should show it. seen: '
             'their share. baseline: greatest angle between two views. deviation: of the centre '
             'on its worst axis. offset: from the centre to where its boxes put it. IoU: median '
             'of its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
             'distance of an overlap.</p>')
-
-
-def _landmark_row(one: LandmarkCheck) -> str:
-    overlaps = ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)
-    label = one.class_id if one.label == one.class_id else f'{one.label} ({one.class_id})'
-    faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
-    texts = [_cell(one.landmark_id, grade(one)), _cell(label, 'text'), _cell(faults, 'text')]
-    support = '' if one.support is None else (
-        str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
-    numbers = [support, _number(one.seen_ratio, 100.0, 0), _number(one.baseline_deg, 1.0, 0),
-               _number(one.position_sigma_m, 100.0, 1), _number(one.offset_m, 100.0, 1),
-               _number(one.median_iou, 1.0, 2), _number(one.thinness, 1.0, 2)]
-    return '<tr>' + ''.join([*texts, *(_cell(text, 'number') for text in numbers),
-                             _cell(overlaps)]) + '</tr>'
 
 
 def _look_alikes(report: CheckReport) -> str:
@@ -185,12 +208,6 @@ def _corrections(recording: RecordingCheck) -> str:
                        '#cost that the cause explains', ''), rows))
 
 
-def _picture(name: str, caption: str, png: bytes) -> str:
-    data = b64encode(png).decode('ascii')
-    return (f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">'
-            f'<figcaption>{escape(caption)}</figcaption></figure>')
-
-
 def _list(texts: Iterable[str]) -> str:
     return '<ul>' + ''.join(f'<li>{escape(text)}</li>' for text in texts) + '</ul>'
 
@@ -211,7 +228,3 @@ def _head(titles: Sequence[str]) -> str:
 
 def _cell(text: str, kind: str = '') -> str:
     return f'<td{f" class={kind}" if kind else ""}>{escape(text)}</td>'
-
-
-def _number(value: float | None, factor: float, digits: int) -> str:
-    return '' if value is None else f'{value * factor:.{digits}f}'

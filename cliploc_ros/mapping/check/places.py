@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The places of a map: a grid of camera positions, and pairs of places that look alike."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,35 +72,29 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     near = np.ones(len(positions), dtype=np.bool_)
     if path is not None:
         near = cKDTree(path[:, :2]).query(positions[:, :2])[0] <= max(_NEAR_M, spacing)
+    # a level camera has its x axis to the right and its z axis forward
     headings = 2.0 * np.pi * np.arange(options.headings) / options.headings
-    rotations = np.array([_look(one, np.radians(pitch_deg)) for one in headings])
+    cosine, sine, pitch = np.cos(headings), np.sin(headings), np.radians(pitch_deg)
+    forward = np.stack([cosine * np.cos(pitch), sine * np.cos(pitch),
+                        np.full(len(headings), np.sin(pitch))], axis=1)
+    right = np.stack([sine, -cosine, np.zeros(len(headings))], axis=1)
     poses = np.tile(np.eye(4), (len(positions), len(headings), 1, 1))
-    poses[:, :, :3, :3] = rotations
+    poses[:, :, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
     poses[:, :, :3, 3] = positions[:, None]
     return Grid(positions, near, poses.reshape(-1, 4, 4), spacing)
 
 
 def _positions(low: NDArray[np.float64], high: NDArray[np.float64], height: float,
                options: CheckOptions) -> tuple[NDArray[np.float64], float]:
+    """Return positions between two corners, and their spacing: larger than asked for if needed."""
     spacing = options.spacing_m
-    while True:
-        counts = np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
-        if counts.prod() <= options.max_positions:
-            break
+    while (counts := np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
+           ).prod() > options.max_positions:
         spacing *= 1.1
     first = (low + high) / 2 - spacing * (counts - 1) / 2
     x, y = (first[axis] + spacing * np.arange(counts[axis]) for axis in (0, 1))
-    columns = np.meshgrid(x, y, indexing='ij')
-    flat = np.stack([column.ravel() for column in columns], axis=1)
-    return np.concatenate([flat, np.full((len(flat), 1), height)], axis=1), spacing
-
-
-def _look(heading: float, pitch: float) -> NDArray[np.float64]:
-    """Return the rotation of map_from_camera for a level camera with a heading and a pitch."""
-    forward = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch),
-                        np.sin(pitch)])
-    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
+    columns = np.meshgrid(x, y, height, indexing='ij')
+    return np.stack([column.ravel() for column in columns], axis=1), spacing
 
 
 @dataclass(frozen=True)
@@ -124,12 +117,24 @@ def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
 
     A place that a turn by more than 45 degrees lays on itself counts, too.
     """
+    ids, labels = landmark_map.landmark_ids, landmark_map.labels
     found: list[LookAlike] = []
     left = np.ones(len(landmark_map), dtype=np.bool_)
     for row, position in enumerate(landmark_map.centers):
-        if left[row]:
-            left[landmark_map.tree.query_ball_point(position, RADIUS_M)] = False
-            found += _look_alikes(landmark_map, position)
+        if not left[row]:
+            continue
+        left[landmark_map.tree.query_ball_point(position, RADIUS_M)] = False
+        alike = find_alike(landmark_map, position)
+        for move, others, matched in zip(alike.moves, alike.others, alike.found, strict=True):
+            if matched.mean() < _LEAST_SHARE:
+                continue
+            pairs = list(zip(alike.landmarks[matched].tolist(), others[matched].tolist(),
+                             strict=True))
+            found.append(LookAlike(
+                tuple(position.tolist()), tuple((move[:3, :3] @ position + move[:3, 3]).tolist()),
+                tuple((ids[one], ids[other]) for one, other in pairs), len(alike.landmarks),
+                float(matched.mean()), sum(labels[one] == labels[other] for one, other in pairs),
+                float(np.degrees(np.arctan2(move[1, 0], move[0, 0])))))
     kept: list[LookAlike] = []
     for one in sorted(found, key=lambda one: (-len(one.matched) * one.share, -one.share)):
         if not any((_near(one.first, other.first) and _near(one.second, other.second))
@@ -137,21 +142,6 @@ def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
                    for other in kept):
             kept.append(one)
     return kept
-
-
-def _look_alikes(landmark_map: LandmarkMap, position: NDArray[np.float64]
-                 ) -> Iterator[LookAlike]:
-    alike = find_alike(landmark_map, position)
-    ids, labels = landmark_map.landmark_ids, landmark_map.labels
-    for move, others, found in zip(alike.moves, alike.others, alike.found, strict=True):
-        if found.mean() < _LEAST_SHARE:
-            continue
-        pairs = list(zip(alike.landmarks[found].tolist(), others[found].tolist(), strict=True))
-        yield LookAlike(
-            tuple(position.tolist()), tuple((move[:3, :3] @ position + move[:3, 3]).tolist()),
-            tuple((ids[one], ids[other]) for one, other in pairs), len(alike.landmarks),
-            float(found.mean()), sum(labels[one] == labels[other] for one, other in pairs),
-            float(np.degrees(np.arctan2(move[1, 0], move[0, 0]))))
 
 
 def _near(first: tuple[float, float, float], second: tuple[float, float, float]) -> bool:

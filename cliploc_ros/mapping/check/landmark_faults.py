@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each landmark of a map: how well a recording supports it, and what is wrong with it."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from cliploc_ros.mapping.views import Views, camera_centers
 # object, unless they are farther apart than the second distance and frames show both at once.
 # Guesses: build_map merges below 0.8 if the boxes agree.
 _OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
-_MAX_SEEN_APART = 0.15
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
@@ -60,8 +59,8 @@ class LandmarkCheck:
     thinness: float  #: Least semi-axis divided by the greatest one
     #: Landmarks that lie in it, and their normalized distances
     overlaps: tuple[tuple[str, float], ...]
-    faults: tuple[str, ...]  #: What is wrong with it and what to do, the worst first
-    severity: float  #: 0: nothing; 1 and more: a serious fault
+    faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
+    severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
 
 
 class Witness(NamedTuple):
@@ -105,7 +104,7 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
     for first, second, distance in close_pairs(landmarks, _OVERLAP_DISTANCE):
         is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
             distance < _SAME_PLACE_DISTANCE or boxes is None or views is None
-            or seen_apart(views, boxes[first], boxes[second]) <= _MAX_SEEN_APART)
+            or seen_apart(views, boxes[first], boxes[second]) <= MappingOptions.max_seen_apart)
         found.append(Overlap(first, second, distance, bool(is_duplicate)))
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
 
@@ -114,80 +113,65 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                     overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
     """Return each landmark's check, the worst first.
 
-    Parameters
-    ----------
-    witness : Witness, optional
-        Without a recording, support comes from the map's own fields.
-    options : MappingOptions
-        Its limits for landmarks.
+    Without a recording, support comes from the map's own fields. The options have the limits.
     """
-    partners: dict[int, list[tuple[int, Overlap]]] = {}
+    ids, classes = landmark_map.landmark_ids, landmark_map.class_ids
+    partners: list[list[tuple[int, Overlap]]] = [[] for _ in ids]
     for one in overlaps:
-        partners.setdefault(one.first, []).append((one.second, one))
-        partners.setdefault(one.second, []).append((one.first, one))
-    checks = [_check(landmark_map, row, witness, partners.get(row, []), options)
-              for row in range(len(landmark_map))]
+        partners[one.first].append((one.second, one))
+        partners[one.second].append((one.first, one))
+    checks = []
+    for row, others in enumerate(partners):
+        semi_axes = landmark_map.semi_axes[row]
+        x, y, z = landmark_map.centers[row].tolist()
+        check = LandmarkCheck(
+            ids[row], landmark_map.labels[row], classes[row], (x, y, z),
+            **_support(landmark_map, row, witness),
+            thinness=float(semi_axes.min() / semi_axes.max()),
+            overlaps=tuple((ids[other], one.distance) for other, one in others))
+        faults = [(1.5, f'is the same object as {ids[other]} (normalized distance '
+                        f'{one.distance:.2f}): delete one of them')
+                  for other, one in others if one.is_duplicate]
+        if not faults:
+            faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
+        faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
+                         'classes, or one on the other; keep one if it is one object')
+                   for other, _ in others if classes[other] != classes[row]]
+        if check.thinness < _MIN_THINNESS:
+            faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
+                                'record it from another side, or give it thickness'))
+        faults.sort(key=lambda one: -one[0])
+        checks.append(replace(
+            check, faults=tuple(text for _, text in faults),
+            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0))
     return sorted(checks, key=lambda one: -one.severity)
 
 
-def _check(landmark_map: LandmarkMap, row: int, witness: Witness | None,
-           partners: list[tuple[int, Overlap]], options: MappingOptions) -> LandmarkCheck:
-    ids, semi_axes = landmark_map.landmark_ids, landmark_map.semi_axes[row]
-    numbers = _Numbers.of(landmark_map, row, witness)
-    thinness = float(semi_axes.min() / semi_axes.max())
-    faults = [(1.5, f'is the same object as {ids[other]} (normalized distance '
-                    f'{overlap.distance:.2f}): delete one of them')
-              for other, overlap in partners if overlap.is_duplicate]
-    if not faults:
-        faults += _support_faults(numbers, float(np.linalg.norm(semi_axes)), options)
-    faults += [(0.4, f'lies in {ids[other]} of class {landmark_map.class_ids[other]}: one object '
-                     'under two classes, or one on the other; keep one if it is one object')
-               for other, overlap in partners
-               if landmark_map.class_ids[other] != landmark_map.class_ids[row]]
-    if thinness < _MIN_THINNESS:
-        faults.append((0.3, f'is a sheet: its axes have the ratio {thinness:.3f}; record it from '
-                            'another side, or give it thickness'))
-    faults.sort(key=lambda one: -one[0])
-    center = landmark_map.centers[row]
-    return LandmarkCheck(
-        ids[row], landmark_map.labels[row], landmark_map.class_ids[row],
-        (float(center[0]), float(center[1]), float(center[2])), *numbers, thinness,
-        tuple((ids[other], overlap.distance) for other, overlap in partners),
-        tuple(text for _, text in faults),
-        faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0)
-
-
-class _Numbers(NamedTuple):
-    """Figures of a landmark from a recording or from the map itself; None where unknown."""
-
-    support: int | None
-    expected: int | None
-    seen_ratio: float | None
-    baseline_deg: float | None
-    position_sigma_m: float | None
-    offset_m: float | None
-    median_iou: float | None
-
-    @staticmethod
-    def of(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> '_Numbers':
-        if witness is None:
-            given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
-            return _Numbers(given.support, None, given.seen_ratio, given.baseline_deg,
-                            given.position_sigma, None, None)
-        evidence, support = witness.evidence, int(witness.evidence.support[row])
+def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
+    """Return the numbers of a landmark's support: from a recording, or from the map itself."""
+    names = ('support', 'expected', 'seen_ratio', 'baseline_deg', 'position_sigma_m', 'offset_m',
+             'median_iou')
+    if witness is None:
+        given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
+        values: tuple[Any, ...] = (
+            given.support, None, given.seen_ratio, given.baseline_deg, given.position_sigma, None,
+            None)
+    elif (support := int(witness.evidence.support[row])) == 0:
         expected = int(witness.expected[row])
-        if support == 0:
-            return _Numbers(0, expected, 0.0 if expected else None, None, None, None, None)
+        values = (0, expected, 0.0 if expected else None, None, None, None, None)
+    else:
+        evidence = witness.evidence
         offset = witness.fitted.centers[row] - witness.landmarks.centers[row]
-        return _Numbers(support, expected, float(evidence.seen_ratio[row]),
-                        float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
-                        float(np.linalg.norm(offset)), float(evidence.median_iou[row]))
+        values = (support, int(witness.expected[row]), float(evidence.seen_ratio[row]),
+                  float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
+                  float(np.linalg.norm(offset)), float(evidence.median_iou[row]))
+    return dict(zip(names, values, strict=True))
 
 
-def _support_faults(numbers: _Numbers, size_m: float, options: MappingOptions
+def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
                     ) -> list[tuple[float, str]]:
-    """Return what is wrong with a landmark's support, with a weight each."""
-    support, expected, ratio = numbers.support, numbers.expected, numbers.seen_ratio
+    """Return the faults of a landmark's support, with a weight each."""
+    support, expected, ratio = check.support, check.expected, check.seen_ratio
     if support == 0:
         if expected is not None and expected < _MIN_EXPECTED:
             return [(0.5, f'was in view in {expected} frames: record this place')]
@@ -200,21 +184,19 @@ def _support_faults(numbers: _Numbers, size_m: float, options: MappingOptions
     if ratio is not None and ratio < options.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'moved, or hard to detect'))
-    iou, baseline = numbers.median_iou, numbers.baseline_deg
+    iou, baseline, sigma = check.median_iou, check.baseline_deg, check.position_sigma_m
     if iou is not None and iou < options.min_median_iou:
         faults.append((1.2, f'does not fit its boxes: median IoU {iou:.2f}; moved, or two objects '
                             'in one; map it again'))
     if baseline is not None and baseline < options.min_baseline_deg:
         faults.append((0.7, f'was seen from one side: {baseline:.0f} degrees; record it from '
                             'another side'))
-    if (offset := numbers.offset_m) is not None and offset > max(
-            _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (numbers.position_sigma_m
-                                                                    or 0.0)):
+    if (offset := check.offset_m) is not None and offset > max(
+            _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (sigma or 0.0)):
         faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: moved, '
                             'or badly fitted; map it again'))
-    limit = max(options.max_position_sigma_m, options.max_position_sigma_share * size_m)
-    sigma = numbers.position_sigma_m
-    if sigma is not None and sigma > limit:
+    if sigma is not None and sigma > max(options.max_position_sigma_m,
+                                         options.max_position_sigma_share * size_m):
         faults.append((0.7, f'has an uncertain position: {sigma * 100:.0f} cm; record it from '
                             'more sides'))
     return faults

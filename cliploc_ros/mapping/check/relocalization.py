@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Cross-validation over time: landmarks fitted to some blocks of a recording, judged on others."""
+"""Relocalize in recorded frames, with maps fitted to others, and in simulated ones."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,19 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.mapping.checking.detector_model import DetectorModel
-from cliploc_ros.mapping.checking.landmark_faults import Witness
-from cliploc_ros.mapping.evidence import best_ious, explained
+from cliploc_ros.mapping.check.landmark_faults import Witness
+from cliploc_ros.mapping.evidence import REACH, best_ious, explained, is_expected
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes
-from cliploc_ros.mapping.options import CheckOptions
+from cliploc_ros.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.views import Views
+from cliploc_ros.mapping.systematic import linearize_boxes
+from cliploc_ros.mapping.views import Views, camera_centers
+from cliploc_ros.simulation.detector import GUESSED_MIN_SIDE_PX, DetectorModel, Sightings
 from cliploc_ros.simulation.labels import LabelModel
+
+_MAX_SAMPLED_FRAMES = 600
+_CLUTTER_IOU = 0.1
 
 Verdict = Literal['accepted', 'refused', 'misled']
 Tell = Callable[[float], None]
@@ -47,75 +51,84 @@ class BoxQuality:
     median_iou: float  #: Of these
 
 
-def split_frames(stamps_s: NDArray[np.float64], options: CheckOptions) -> NDArray[np.int64]:
-    """Return the fold (F,) of each frame: blocks of time in turn, at least one block a fold."""
-    elapsed = stamps_s - stamps_s[0]
-    block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
-    return np.asarray((elapsed / block_s).astype(np.int64) % options.folds)
-
-
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
     """Return the folds of a recording, each with the map as the others show it.
 
-    A landmark that fits its boxes is fitted again, to the boxes outside of the fold; it is left
-    out if they are too few. A landmark that does not fit its boxes, or has none, stays as it is:
-    a robot would use it as it is.
+    Folds take blocks of time in turn, at least one block each. A landmark that fits its boxes is
+    fitted again, to the boxes outside of the fold; it is left out if they are too few. A landmark
+    that does not fit its boxes, or has none, stays as it is: a robot would use it as it is.
     """
-    of_frames = split_frames(views.stamps_s, options)
+    stamps_s, mapping = views.stamps_s, options.mapping
+    elapsed = stamps_s - stamps_s[0]
+    block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
+    of_frames = (elapsed / block_s).astype(np.int64) % options.folds
+    gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
+    fits = witness.evidence.median_iou >= mapping.min_median_iou
+    all_boxes = group_boxes(witness.shown, len(fits))
     for number in range(options.folds):
         judged = np.nonzero(of_frames == number)[0]
-        if len(judged):
-            block_s = (views.stamps_s[-1] - views.stamps_s[0]) / options.folds
-            gap = float(min(options.gap_s, 0.25 * block_s))
-            training = ~_is_near(views.stamps_s, judged, gap)
-            rows, landmarks = _refit(views, witness, training, options)
-            yield Fold(judged, rows, landmarks)
-
-
-def _is_near(stamps_s: NDArray[np.float64], judged: NDArray[np.int64], gap_s: float
-             ) -> NDArray[np.bool_]:
-    """Tell which frames (F,) are judged or within a gap of one that is."""
-    times = stamps_s[judged]
-    after = np.searchsorted(times, stamps_s).clip(0, len(times) - 1)
-    before = (after - 1).clip(0)
-    nearest = np.minimum(np.abs(times[after] - stamps_s), np.abs(times[before] - stamps_s))
-    return np.asarray(nearest <= gap_s)
-
-
-def _refit(views: Views, witness: Witness, training: NDArray[np.bool_], options: CheckOptions
-           ) -> tuple[NDArray[np.int64], Landmarks]:
-    landmarks, evidence = witness.landmarks, witness.evidence
-    kept = np.ones(len(landmarks.centers), dtype=np.bool_)
-    boxes = group_boxes(witness.shown, len(kept))
-    for number, rows in enumerate(boxes):
-        boxes[number] = rows[:0]
-        if evidence.median_iou[number] < options.mapping.min_median_iou:
+        if len(judged) == 0:
             continue
-        rows = rows[training[views.frames[rows]]]
-        seen_from = np.unique(views.viewpoints[views.frames[rows]])
-        kept[number] = len(seen_from) >= options.mapping.min_viewpoints
-        if kept[number]:
-            boxes[number] = rows
-    return np.nonzero(kept)[0], fit_landmarks(views, landmarks, boxes).select(kept)
-
-
-def judge_boxes(views: Views, landmarks: Landmarks, frames: NDArray[np.int64] | None = None
-                ) -> NDArray[np.float64]:
-    """Return the best IoU of each box of some frames, or of all, with a landmark of its class."""
-    ious = best_ious(views, landmarks)
-    return ious if frames is None else ious[np.isin(views.frames, frames)]
+        # frames within a gap of one that is judged train nothing
+        times = stamps_s[judged]
+        after = np.searchsorted(times, stamps_s).clip(0, len(times) - 1)
+        nearest = np.minimum(np.abs(times[after] - stamps_s),
+                             np.abs(times[(after - 1).clip(0)] - stamps_s))
+        training = nearest > gap_s
+        kept, boxes = np.ones(len(fits), dtype=np.bool_), []
+        for row, rows in enumerate(all_boxes):
+            rows = rows[training[views.frames[rows]] & fits[row]]
+            if fits[row]:
+                seen_from = np.unique(views.viewpoints[views.frames[rows]])
+                kept[row] = len(seen_from) >= mapping.min_viewpoints
+            boxes.append(rows if kept[row] else rows[:0])
+        yield Fold(judged, np.nonzero(kept)[0],
+                   fit_landmarks(views, witness.landmarks, boxes).select(kept))
 
 
 def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
-    """Return how well landmarks explain boxes with these best IoUs."""
+    """Return how well landmarks explain boxes, by the best IoU of each with one of its class."""
     return BoxQuality(len(ious), *explained(ious))
 
 
-def fold_map(landmark_map: LandmarkMap, fold: Fold) -> LandmarkMap:
-    """Return the map of a fold, with the ids and labels of the whole map."""
-    semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
-    return replace(landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
-                   semi_axes=semi_axes, quats_xyzw=quats_xyzw)
+def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, options: MappingOptions) -> DetectorModel:
+    """Return the detector of a recording.
+
+    A landmark that was never detected does not exist: the model never detects it.
+    """
+    landmarks, cameras = witness.landmarks, camera_centers(views)
+    frames = np.arange(0, len(detections), -(-len(detections) // _MAX_SAMPLED_FRAMES))
+    reach, sightings = np.zeros(len(landmark_map)), []
+    for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
+        center, basis = landmarks.centers[row], landmarks.bases[row]
+        if len(rows):
+            offsets = center - cameras[views.frames[rows]]
+            reach[row] = REACH * np.linalg.norm(offsets, axis=1).max()
+        offsets = center - cameras
+        distances = np.linalg.norm(offsets, axis=1)
+        expected = frames[(is_expected(views, cameras, center, basis, reach[row])
+                           & (distances > 0.0))[frames]]
+        sightings.append(Sightings(offsets[expected] / distances[expected, None],
+                                    np.isin(expected, views.frames[rows])))
+    sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
+    min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
+    # the boxes that no landmark explains, by frame
+    is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
+    clutter = []
+    for frame in frames:
+        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
+        rows = rows[is_clutter[rows]]
+        clutter.append((detections.bboxes_xyxy[rows],
+                        tuple(detections.class_names[one] for one in detections.classes[rows])))
+    # the robust deviation of closed edges, in standard deviations
+    rows = np.nonzero(witness.shown >= 0)[0]
+    linear = linearize_boxes(views, rows, witness.shown[rows], landmarks)
+    residuals = np.abs(linear.residuals[linear.weights > 0.0])
+    scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
+    return DetectorModel(
+        landmark_map, detections.camera, tuple(sightings), witness.evidence.seen_ratio, reach,
+        (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
 
 
 class PosedObservation(NamedTuple):
@@ -143,20 +156,24 @@ class Trial:
     reason: str  #: Of a refusal
     stamp_s: float | None = None  #: Of a recorded frame [s]
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the trial as plain values, for JSON."""
+        return {
+            'verdict': self.verdict, 'stamp_s': self.stamp_s,
+            'position': self.position.round(4).tolist(),
+            'forward': self.forward.round(4).tolist(), 'detections': self.detections,
+            'landmarks': self.landmarks,
+            'estimate': None if self.estimate is None else self.estimate.round(4).tolist(),
+            'error_m': self.error_m, 'reason': self.reason}
+
 
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                   shown: NDArray[np.int64], folds: Sequence[Fold], options: CheckOptions,
                   tell: Tell) -> list[Trial]:
     """Relocalize recorded frames in the map that the other frames show, in the order of time.
 
-    Boxes and poses are the recording's, similarities are simulated.
-
-    Parameters
-    ----------
-    shown : ndarray (n,) of int
-        The landmark that each box shows, -1 for none.
-    tell : callable
-        Told the share that is done.
+    Boxes and poses are the recording's, similarities are simulated; shown (n,) has the landmark
+    of each box, -1 for none. The callable tell is told the share that is done.
     """
     labels = LabelModel.of(landmark_map)
     chosen = set(sample_frames(len(detections), options.frames).tolist())
@@ -165,8 +182,12 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
         if not frames:
             continue
-        relocalizer = _relocalizer(fold_map(landmark_map, fold), options) if len(fold.rows) \
-            else None
+        relocalizer = None
+        if len(fold.rows):
+            semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
+            relocalizer = _relocalizer(replace(
+                landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
+                semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
         for frame in frames:
             rows = slice(*detections.frame_offsets[frame:frame + 2])
             rng = np.random.default_rng([options.random_seed, frame])

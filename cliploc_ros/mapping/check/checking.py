@@ -2,40 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """The entry point of checking: a map and, if there is one, a recording in, a report out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.checking.advice import give_advice
-from cliploc_ros.mapping.checking.detector_model import (
-    DetectorModel,
-    guess_detector,
-    measure_detector,
-)
-from cliploc_ros.mapping.checking.landmark_faults import (
+from cliploc_ros.mapping.building import Progress
+from cliploc_ros.mapping.check.advice import give_advice
+from cliploc_ros.mapping.check.landmark_faults import (
     Witness,
     check_landmarks,
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.mapping.checking.places import Grid, find_look_alikes, make_grid
-from cliploc_ros.mapping.checking.relocalization import (
+from cliploc_ros.mapping.check.places import Grid, find_look_alikes, make_grid
+from cliploc_ros.mapping.check.relocalization import (
     PosedObservation,
     Trial,
     box_quality,
-    judge_boxes,
     make_folds,
+    measure_detector,
     sample_frames,
     try_observations,
     try_poses,
     try_recording,
 )
-from cliploc_ros.mapping.checking.report import (
+from cliploc_ros.mapping.check.report import (
     BlockQuality,
     CheckReport,
     GridCheck,
@@ -43,13 +39,12 @@ from cliploc_ros.mapping.checking.report import (
     check_keyframes,
     find_failures,
 )
+from cliploc_ros.mapping.evidence import best_ious
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import Views, check_input, make_views
-
-#: Told the name of a stage and the share of it that is done.
-Progress = Callable[[str, float], None]
+from cliploc_ros.simulation.detector import DetectorModel, guess_detector
 
 _NOTES = (
     'similarities of crops and labels are simulated, except for queries: labels of equal text '
@@ -75,8 +70,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         Observations with recorded similarities to the map's labels.
     thresholds : Thresholds, optional
         What the map has to reach.
-    progress : callable, optional
-        Called with the name of a stage and the share of it that is done, 0 to 1.
     layer : KeyframeLayer, optional
         The keyframes next to the map.
 
@@ -86,11 +79,13 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         The recording says nothing of this map; the message says what to correct.
     """
     options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
-    notes = [*_NOTES]
-    witness: Witness | None = None
-    recording: RecordingCheck | None = None
-    recorded: NDArray[np.float64] | None = None
-    if detections is not None:
+    notes, views, witness, recording = [*_NOTES], None, None, None
+    recorded = None if detections is None else detections.map_from_camera
+    if detections is None:
+        notes.append(_NO_RECORDING)
+        model = guess_detector(landmark_map, (options.mapping.edge_sigma_px,
+                                              options.mapping.edge_sigma_share))
+    else:
         tell('judging landmarks', 0.0)
         views = make_views(detections, options.mapping)
         notes += check_input(detections, views, options.mapping)
@@ -100,22 +95,17 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         model = measure_detector(landmark_map, detections, views, witness, options.mapping)
         recording = _check_recording(landmark_map, detections, views, witness, model, options,
                                      tell)
-        overlaps = find_map_overlaps(landmark_map, witness, views)
-        recorded = detections.map_from_camera
-    else:
-        notes.append(_NO_RECORDING)
-        model = guess_detector(landmark_map, options.mapping)
-        overlaps = find_map_overlaps(landmark_map, None, None)
+    overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, recorded, options)
     grid = judge_grid(places, model, try_poses(
         model, landmark_map, places.poses, options,
-        lambda share: tell('relocalizing on the grid', share)), options.headings)
+        partial(tell, 'relocalizing on the grid')), options.headings)
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
         queries=tuple(try_observations(landmark_map, queries, options,
-                                       lambda share: tell('relocalizing queries', share))),
+                                       partial(tell, 'relocalizing queries'))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
     tell('done', 1.0)
@@ -144,22 +134,22 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
     tell('cross-validating', 0.0)
     folds, blocks, held_out = [], [], []
     for fold in make_folds(views, witness, options):
-        ious = judge_boxes(views, fold.landmarks, fold.frames)
+        ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames)]
         folds.append(fold)
         held_out.append(ious)
         blocks.append(BlockQuality(len(fold.frames), len(fold.rows), box_quality(ious)))
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
-                           lambda share: tell('relocalizing recorded frames', share))
+                           partial(tell, 'relocalizing recorded frames'))
     sampled = sample_frames(len(detections), options.frames)
     simulated = try_poses(model, landmark_map, detections.map_from_camera[sampled], options,
-                          lambda share: tell('relocalizing simulated frames', share))
+                          partial(tell, 'relocalizing simulated frames'))
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
         duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
         path_xyz=detections.map_from_camera[:, :3, 3],
-        as_given=box_quality(judge_boxes(views, witness.landmarks)),
+        as_given=box_quality(best_ious(views, witness.landmarks)),
         held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),

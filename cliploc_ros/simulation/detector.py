@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector would see of a map from a pose, with the errors measured in a recording."""
+"""What a detector would see of a map from a pose, with guessed or measured errors."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,29 +17,22 @@ from cliploc_ros.core.geometry.ellipsoid import (
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.mapping.checking.landmark_faults import Witness
-from cliploc_ros.mapping.evidence import REACH, SHOWN_SHARE, best_ious, is_expected
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
-from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.systematic import linearize_boxes
-from cliploc_ros.mapping.views import Views, camera_centers
 
+#: A landmark is detected only if the image shows this share of its box.
+SHOWN_SHARE = 0.6
 # Frames count for a pose if they saw the landmark from within this angle of its direction.
 _NEAR_COSINE = np.cos(np.radians(30.0))
 # Frames that the landmark's overall ratio stands for, where few frames are near.
 _PRIOR_FRAMES = 3.0
-_MAX_SAMPLED_FRAMES = 600
-_CLUTTER_IOU = 0.1
 _SCORE = 0.8
 # Without a recording; guesses.
 _GUESSED_RATIO = 0.6
 _GUESSED_REACH_M = 5.0
-_GUESSED_MIN_SIDE_PX = 12.0
+GUESSED_MIN_SIDE_PX = 12.0
 _GUESSED_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 
 
-class _Sightings(NamedTuple):
+class Sightings(NamedTuple):
     """Frames that should show a landmark: its direction (k, 3) from them, and if it was seen."""
 
     directions: NDArray[np.float64]
@@ -52,17 +45,18 @@ class DetectorModel:
 
     landmark_map: LandmarkMap  #: What there is to see
     camera: Camera
-    sightings: tuple[_Sightings, ...]  #: Of each landmark; empty without a recording
+    sightings: tuple[Sightings, ...]  #: Of each landmark; empty without a recording
     #: (L,): share of the expected frames in which each landmark was detected, and from how far
     #: away it can be [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
-    edge_scale: float  #: Deviation of edges, in units of MappingOptions' one
+    #: Standard deviation of edges: [px], and as a share of the box's extent; and their scale
+    edge_sigma: tuple[float, float]
+    edge_scale: float
     min_side_px: float  #: Smaller boxes are not detected
     #: tuple of ((k, 4), tuple of str): boxes [px] of no landmark in single frames, and their
     #: classes
     clutter: tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]
-    mapping: MappingOptions
 
     def in_view(self, map_from_camera: NDArray[np.float64]
                 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -93,7 +87,7 @@ class DetectorModel:
         seen = rng.random(len(rows)) < chances
         rows, boxes = rows[seen], boxes[seen]
         extents = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-        deviations = np.hypot(self.mapping.edge_sigma_px, self.mapping.edge_sigma_share * extents)
+        deviations = np.hypot(self.edge_sigma[0], self.edge_sigma[1] * extents)
         noisy = boxes + self.edge_scale * deviations * rng.normal(size=boxes.shape)
         noisy = np.clip(noisy, 0.0, [self.camera.width, self.camera.height] * 2)
         sound = (noisy[:, 2:] - noisy[:, :2]).min(axis=1, initial=np.inf) >= 1.0
@@ -118,57 +112,13 @@ class DetectorModel:
                      / (near.sum() + _PRIOR_FRAMES))
 
 
-def guess_detector(landmark_map: LandmarkMap, options: MappingOptions) -> DetectorModel:
-    """Return a detector of which nothing was measured."""
+def guess_detector(landmark_map: LandmarkMap, edge_sigma: tuple[float, float]) -> DetectorModel:
+    """Return a detector without any measurement."""
     count = len(landmark_map)
     ratios = np.full(count, _GUESSED_RATIO)
     for row, one in enumerate(landmark_map.details):
         if one.seen_ratio is not None:
             ratios[row] = one.seen_ratio
     return DetectorModel(landmark_map, _GUESSED_CAMERA, (), ratios,
-                         np.full(count, _GUESSED_REACH_M), 1.0, _GUESSED_MIN_SIDE_PX, (), options)
-
-
-def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, options: MappingOptions) -> DetectorModel:
-    """Return the detector of a recording.
-
-    A landmark that was never detected does not exist: the model never detects it.
-    """
-    landmarks, cameras = witness.landmarks, camera_centers(views)
-    frames = np.arange(0, len(detections), -(-len(detections) // _MAX_SAMPLED_FRAMES))
-    reach, sightings = np.zeros(len(landmark_map)), []
-    for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
-        center, basis = landmarks.centers[row], landmarks.bases[row]
-        if len(rows):
-            offsets = center - cameras[views.frames[rows]]
-            reach[row] = REACH * np.linalg.norm(offsets, axis=1).max()
-        offsets = center - cameras
-        distances = np.linalg.norm(offsets, axis=1)
-        expected = frames[(is_expected(views, cameras, center, basis, reach[row])
-                           & (distances > 0.0))[frames]]
-        sightings.append(_Sightings(offsets[expected] / distances[expected, None],
-                                    np.isin(expected, views.frames[rows])))
-    sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
-    min_side = float(np.quantile(sides, 0.01)) if len(sides) else _GUESSED_MIN_SIDE_PX
-    # the boxes that no landmark explains, by frame
-    is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
-    clutter = []
-    for frame in frames:
-        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
-        rows = rows[is_clutter[rows]]
-        clutter.append((detections.bboxes_xyxy[rows],
-                        tuple(detections.class_names[one] for one in detections.classes[rows])))
-    return DetectorModel(
-        landmark_map, detections.camera, tuple(sightings), witness.evidence.seen_ratio, reach,
-        _edge_scale(views, landmarks, witness.shown), min_side, tuple(clutter), options)
-
-
-def _edge_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> float:
-    """Return the robust deviation of closed edges, in standard deviations."""
-    rows = np.nonzero(shown >= 0)[0]
-    if len(rows) == 0:
-        return 1.0
-    linear = linearize_boxes(views, rows, shown[rows], landmarks)
-    residuals = np.abs(linear.residuals[linear.weights > 0.0])  # those of closed edges
-    return float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
+                         np.full(count, _GUESSED_REACH_M), edge_sigma, 1.0, GUESSED_MIN_SIDE_PX,
+                         ())

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a check: figures, verdict and advice."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
-from cliploc_ros.mapping.checking.landmark_faults import LandmarkCheck, Overlap
-from cliploc_ros.mapping.checking.places import LookAlike
-from cliploc_ros.mapping.checking.relocalization import BoxQuality, Trial, count_verdicts
+from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck, Overlap
+from cliploc_ros.mapping.check.places import LookAlike
+from cliploc_ros.mapping.check.relocalization import BoxQuality, Trial, count_verdicts
 from cliploc_ros.mapping.options import Thresholds
 from cliploc_ros.mapping.systematic import Correction
 
@@ -51,6 +51,17 @@ class RecordingCheck:
     corrections: tuple[Correction, ...]
     edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'frames': self.frames, 'boxes': self.boxes, 'duration_s': self.duration_s,
+            'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
+            'folds': [asdict(one) for one in self.folds], 'edge_scale': self.edge_scale,
+            'verdicts': count_verdicts(self.trials),
+            'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
+            'corrections': [asdict(one) for one in self.corrections],
+            'trials': [one.as_dict() for one in self.trials]}
+
 
 @dataclass(frozen=True)
 class GridCheck:
@@ -81,6 +92,20 @@ class GridCheck:
         """Return the share of the positions near the recording with an accepted heading."""
         near = self.accepted[self.is_near]
         return float((near > 0).mean()) if len(near) else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'headings': self.headings, 'spacing_m': self.spacing_m,
+            'accepted_positions_near_recording': self.accepted_positions,
+            'verdicts': count_verdicts(self.trials),
+            'positions': [
+                {'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
+                 'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
+                for row, near, accepted, misled, visible in zip(
+                    self.positions.round(3).tolist(), self.is_near, self.accepted, self.misled,
+                    self.visible, strict=True)],
+            'misled': [one.as_dict() for one in self.trials if one.verdict == 'misled']}
 
 
 @dataclass(frozen=True)
@@ -156,14 +181,13 @@ class CheckReport:
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
             'landmarks': [asdict(one) for one in self.landmarks],
-            'overlaps': [{'first': self.map_ids[one.first],
-                          'second': self.map_ids[one.second], 'distance': one.distance,
-                          'is_duplicate': one.is_duplicate}
+            'overlaps': [{'first': self.map_ids[one.first], 'second': self.map_ids[one.second],
+                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
                          for one in self.overlaps],
             'look_alikes': [asdict(one) for one in self.look_alikes],
-            'grid': _grid_dict(self.grid),
-            'recording': None if self.recording is None else _recording_dict(self.recording),
-            'queries': [_trial_dict(one) for one in self.queries],
+            'grid': self.grid.as_dict(),
+            'recording': None if self.recording is None else self.recording.as_dict(),
+            'queries': [one.as_dict() for one in self.queries],
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
 
 
@@ -171,44 +195,32 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
     """Return the thresholds that a report misses."""
     failures = []
 
-    def demand(is_met: bool, text: str) -> None:
-        if not is_met:
-            failures.append(text)
+    def percent(value: float) -> str:
+        """Return a share with enough digits to show that it is below its limit."""
+        return f'{100.0 * value:.4g} %'
+
+    def demand(text: str, value: float, limit: float, is_most: bool,
+               show: Callable[[float], str] = percent) -> None:
+        if value > limit if is_most else value < limit:
+            failures.append(f'{text}: {show(value)} {">" if is_most else "<"} {show(limit)}')
 
     views = [*report.grid.trials, *report.queries]
-    demand(report.faulty <= limits.max_faulty,
-           f'landmarks with a serious fault: {_percent(report.faulty)} > '
-           f'{_percent(limits.max_faulty)}')
-    demand(report.duplicates <= limits.max_duplicates,
-           f'pairs of duplicates: {report.duplicates} > {limits.max_duplicates}')
-    demand(len(report.look_alikes) <= limits.max_look_alikes,
-           f'pairs of places that look alike: {len(report.look_alikes)} > '
-           f'{limits.max_look_alikes}')
+    demand('landmarks with a serious fault', report.faulty, limits.max_faulty, True)
+    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, str)
+    demand('pairs of places that look alike', len(report.look_alikes), limits.max_look_alikes,
+           True, str)
     if (recording := report.recording) is not None:
         views += recording.trials
-        quality = recording.held_out
-        demand(quality.explained >= limits.min_explained,
-               f'held-out boxes explained: {_percent(quality.explained)} < '
-               f'{_percent(limits.min_explained)}')
-        demand(quality.median_iou >= limits.min_iou,
-               f'held-out median IoU: {quality.median_iou:.4g} < {limits.min_iou:g}')
-        accepted = share(recording.trials, 'accepted')
-        demand(accepted >= limits.min_accepted,
-               f'recorded frames accepted: {_percent(accepted)} < '
-               f'{_percent(limits.min_accepted)}')
-    positions = report.grid.accepted_positions
-    demand(positions >= limits.min_positions,
-           f'positions with an accepted heading: {_percent(positions)} < '
-           f'{_percent(limits.min_positions)}')
-    misled = share(views, 'misled')
-    demand(misled <= limits.max_misled,
-           f'views that mislead a robot: {_percent(misled)} > {_percent(limits.max_misled)}')
+        demand('held-out boxes explained', recording.held_out.explained, limits.min_explained,
+               False)
+        demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
+               '{:.4g}'.format)
+        demand('recorded frames accepted', share(recording.trials, 'accepted'),
+               limits.min_accepted, False)
+    demand('positions with an accepted heading', report.grid.accepted_positions,
+           limits.min_positions, False)
+    demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
     return failures
-
-
-def _percent(value: float) -> str:
-    """Return a share with enough digits to show that it is below its limit."""
-    return f'{100.0 * value:.4g} %'
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:
@@ -216,48 +228,9 @@ def share(trials: Sequence[Trial], verdict: str) -> float:
     return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
 
 
-def _grid_dict(grid: GridCheck) -> dict[str, Any]:
-    return {
-        'headings': grid.headings, 'spacing_m': grid.spacing_m,
-        'accepted_positions_near_recording': grid.accepted_positions,
-        'verdicts': count_verdicts(grid.trials),
-        'positions': [{'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
-                       'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
-                      for row, near, accepted, misled, visible in zip(
-                          grid.positions.round(3).tolist(), grid.is_near, grid.accepted,
-                          grid.misled, grid.visible, strict=True)],
-        'misled': [_trial_dict(one) for one in grid.trials if one.verdict == 'misled']}
-
-
-def _recording_dict(recording: RecordingCheck) -> dict[str, Any]:
-    return {
-        'frames': recording.frames, 'boxes': recording.boxes,
-        'duration_s': recording.duration_s, 'as_given': asdict(recording.as_given),
-        'held_out': asdict(recording.held_out), 'folds': [asdict(one) for one in recording.folds],
-        'edge_scale': recording.edge_scale, 'verdicts': count_verdicts(recording.trials),
-        'verdicts_with_simulated_boxes': count_verdicts(recording.simulated),
-        'corrections': [asdict(one) for one in recording.corrections],
-        'trials': [_trial_dict(one) for one in recording.trials]}
-
-
-def _trial_dict(trial: Trial) -> dict[str, Any]:
-    return {
-        'verdict': trial.verdict, 'stamp_s': trial.stamp_s,
-        'position': trial.position.round(4).tolist(), 'forward': trial.forward.round(4).tolist(),
-        'detections': trial.detections, 'landmarks': trial.landmarks,
-        'estimate': None if trial.estimate is None else trial.estimate.round(4).tolist(),
-        'error_m': trial.error_m, 'reason': trial.reason}
-
-
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
-    """Return what keyframes reach.
-
-    Parameters
-    ----------
-    recorded : ndarray (F, 4, 4), optional
-        Poses map_from_camera of a recording.
-    """
+    """Return what keyframes reach; recorded (F, 4, 4) has the poses of a recording."""
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
     reached = in_reach(layer, np.array([one.position for one in grid.trials]),
                        np.array([one.forward for one in grid.trials]))
@@ -270,10 +243,7 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
              forward: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which views (n,) have a keyframe within reach.
 
-    Parameters
-    ----------
-    positions, forward : ndarray (n, 3)
-        Of the cameras: where they are [m], and the unit vectors along which they look.
+    Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """
     places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
     found = np.zeros(len(positions), dtype=np.bool_)
