@@ -16,7 +16,7 @@ from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.errors import ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
 from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import MountCorrection
 from cliploc_ros.mapping.update.renewal import UpdateReport
@@ -178,7 +178,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
     if options.pose_errors is None and options.estimate_pose_errors:
         options = replace(options, pose_errors=_USUAL_NOISE)
-    updated = update_landmarks(old, detections, UpdateOptions(mapping=options), old_embeddings)
+    updated = update_landmarks(old, detections, options, old_embeddings)
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):
         return MadeMap(landmark_map, updated.report, updated.embeddings)

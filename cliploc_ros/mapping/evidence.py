@@ -12,10 +12,9 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps, ious_with
 from cliploc_ros.mapping.fitting import LANDMARK_SIZE, accumulate
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, project_box
+from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, is_in_image, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
-from cliploc_ros.simulation.detector import SHOWN_SHARE
 
 #: A landmark is expected from no farther away than this times the greatest distance at which it
 #: was detected.
@@ -112,19 +111,15 @@ def widest_angle_deg(directions: NDArray[np.float64]) -> float:
 def is_expected(views, cameras, center, basis, reach):
     """Return the frames (F,) that show an ellipsoid, from no farther away than reach [m]."""
     expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
-    left, top, right, bottom = views.bounds
     for frame in range(len(cameras)):
         distance_2 = 0.0
         for i in range(3):
             distance_2 += (center[i] - cameras[frame, i]) ** 2
         if distance_2 > reach * reach:
             continue
-        if not project_box(views.rotations[frame], views.translations[frame], center, basis, box):
-            continue
-        width = min(box[2], right) - max(box[0], left)
-        height = min(box[3], bottom) - max(box[1], top)
-        expected[frame] = width > 0.0 and height > 0.0 and width * height > (
-            SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
+        expected[frame] = project_box(
+            views.rotations[frame], views.translations[frame], center, basis, box
+        ) and is_in_image(box, views.bounds)
     return expected
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The box of an ellipsoid in an image, and how it moves with the ellipsoid and the camera.
+"""Landmarks while a map is built: ellipsoids, their boxes in images, and derivatives of these.
 
 An ellipsoid is its centre c and a basis B (3, 3) whose columns are its semi-axes, so that its
 shape matrix is S = B B^T. In the camera, p = R c + t and G = R B, N = G G^T. Its outline's
@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.simulation.detector import SHOWN_SHARE
 
 #: Numbers of a landmark: centre, then the upper triangle of D, row by row.
 LANDMARK_SIZE = 9
@@ -138,6 +139,15 @@ def _chain(rotation, p, g, axis, by_p, by_n, by_landmark, by_pose):
     by_pose[across] += turn * (2.0 * by_n[0] * naz + by_n[1] * (nzz - naa) - 2.0 * by_n[2] * naz)
     by_pose[own] += turn * (by_n[1] * nab + 2.0 * by_n[2] * nbz)
     by_pose[5] += turn * (-2.0 * by_n[0] * nab - by_n[1] * nbz)
+
+
+@compiled
+def is_in_image(box, bounds):
+    """Tell whether an image shows enough of a box (4,) for a detector."""
+    width = min(box[2], bounds[2]) - max(box[0], bounds[0])
+    height = min(box[3], bounds[3]) - max(box[1], bounds[1])
+    return width > 0.0 and height > 0.0 and width * height > (
+        SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
 
 
 @compiled

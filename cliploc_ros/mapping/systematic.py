@@ -179,17 +179,18 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
     """Yield the numbers of a cause that fit best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
-    cost_before = cost = _cost_of(linearize_boxes(views, rows, numbers, landmarks))
+    linear = linearize_boxes(views, rows, numbers, landmarks)
+    cost_before = cost = _cost_of(linear)
     for _ in range(_STEPS):
-        linear = linearize_boxes(views, rows, numbers, landmarks)
         step, deviations = _solve(cause.differentiate(views, rows, linear), linear, numbers,
                                   viewpoints)
         moved = cause.apply(given, values + step)
         refitted = _refit(moved, landmarks, rows, numbers)
-        trial_cost = _cost_of(linearize_boxes(moved, rows, numbers, refitted))
-        if trial_cost >= cost:
+        trial = linearize_boxes(moved, rows, numbers, refitted)
+        if _cost_of(trial) >= cost:
             break
-        values, views, landmarks, cost = values + step, moved, refitted, trial_cost
+        values, views, landmarks, linear = values + step, moved, refitted, trial
+        cost = _cost_of(linear)
         if (np.abs(step) < 0.2 * deviations).all():
             break
     explained = max(0.0, 1.0 - cost / max(cost_before, 1e-12))
@@ -327,33 +328,30 @@ def refine_mount(given: Views, landmarks: Landmarks, shown: NDArray[np.int64], s
     values = np.concatenate([start.translations[0] - turn @ given.translations[0],
                              Rotation.from_matrix(turn).as_rotvec()])
 
-    def cost_at(views: Views, landmarks: Landmarks, values: NDArray[np.float64]) -> float:
+    def cost_of(linear: Linear, values: NDArray[np.float64]) -> float:
         # the prior's cost on the scale of _cost_of, whose residuals have LOSS_SCALE
-        return (_cost_of(linearize_boxes(views, rows, numbers, landmarks))
-                + float((weights * values ** 2).sum()) / LOSS_SCALE ** 2)
+        return _cost_of(linear) + float((weights * values ** 2).sum()) / LOSS_SCALE ** 2
 
-    def equations(views: Views, landmarks: Landmarks
-                  ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def equations() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return information (6, 6), and the gradients of single viewpoints."""
-        linear = linearize_boxes(views, rows, numbers, landmarks)
         free, residuals = _without_landmarks(linear.by_pose, linear, numbers)
         gradients = np.zeros((viewpoints.max() + 1, 6))
         np.add.at(gradients, viewpoints,
                   np.einsum('meg,me->mg', free, linear.weights * residuals))
         return np.einsum('meg,me,meh->gh', free, linear.weights, free), gradients
 
-    cost = cost_at(views, landmarks, values)
+    linear = linearize_boxes(views, rows, numbers, landmarks)
     for _ in range(_MOUNT_STEPS):
-        information, gradients = equations(views, landmarks)
+        information, gradients = equations()
         trial = values - np.linalg.solve(information + np.diag(weights),
                                          gradients.sum(axis=0) + weights * values)
         moved = _move_map(given, np.tile(trial, (len(given.rotations), 1)))
         refitted = _refit(moved, landmarks, rows, numbers)
-        trial_cost = cost_at(moved, refitted, trial)
-        if trial_cost >= cost:
+        trial_linear = linearize_boxes(moved, rows, numbers, refitted)
+        if cost_of(trial_linear, trial) >= cost_of(linear, values):
             break
-        values, views, landmarks, cost = trial, moved, refitted, trial_cost
-    information, gradients = equations(views, landmarks)
+        values, views, landmarks, linear = trial, moved, refitted, trial_linear
+    information, gradients = equations()
     inverse = np.linalg.inv(information + np.diag(weights))
     deviations = np.sqrt(np.diag(inverse @ (gradients.T @ gradients + np.diag(weights))
                                  @ inverse))

@@ -62,34 +62,28 @@ class Views(NamedTuple):
 def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
     """Return what the kernels read of posed detections."""
     camera = detections.camera
-    boxes_px, is_open, bounds_px = _at_border(detections, options.border_px)
+    boxes_px, is_open = detections.bboxes_xyxy, detections.open_edges
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    bounds_px = np.concatenate([[0.0, 0.0], size])
+    if is_open is None:
+        boxes_px = np.clip(boxes_px, 0.0, np.tile(size, 2))
+        is_open = np.hstack([boxes_px[:, :2] <= options.border_px,
+                             boxes_px[:, 2:] >= size - options.border_px])
+    else:
+        reach = np.concatenate([boxes_px[:, :2].min(axis=0, initial=np.inf),
+                                boxes_px[:, 2:].max(axis=0, initial=-np.inf)])
+        bounds_px = np.where(is_open.any(axis=0), reach, bounds_px)
     focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
     principal = np.array([camera.cx, camera.cy, camera.cx, camera.cy])
     extents_px = np.tile(boxes_px[:, 2:] - boxes_px[:, :2], 2)
     deviations_px = np.hypot(options.edge_sigma_px, options.edge_sigma_share * extents_px)
-    rotations, translations = camera_from_map(detections.map_from_camera)
     viewpoints = number_viewpoints(detections.map_from_camera)
     return Views(
-        rotations, translations, np.ascontiguousarray(detections.stamps_s, dtype=np.float64),
-        viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints], detections.frame_offsets,
-        detections.frames, detections.classes, (boxes_px - principal) / focal,
-        focal / deviations_px, is_open,
+        *camera_from_map(detections.map_from_camera),
+        np.ascontiguousarray(detections.stamps_s, dtype=np.float64), viewpoints,
+        1.0 / np.bincount(viewpoints)[viewpoints], detections.frame_offsets, detections.frames,
+        detections.classes, (boxes_px - principal) / focal, focal / deviations_px, is_open,
         (bounds_px - principal) / focal, np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
-
-
-def _at_border(detections: PosedDetections, border_px: float
-               ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
-    """Return boxes (n, 4) [px], their open edges (n, 4), and the border (4,) of the image."""
-    boxes, is_open = detections.bboxes_xyxy, detections.open_edges
-    size = np.array([detections.camera.width, detections.camera.height], dtype=np.float64)
-    border = np.concatenate([[0.0, 0.0], size])
-    if is_open is None:
-        boxes = np.clip(boxes, 0.0, np.tile(size, 2))
-        return boxes, np.hstack([boxes[:, :2] <= border_px, boxes[:, 2:] >= size - border_px]
-                                ), border
-    reach = np.concatenate([boxes[:, :2].min(axis=0, initial=np.inf),
-                            boxes[:, 2:].max(axis=0, initial=-np.inf)])
-    return boxes, is_open, np.where(is_open.any(axis=0), reach, border)
 
 
 def camera_from_map(map_from_camera: NDArray[np.float64]
@@ -157,8 +151,16 @@ def check_input(detections: PosedDetections, views: Views, options: MappingOptio
         raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
                            f'{options.min_viewpoints} are needed; move it around the objects, and '
                            'check that the poses are those of the images')
-    notes = []
-    if jumps := _jumps(detections):
+    # the pose moves faster than any camera does
+    poses, stamps = detections.map_from_camera, detections.stamps_s
+    seconds = np.maximum(np.diff(stamps), 1e-3)
+    distances = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    traces = np.einsum('fij,fij->f', poses[1:, :3, :3], poses[:-1, :3, :3])
+    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+    far = (distances > _LEAST_JUMP_M) & (distances > _MAX_SPEED_M_PER_S * seconds)
+    far |= (angles > _LEAST_JUMP_DEG) & (angles > _MAX_TURN_DEG_PER_S * seconds)
+    jumps, notes = stamps[1:][far], []
+    if len(jumps):
         notes.append(f'the poses jump {len(jumps)} times, first at {jumps[0]:.2f} s; check the '
                      'localization that they come from')
     empty = float(np.mean(np.diff(detections.frame_offsets) == 0))
@@ -168,15 +170,3 @@ def check_input(detections: PosedDetections, views: Views, options: MappingOptio
         notes.append(f"all boxes are of the class '{detections.class_names[0]}'; maps with more "
                      'classes relocalize better')
     return notes
-
-
-def _jumps(detections: PosedDetections) -> list[float]:
-    """Return the times [s] at which the pose moves faster than any camera does."""
-    poses, stamps = detections.map_from_camera, detections.stamps_s
-    seconds = np.maximum(np.diff(stamps), 1e-3)
-    distances = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    traces = np.einsum('fij,fij->f', poses[1:, :3, :3], poses[:-1, :3, :3])
-    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
-    far = (distances > _LEAST_JUMP_M) & (distances > _MAX_SPEED_M_PER_S * seconds)
-    far |= (angles > _LEAST_JUMP_DEG) & (angles > _MAX_TURN_DEG_PER_S * seconds)
-    return [float(stamp) for stamp in stamps[1:][far]]

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around
+from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around, without
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
@@ -17,6 +16,7 @@ from cliploc_ros.make_map import find_labeller, make_map, update_map
 from cliploc_ros.mapping.building import _windows, build_map
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.views import make_views, number_viewpoints, thin_out
+from studies.speed.pose_errors import disturb, draw_errors
 
 
 def test_every_landmark_is_found_where_it_is():
@@ -59,58 +59,38 @@ def test_equal_seed_and_input_give_an_equal_map():
 
 def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():
     poses = walk_around(frames=12, turn_deg=12.0)
-    with pytest.raises(MappingError, match=r'good enough.*one side only: [\d.]+ degrees, not 20'):
-        build_map(see(make_table(), poses))
+    for options in (None, MappingOptions(refine_mount=True)):
+        with pytest.raises(MappingError, match=r'good enough.*one side only: [\d.]+ degrees, no'):
+            build_map(see(make_table(), poses), options)
     eager = MappingOptions(min_baseline_deg=8.0, max_position_sigma_m=1.0)
     built = build_map(see(make_table(), poses), eager)
     assert nearest_errors(built.landmark_map, make_table()).max() < 0.05
 
 
 def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
-    table, poses = make_table(), walk_around(frames=120)
-    rare = see(table, poses)
-    cup = np.argmin(np.linalg.norm(table.centers - table.centers[2], axis=1))
-    start = np.array([frame for frame in range(len(poses)) if frame < 30])
-    without = see(replace(table, landmark_ids=table.landmark_ids[:2] + table.landmark_ids[3:],
-                          labels=table.labels[:2] + table.labels[3:],
-                          class_ids=table.class_ids[:2] + table.class_ids[3:],
-                          centers=np.delete(table.centers, cup, 0),
-                          semi_axes=np.delete(table.semi_axes, cup, 0),
-                          quats_xyzw=np.delete(table.quats_xyzw, cup, 0)), poses)
-    first = rare.select_frames(start)
-    rest = without.select_frames(np.arange(30, 120))
+    table, poses, taken = make_table(), walk_around(frames=120), 2
+    seen = see(table, poses)
+    later = see(without(table, taken), poses)
+    first, rest = seen.select_boxes(seen.frames < 30), later.select_boxes(later.frames >= 30)
     both = replace(
-        rare, frame_offsets=np.concatenate([first.frame_offsets,
-                                            first.frame_offsets[-1] + rest.frame_offsets[1:]]),
-        bboxes_xyxy=np.concatenate([first.bboxes_xyxy, rest.bboxes_xyxy]),
-        classes=np.concatenate([first.classes, rest.classes]),
-        scores=np.concatenate([first.scores, rest.scores]))
+        seen, frame_offsets=first.frame_offsets + rest.frame_offsets,
+        **{name: np.concatenate([getattr(first, name), getattr(rest, name)])
+           for name in ('bboxes_xyxy', 'classes', 'scores')})
     built = build_map(both, MappingOptions(min_seen_ratio=0.4))
     assert len(built.landmark_map) == len(table) - 1
     (left_out,) = built.report.left_out
-    assert left_out.class_id == table.class_ids[cup]
-    assert left_out.center == pytest.approx(table.centers[cup], abs=0.02)
+    assert left_out.class_id == table.class_ids[taken]
+    assert left_out.center == pytest.approx(table.centers[taken], abs=0.02)
     assert 'rarely detected, or moved' in left_out.reason
     assert built.report.lines()[-2] == 'left out: 1'
 
 
-def slow_errors(count, sigma_m, sigma_deg, seed=1):
-    """Return pose errors (F, 6) that change over about three seconds."""
-    rng = np.random.default_rng(seed)
-    errors, keep = np.zeros((count, 6)), np.exp(-0.2 / 3.0)
-    for frame in range(count):
-        errors[frame] = (keep * errors[frame - 1] + np.sqrt(1 - keep**2) * rng.normal(size=6)
-                         if frame else rng.normal(size=6))
-    return errors * np.repeat([sigma_m, np.radians(sigma_deg)], 3)
-
-
 def test_joint_refinement_corrects_poses_and_landmarks():
     table, poses = make_table(), walk_around(frames=150)
-    errors = slow_errors(len(poses), 0.05, 1.0)
-    wrong = poses.copy()
-    wrong[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
-    wrong[:, :3, 3] += errors[:, :3]
-    detections = see(table, poses, noise_px=2.0).with_poses(wrong)
+    seen = see(table, poses, noise_px=2.0)
+    errors = draw_errors('correlated', seen.stamps_s, PoseErrors(0.05, 1.0, 3.0),
+                         np.random.default_rng(1))
+    detections = disturb(seen, errors)
     plain = build_map(detections)
     joint = build_map(detections, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
 
@@ -152,9 +132,8 @@ def test_objects_behind_one_another_do_not_confuse_it():
     (lambda one: one.select_frames([3]), 'took 1 viewpoints, at least 3 are needed; move it'),
     (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
      'check that the poses are those of the images'),
-    (lambda one: replace(one, frame_offsets=np.zeros(len(one) + 1, dtype=np.int64),
-                         bboxes_xyxy=np.empty((0, 4)), classes=np.empty(0, dtype=np.int64),
-                         scores=np.empty(0)), 'have no detections; check the detector'),
+    (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
+     'have no detections; check the detector'),
     # a base whose x axis looks forward instead of the camera's z
     (lambda one: one.with_poses(one.map_from_camera @ np.array(
         [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
@@ -235,16 +214,6 @@ def test_one_object_under_two_names_becomes_class_weights():
 ])
 def test_windows_cover_every_frame(stamps_s, expected):
     assert _windows(np.array(stamps_s)) == expected
-
-
-def test_a_window_holds_the_frames_of_its_time():
-    views = make_views(see(make_table(), walk_around(30)), MappingOptions())
-    part = views.between(10, 20)
-    assert len(part.rotations) == len(part.stamps_s) == 10
-    assert (part.rotations[0] == views.rotations[10]).all()
-    assert (part.offsets[0], part.offsets[-1]) == (0, len(part.frames))
-    assert (part.frames.min(), part.frames.max()) == (0, 9)
-    assert (part.edges == views.edges[views.offsets[10]:views.offsets[20]]).all()
 
 
 def test_a_camera_that_stands_still_gives_few_frames():

@@ -49,14 +49,26 @@ def linked(truth, disturbed):
 
 
 def moved_odometry(detections, change):
-    """Return the detections after a function has changed their odometry in place."""
-    poses = detections.odom_from_camera.copy()
-    change(poses)
-    return replace(detections, odom_from_camera=poses)
+    """Return the detections with their odometry changed by a function of the poses."""
+    return replace(detections, odom_from_camera=change(detections.odom_from_camera.copy()))
 
 
-def slip(poses):
-    poses[60:, :3, 3] += [0.3, 0.2, 0.0]
+def slip(poses, way_m=(0.3, 0.2, 0.0)):
+    poses[60:, :3, 3] += way_m
+    return poses
+
+
+def lose(poses, frames=slice(None, None, 3)):
+    poses[frames] = np.nan
+    return poses
+
+
+def scaled(factor):
+    def change(poses):
+        poses[:, :3, 3] *= factor
+        return poses
+
+    return change
 
 
 def note_on(built):
@@ -122,44 +134,19 @@ def test_a_slip_is_left_out(truth, linked, without):
 
 
 def test_a_slip_that_the_poses_hide_does_little_harm(truth, linked, without):
-    def slip_a_little(poses):
-        poses[60:, :3, 3] += [0.05, 0.05, 0.0]
-
-    built = build_map(moved_odometry(linked, slip_a_little), OPTIONS)
+    built = build_map(moved_odometry(linked, lambda poses: slip(poses, (0.05, 0.05, 0.0))),
+                      OPTIONS)
     assert note_on(built) == 'odometry joins 119 of 119 pairs of frames'
     assert pose_error_m(built, truth) < pose_error_m(without, truth)
 
 
-def millimetres(poses):
-    poses[:, :3, 3] *= 1000.0
-
-
-def half_as_far(poses):
-    poses[:, :3, 3] *= 0.5
-
-
-def a_fourth_too_far(poses):
-    poses[:, :3, 3] *= 1.25
-
-
-def standing(poses):
-    poses[:] = np.eye(4)
-
-
-def two_seconds_late(poses):
-    poses[10:] = poses[:-10].copy()
-
-
-def another_camera(poses):
-    poses @= look_at(np.array([1.0, 0.0, 0.8]))
-
-
-def huge(poses):
-    poses[:, :3, 3] *= 1e300
-
-
 @pytest.mark.parametrize('change', [
-    millimetres, half_as_far, a_fourth_too_far, standing, two_seconds_late, another_camera, huge])
+    scaled(1000.0), scaled(0.5), scaled(1.25), scaled(1e300),
+    lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
+    lambda poses: np.concatenate([poses[:10], poses[:-10]]),
+    lambda poses: poses @ look_at(np.array([1.0, 0.0, 0.8])),
+], ids=['millimetres', 'half as far', 'a fourth too far', 'huge', 'standing', 'two seconds late',
+        'another camera'])
 def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
     built = build_map(moved_odometry(linked, change), OPTIONS)
     assert 'odometry is left out: it contradicts the poses in ' in note_on(built)
@@ -167,16 +154,9 @@ def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change
 
 
 def test_frames_without_odometry_are_not_joined(linked, without):
-    def lose(poses):
-        poses[::3] = np.nan
-
     built = build_map(moved_odometry(linked, lose), OPTIONS)
     assert note_on(built) == 'odometry joins 40 of 119 pairs of frames'
-
-    def lose_all(poses):
-        poses[:] = np.nan
-
-    built = build_map(moved_odometry(linked, lose_all), OPTIONS)
+    built = build_map(moved_odometry(linked, lambda poses: lose(poses, slice(None))), OPTIONS)
     assert note_on(built) == 'odometry is left out: no two successive frames have it'
     assert (built.landmark_map.centers == without.landmark_map.centers).all()
 

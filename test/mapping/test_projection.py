@@ -47,23 +47,16 @@ def test_derivatives_are_those_of_small_steps():
     rotation, translation = CAMERA_FROM_MAP[:3, :3].copy(), CAMERA_FROM_MAP[:3, 3].copy()
     box, by_landmark, by_pose = np.empty(4), np.empty((4, 9)), np.empty((4, 6))
     assert linearize_box(rotation, translation, CENTER, BASIS, box, by_landmark, by_pose)
-    size = 1e-6
-    for i in range(9):
-        ends = []
-        for sign in (1, -1):
-            center, basis, step = np.empty(3), np.empty((3, 3)), np.zeros(9)
-            step[i] = sign * size
-            move_ellipsoid(CENTER, BASIS, step, center, basis)
-            ends.append(box_at(center, basis))
-        assert (ends[0] - ends[1]) / (2 * size) == pytest.approx(by_landmark[:, i], abs=1e-7)
-    for i in range(6):
-        ends = []
-        for sign in (1, -1):
-            step = np.zeros(6)
-            step[i] = sign * size
-            motion = make_transform(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3])
-            ends.append(box_at(CENTER, BASIS, motion @ CAMERA_FROM_MAP))
-        assert (ends[0] - ends[1]) / (2 * size) == pytest.approx(by_pose[:, i], abs=1e-7)
+
+    def box_after(step):
+        """Return the box after a step of the landmark (9,) and of the pose (6,)."""
+        center, basis = np.empty(3), np.empty((3, 3))
+        move_ellipsoid(CENTER, BASIS, step[:9], center, basis)
+        motion = make_transform(Rotation.from_rotvec(step[12:]).as_matrix(), step[9:12])
+        return box_at(center, basis, motion @ CAMERA_FROM_MAP)
+
+    for step, expected in zip(1e-6 * np.eye(15), np.hstack([by_landmark, by_pose]).T, strict=True):
+        assert (box_after(step) - box_after(-step)) / 2e-6 == pytest.approx(expected, abs=1e-7)
 
 
 def test_iou_counts_only_what_lies_in_the_image():

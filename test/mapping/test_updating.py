@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walk import CLASSES, join_maps, look_at, moved, see, walk_around, without
+from walk import CLASSES, join_maps, look_at, moved, see, see_rows, walk_around, without
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors, UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.update.updating import update_map
 
 ENCODER = 'test:0'
@@ -202,8 +202,8 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     detections = see(later, POSES, noise_px=2.0).with_poses(wrong).select_frames(kept)
     with pytest.raises(MappingError, match='give --pose-noise if the poses have errors'):
         update_map(things, detections)
-    joint = update_map(things, detections, UpdateOptions(
-        MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0))))
+    joint = update_map(things, detections,
+                       MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0)))
     assert ids(joint.report.missing) == {'thing_6'}
     assert ids(joint.report.moved) == {'thing_12'}
     assert joint.report.new == ()
@@ -222,14 +222,6 @@ def test_a_recording_of_another_place_is_refused():
         update_map(make_things(), see(others, POSES))
 
 
-def crops(detections, truth, looks, seed=0):
-    """Return detections with embeddings near the look of the object that each box shows."""
-    rng = np.random.default_rng(seed)
-    rows = looks[truth] + rng.normal(scale=0.1, size=(len(truth), looks.shape[1]))
-    return replace(detections, encoder_key=ENCODER, embeddings=(
-        rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16))
-
-
 def unit_rows(count, size=24, seed=0):
     rows = np.random.default_rng(seed).normal(size=(count, size))
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -242,17 +234,12 @@ def embeddings_of(landmark_ids, looks):
 
 
 def seen_with_looks(later, looks):
-    """Return what is seen of things, whose order gives their looks, with embeddings."""
-    detections = see(later, POSES, noise_px=1.0)
-    rows = [row for pose in POSES for row in visible(later, pose)]
-    assert len(rows) == len(detections.classes)
-    return crops(detections, np.array(rows), looks)
-
-
-def visible(things, pose):
-    """Return the rows that `see` sees from a pose."""
-    return [row for row in range(len(things))
-            if len(see(things.select([row]), [pose]).classes)]
+    """Return what is seen of things, with embeddings near the look of each thing."""
+    detections, truth = see_rows(later, POSES, noise_px=1.0)
+    rows = looks[truth] + np.random.default_rng(0).normal(scale=0.1, size=(len(truth),
+                                                                           looks.shape[1]))
+    return replace(detections, encoder_key=ENCODER, embeddings=(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16))
 
 
 @pytest.mark.parametrize('alike', [False, True])

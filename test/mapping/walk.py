@@ -74,9 +74,14 @@ def walk_around(frames=60, turn_deg=300.0, radius=2.2):
 
 def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDetections:
     """Return what a detector sees: boxes with noise, clipped to the image; some are missed."""
+    return see_rows(table, poses, noise_px, missed, seed)[0]
+
+
+def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0):
+    """Return what a detector sees, and the row of the landmark that each box shows."""
     rng = np.random.default_rng(seed)
     size = np.array([640.0, 480.0, 640.0, 480.0])
-    classes, boxes, counts = [], [], []
+    rows, boxes, counts = [], [], [0]
     for pose in poses:
         outlines = project_ellipsoids(invert_transform(pose), table.centers, table.shapes)
         full = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
@@ -85,13 +90,13 @@ def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDet
         seen = (clipped[:, 2:] - clipped[:, :2] > 8.0).all(axis=1)
         seen &= rng.random(len(seen)) >= missed
         boxes.append(clipped[seen])
-        classes += [CLASSES.index(name) for name, one in zip(table.class_ids, seen, strict=True)
-                    if one]
+        rows.append(np.nonzero(seen)[0])
         counts.append(int(seen.sum()))
-    bboxes = np.concatenate(boxes)
+    bboxes, shown = np.concatenate(boxes), np.concatenate(rows)
+    classes = np.array([CLASSES.index(name) for name in table.class_ids], dtype=np.int64)
     return PosedDetections(
-        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum([0, *counts]), bboxes,
-        CLASSES, np.array(classes, dtype=np.int64), np.full(len(bboxes), 0.9))
+        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
+        CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
 def nearest_errors(built: LandmarkMap, table: LandmarkMap):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Each landmark of a map: how well a recording supports it, and what is wrong with it."""
+"""Each landmark of a map: how well a recording supports it, and its faults."""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -21,7 +21,6 @@ from cliploc_ros.mapping.views import Views, camera_centers
 # object, unless they are farther apart than the second distance and frames show both at once.
 # Guesses: build_map merges below 0.8 if the boxes agree.
 _OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
-_MAX_SEEN_APART = 0.15
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
@@ -105,7 +104,7 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
     for first, second, distance in close_pairs(landmarks, _OVERLAP_DISTANCE):
         is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
             distance < _SAME_PLACE_DISTANCE or boxes is None or views is None
-            or seen_apart(views, boxes[first], boxes[second]) <= _MAX_SEEN_APART)
+            or seen_apart(views, boxes[first], boxes[second]) <= MappingOptions.max_seen_apart)
         found.append(Overlap(first, second, distance, bool(is_duplicate)))
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
 

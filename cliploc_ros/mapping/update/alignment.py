@@ -18,12 +18,21 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.joint import Anchors, pose_changes, refine_jointly
+from cliploc_ros.mapping.labelling import classes_of
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
-from cliploc_ros.mapping.options import UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_from_map, map_from_cameras
 
 # A position is known no better than this [m]: objects are no ellipsoids. A guess.
 _LEAST_SIGMA_M = 0.01
+# Deviation of a centre where the map does not say it [m]. A guess.
+_UNKNOWN_SIGMA_M = 0.05
+# An object has moved if it is farther away than all three: [m], in units of its old and new shape
+# (1: they touch), and in standard deviations of both positions. A smaller change is a better fit.
+# Guesses.
+_LEAST_MOVE_M, LEAST_MOVE_SHAPES, LEAST_MOVE_SIGMAS = 0.1, 0.6, 4.0
+#: A recording that confirms fewer landmarks does not belong to the map.
+MIN_CONFIRMED = 3
 _ROUNDS = 4
 # The first association tolerates an offset.
 _LOOSE_IOU = 0.1
@@ -66,19 +75,17 @@ class Known(NamedTuple):
         return once
 
 
-def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...], options: UpdateOptions
-                    ) -> Known:
+def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> Known:
     """Return the landmarks of a map for a recording with some classes."""
     details = old.details or (LandmarkDetails(),) * len(old)
     numbers = {name: number for number, name in enumerate(class_names)}
-    names = [(row, numbers[name]) for row, one in enumerate(details)
-             for name in dict.fromkeys((old.class_ids[row], *dict(one.class_weights or ())))
-             if name in numbers]
+    names = [(row, numbers[name]) for row in range(len(old))
+             for name in classes_of(old, row) if name in numbers]
     owners, classes = np.array(names, dtype=np.int64).reshape(-1, 2).T
     landmarks = landmarks_of_map(old, class_names)
     first = np.full(len(old), -1, dtype=np.int64)
     first[owners[::-1]] = classes[::-1]
-    sigmas = np.array([options.unknown_sigma_m if one.position_sigma is None
+    sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
                        else one.position_sigma for one in details])
     return Known(landmarks._replace(classes=first), np.maximum(sigmas, _LEAST_SIGMA_M), details,
                  Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners)
@@ -135,14 +142,14 @@ class Alignment(NamedTuple):
     change_deg: float
 
 
-def align(given: Views, known: Known, options: UpdateOptions) -> Alignment:
+def align(given: Views, known: Known, options: MappingOptions) -> Alignment:
     """Return the views with poses in the coordinate frame of the old map."""
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
-        min_iou = options.mapping.association_iou if number else _LOOSE_IOU
+        min_iou = options.association_iou if number else _LOOSE_IOU
         found = refit(views, known.landmarks, known.shown(views, min_iou),
-                      options.mapping.min_viewpoints)
-        if np.count_nonzero(found.is_known) < options.min_confirmed:
+                      options.min_viewpoints)
+        if np.count_nonzero(found.is_known) < MIN_CONFIRMED:
             break
         step = _offset(known, found)
         rotations, translations = camera_from_map(step @ map_from_cameras(views))
@@ -184,16 +191,16 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     return step
 
 
-def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:
+def _refine(aligned: Views, known: Known, options: MappingOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
-    views, errors = aligned, options.mapping.pose_errors
+    views, errors = aligned, options.pose_errors
     if errors is None:
         return aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
-    for _ in range(options.mapping.refinements):
-        shown = known.shown(views, options.mapping.association_iou)
-        found = refit(views, known.landmarks, shown, options.mapping.min_viewpoints)
-        away = has_moved(known.landmarks, known.sigmas, found, options)
+    for _ in range(options.refinements):
+        shown = known.shown(views, options.association_iou)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
+        away = has_moved(known.landmarks, known.sigmas, found)
         shown[np.isin(shown, np.nonzero(away)[0])] = -1
         if not (shown >= 0).any():
             return views
@@ -201,17 +208,16 @@ def _refine(aligned: Views, known: Known, options: UpdateOptions) -> Views:
     return views
 
 
-def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits, options: UpdateOptions
-              ) -> NDArray[np.bool_]:
+def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.bool_]:
     """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
     offsets = found.landmarks.centers - old.centers
-    far = found.is_known & (np.linalg.norm(offsets, axis=1) > options.least_move_m)
+    far = found.is_known & (np.linalg.norm(offsets, axis=1) > _LEAST_MOVE_M)
     rows = np.nonzero(far)[0]
     bases, others = old.bases[rows], found.landmarks.bases[rows]
     shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
-    far[rows] = ((_lengths(offsets[rows], shapes) > options.least_move_shapes)
+    far[rows] = ((_lengths(offsets[rows], shapes) > LEAST_MOVE_SHAPES)
                  & (deviations(old.select(rows), sigmas[rows], found.select(rows))
-                    > options.least_move_sigmas))
+                    > LEAST_MOVE_SIGMAS))
     return far
 
 

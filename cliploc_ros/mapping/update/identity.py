@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
-from cliploc_ros.mapping.options import UpdateOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import Known, has_moved
 from cliploc_ros.mapping.update.judging import Judged, Objects
@@ -53,8 +52,8 @@ class Fates(NamedTuple):
     rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
 
 
-def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None',
-                 options: UpdateOptions) -> Fates:
+def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None'
+                 ) -> Fates:
     """Return what became of each old landmark."""
     numbers, rivals = _identify(known, objects, judged.is_gone, looks)
     found = numbers >= 0
@@ -64,7 +63,7 @@ def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks |
     # an object that is a little off its place was only mapped badly
     rows = np.nonzero(elsewhere)[0]
     elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
-                                objects.refits.select(numbers[rows]), options)
+                                objects.refits.select(numbers[rows]))
     missing = ~found & (judged.is_gone | judged.is_there)
     return Fates(
         np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says of each place of a map: its object is there, it is gone, or neither.
+"""Judge each place of a map by a recording: its object is there, it is gone, or neither.
 
 Boxes that no old landmark explains show new objects, which hide old places in turn.
 """
@@ -23,9 +23,9 @@ from cliploc_ros.mapping.landmarks import (
     landmarks_of_map,
     no_landmarks,
 )
-from cliploc_ros.mapping.options import MappingOptions, UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.update.alignment import Known, Refits, has_moved, refit
+from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SHAPES, Known, Refits, has_moved, refit
 from cliploc_ros.mapping.update.sight import Sight, look_for
 from cliploc_ros.mapping.views import Views, map_from_cameras
 
@@ -35,7 +35,20 @@ _RATIO_RANGE = (0.02, 0.95)
 # Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
 # that a usual ratio is worth [views]. Guesses.
 _MEDIAN_SQUARE = 0.455  # of a standard normal variable
-_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_VIEWS = 5, 3, 0.5
+_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
+# Share of the objects that are usually still in their place; of the views in which an object is
+# detected, where neither map nor recording tell; and of those in which a wrong box appears in an
+# empty place. Guesses, as all below.
+_STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
+# The seen ratio is worth this number of views at most: an object may be hard to see from one side.
+_PRIOR_VIEWS = 4.0
+# An object is gone, or there, below and above these probabilities of being there; the second one
+# where another object was found in its place.
+_GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
+#: Its place must be in view from this number of viewpoints before an object can be missing.
+LEAST_VIEWS = 5
+# A new landmark must be detected this often, in units of how often the old ones are.
+_MIN_NEW_SHARE = 0.4
 # Overlaps with which a box is near a landmark, and on it whatever its class. Guesses.
 _NEAR_IOU, _SAME_IOU = 0.02, 0.5
 
@@ -68,60 +81,59 @@ class Judged(NamedTuple):
     is_there: NDArray[np.bool_]  #: (L,): Neither: the recording does not tell
 
 
-def judge(detections: PosedDetections, views: Views, known: Known, options: UpdateOptions
+def judge(detections: PosedDetections, views: Views, known: Known, options: MappingOptions
           ) -> Judged:
     """Return what the recording says of each place of the map, and what else it shows.
 
     The views have poses in the coordinate frame of the map.
     """
-    mapping, count = options.mapping, len(known.landmarks.centers)
-    shown = known.shown(views, mapping.association_iou)
-    refits = refit(views, known.landmarks, shown, mapping.min_viewpoints)
-    displaced = has_moved(known.landmarks, known.sigmas, refits, options)
-    sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_), options)
-    is_gone = displaced | _is_absent(known, sight, options.gone_below, options)
-    finds = _find_new(detections, views, _free(views, known, refits, shown, is_gone), mapping)
-    finds = _with_displaced(finds, refits, shown, displaced, mapping.merge_distance)
+    count = len(known.landmarks.centers)
+    shown = known.shown(views, options.association_iou)
+    refits = refit(views, known.landmarks, shown, options.min_viewpoints)
+    displaced = has_moved(known.landmarks, known.sigmas, refits)
+    sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_))
+    is_gone = displaced | _is_absent(known, sight, _GONE_BELOW)
+    finds = _find_new(detections, views, _free(views, known, refits, shown, is_gone), options)
+    finds = _with_displaced(finds, refits, shown, displaced, options.merge_distance)
     # a new object may be in the place of an old one of which a wrong box remains
     finds = _without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 1.0, options)
-    _, sight = _look(views, known, finds, shown, is_gone, options)
+    _, sight = _look(views, known, finds, shown, is_gone)
     # finds are seen about as often as the old landmarks, which come first
     usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
-    least = options.min_new_share * (float(np.median(usual)) if len(usual) else 1.0)
+    least = _MIN_NEW_SHARE * (float(np.median(usual)) if len(usual) else 1.0)
     finds = finds.select(np.nonzero(sight.seen_ratio[count:] >= least)[0])
     # new objects hide old places
-    _, sight = _look(views, known, finds, shown, is_gone, options)
+    _, sight = _look(views, known, finds, shown, is_gone)
     # an old landmark is hardly there if a find with more boxes is in its place
     of_old, of_new = group_boxes(shown, count), group_boxes(finds.shown, len(finds.details))
-    limits = np.full(count, options.gone_below)
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks, mapping.merge_distance):
+    limits = np.full(count, _GONE_BELOW)
+    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks, options.merge_distance):
         if len(of_new[new]) > len(of_old[row]):
-            limits[row] = options.gone_below_if_taken
-    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits, options)
+            limits[row] = _GONE_BELOW_IF_TAKEN
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
     finds = _without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 0.0, options)
     # objects that are gone hide nothing
-    both, sight = _look(views, known, finds, shown, is_gone, options)
+    both, sight = _look(views, known, finds, shown, is_gone)
     own = sight.select(slice(count))
-    is_gone |= _is_absent(known, own, limits, options)
+    is_gone |= _is_absent(known, own, limits)
     fits = gather_evidence(views, refits.landmarks, _held(shown, is_gone)).median_iou
-    is_there = (~is_gone & (fits >= mapping.min_median_iou)
+    is_there = (~is_gone & (fits >= options.min_median_iou)
                 & (refits.is_known
-                   | (_probability_there(known, own, options) > options.there_above)))
+                   | (_probability_there(known, own) > _THERE_ABOVE)))
     return Judged(both, finds, sight, is_gone, is_there)
 
 
-def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float,
-               options: UpdateOptions) -> NDArray[np.bool_]:
+def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float
+               ) -> NDArray[np.bool_]:
     """Tell which objects (L,) are in their place with less than some probabilities.
 
     A detector that never found a class in this recording may not know it, or not at these sizes.
     """
-    is_told = (known.landmarks.classes >= 0) & (sight.expected >= options.least_views)
-    return np.asarray(is_told & (_probability_there(known, sight, options) < limits))
+    is_told = (known.landmarks.classes >= 0) & (sight.expected >= LEAST_VIEWS)
+    return np.asarray(is_told & (_probability_there(known, sight) < limits))
 
 
-def _probability_there(known: Known, sight: Sight, options: UpdateOptions
-                       ) -> NDArray[np.float64]:
+def _probability_there(known: Known, sight: Sight) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
     The recording should show an object in a usual share of the views: that of the old recording,
@@ -132,7 +144,7 @@ def _probability_there(known: Known, sight: Sight, options: UpdateOptions
     share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
     given = np.array([np.nan if one.seen_ratio is None else one.seen_ratio
                       for one in known.details])
-    ratios = np.where(np.isnan(given), min(options.seen_ratio, share), given)
+    ratios = np.where(np.isnan(given), min(_SEEN_RATIO, share), given)
     told = seen & ~np.isnan(given)
     if told.any():
         expected = float((given[told] * sight.expected[told]).sum())
@@ -141,16 +153,16 @@ def _probability_there(known: Known, sight: Sight, options: UpdateOptions
     ratios = np.clip(ratios, *_RATIO_RANGE)
     # the usual ratios are worth few views if this recording scatters about them: a beta variable
     # of mean r and n views has the variance r (1 - r) / (n + 1)
-    certainty, rows = options.prior_views, seen & (sight.expected >= _FEW_VIEWS)
+    certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
     if np.count_nonzero(rows) >= _FEW_LANDMARKS:
         shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
         # the median, since objects that are gone are no scatter
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_VIEWS,
-                                  options.prior_views))
+        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
+                                  _PRIOR_VIEWS))
     there = _log_evidence(sight, ratios, certainty)
-    away = _log_evidence(sight, np.full(len(ratios), options.chance_ratio), options.prior_views)
-    return np.asarray(expit(np.log(options.stays / (1.0 - options.stays)) + there - away))
+    away = _log_evidence(sight, np.full(len(ratios), _CHANCE_RATIO), _PRIOR_VIEWS)
+    return np.asarray(expit(np.log(_STAYS / (1.0 - _STAYS)) + there - away))
 
 
 def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> NDArray[np.float64]:
@@ -160,13 +172,12 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
 
 
 def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
-          is_gone: NDArray[np.bool_], options: UpdateOptions) -> tuple[NDArray[np.int64], Sight]:
+          is_gone: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Sight]:
     """Return the landmark or find that each box shows, and the sight of all their places."""
     own = _held(shown, is_gone)
     both = np.where((own < 0) & (finds.shown >= 0), len(is_gone) + finds.shown, own)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
-    return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid,
-                          options)
+    return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid)
 
 
 def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -227,7 +238,7 @@ def _with_displaced(finds: Finds, refits: Refits, shown: NDArray[np.int64],
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArray[np.int64],
-                    majority: float, options: UpdateOptions) -> Finds:
+                    majority: float, options: MappingOptions) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
     An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
@@ -237,11 +248,11 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArr
     of_old = group_boxes(old_shown, len(old.centers))
     of_new = group_boxes(finds.shown, len(finds.details))
     is_copy = np.zeros(len(of_new), dtype=np.bool_)
-    for new, row, distance in _pairs_between(finds.landmarks, old, options.mapping.merge_distance):
+    for new, row, distance in _pairs_between(finds.landmarks, old, options.merge_distance):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
         is_copy[new] |= len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
-            (is_one_class and distance < options.least_move_shapes)
-            or seen_apart(views, of_old[row], of_new[new]) <= options.mapping.max_seen_apart)
+            (is_one_class and distance < LEAST_MOVE_SHAPES)
+            or seen_apart(views, of_old[row], of_new[new]) <= options.max_seen_apart)
     return finds.select(np.nonzero(~is_copy)[0])
 
 
@@ -270,7 +281,7 @@ class Objects(NamedTuple):
         return self.refits.landmarks
 
 
-def gather_objects(views: Views, known: Known, judged: Judged, options: UpdateOptions) -> Objects:
+def gather_objects(views: Views, known: Known, judged: Judged, options: MappingOptions) -> Objects:
     """Return the objects that the recording shows."""
     count, finds = len(known.sigmas), judged.finds
     in_place = np.nonzero(judged.is_there)[0]
@@ -279,11 +290,11 @@ def gather_objects(views: Views, known: Known, judged: Judged, options: UpdateOp
     numbers[places] = np.arange(len(places))
     shown = numbers[judged.shown]
     refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
-                   options.mapping.min_viewpoints)
+                   options.min_viewpoints)
     near: list[set[int]] = [set() for _ in places]
     names = known.names
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks,
-                                      options.mapping.merge_distance):
+                                      options.merge_distance):
         if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
             near[len(in_place) + new].add(row)
     return Objects(

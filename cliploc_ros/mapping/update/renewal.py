@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The new map: what stays, what is fitted again, what moves, what is added and what goes.
+"""The new map, and the report on it: landmarks stay, are fitted again, move, come and go.
 
 A landmark keeps its id, labels and classes. In its place, it also keeps its ellipsoid, unless the
 recording knows it better: then the centre is the mean of both, each weighted by its inverse
@@ -19,8 +19,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.building import LeftOut
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
-from cliploc_ros.mapping.options import UpdateOptions
-from cliploc_ros.mapping.update.alignment import Known, deviations
+from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, Known, deviations
 from cliploc_ros.mapping.update.identity import Fates
 from cliploc_ros.mapping.update.judging import Judged, Objects
 from cliploc_ros.mapping.update.sight import Sight
@@ -30,7 +29,7 @@ _ROWS_SHOWN = 40
 
 
 def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates: Fates,
-          class_names: tuple[str, ...], options: UpdateOptions) -> LandmarkMap:
+          class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
@@ -43,7 +42,7 @@ def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates:
         details[row] = _in_place(details[row], objects.sight, evidence, fates.objects[row])
     for row in fates.moved:
         details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
-    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates, options)
+    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates)
     for row, weight in placed.items():
         number = fates.objects[row]
         centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
@@ -68,15 +67,14 @@ def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates:
         tuple(every) if any(one != LandmarkDetails() for one in every) else ())
 
 
-def _refitted(known: Known, objects: Objects, fates: Fates, options: UpdateOptions
-              ) -> dict[int, float]:
+def _refitted(known: Known, objects: Objects, fates: Fates) -> dict[int, float]:
     """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
     rows = np.array([row for row in fates.confirmed
                      if known.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
     refits, old_sigmas = objects.refits.select(fates.objects[rows]), known.sigmas[rows]
     nudged = deviations(known.landmarks.select(rows), old_sigmas, refits
-                        ) > options.least_move_sigmas
+                        ) > LEAST_MOVE_SIGMAS
     weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + refits.sigmas ** 2))
     better = nudged | (refits.sigmas < old_sigmas)
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))

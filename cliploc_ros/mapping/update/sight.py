@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.landmarks import Landmarks, project_box
-from cliploc_ros.mapping.options import UpdateOptions
+from cliploc_ros.mapping.landmarks import Landmarks, is_in_image, project_box
 from cliploc_ros.mapping.views import Views
 
-# Share of a place's box that must lie in the image.
-_SHOWN_SHARE = 0.6
+# A place is in view if the frame shows another landmark this close to its direction, and not
+# nearer: otherwise a wall may hide it. It is out of view if landmarks or boxes hide this share.
+# Guesses.
+_BESIDE_DEG, _HIDDEN_SHARE = 20.0, 0.4
 # A landmark as near as this share of a place's distance is beside the place, not before it.
 _BESIDE_SHARE = 0.8
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
@@ -51,7 +52,7 @@ class Sight(NamedTuple):
 
 
 def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
-             is_solid: NDArray[np.bool_], options: UpdateOptions) -> Sight:
+             is_solid: NDArray[np.bool_]) -> Sight:
     """Return in which frames places were in view, and in which of them their landmark was seen.
 
     Class -1 is one that no box has. Solid places have an object, which may hide others.
@@ -62,7 +63,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
     frames, rows = _in_view(
         views, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6), least,
-        is_solid, shown, np.cos(np.radians(options.beside_deg)), options.hidden_share)
+        is_solid, shown, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
     seen_rows = np.nonzero(shown >= 0)[0]
     seen_keys = np.unique(views.frames[seen_rows] * count + shown[seen_rows])
     keys = np.union1d(frames * count + rows, seen_keys)
@@ -116,8 +117,11 @@ def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, besi
                 was_seen[shown[row]] = True
         for i in range(in_front):
             place = near[i]
-            if distances[place] > reaches[place] or not _is_whole(
-                    boxes[place], views.bounds, least[place]):
+            box = boxes[place]
+            if distances[place] > reaches[place] or not is_in_image(box, views.bounds):
+                continue
+            # large enough to be detected
+            if (box[2] - box[0]) * (box[3] - box[1]) < least[place] * least[place]:
                 continue
             if not _has_beside(place, near[:in_front], was_seen, offsets, distances,
                                beside_cosine):
@@ -161,16 +165,6 @@ def _project_near(rotation, translation, centers, bases, farthest, boxes, offset
         near[count] = place
         count += 1
     return count
-
-
-@compiled
-def _is_whole(box, bounds, least):
-    """Tell whether most of a box is in the image, and the box large enough to be detected."""
-    area = (box[2] - box[0]) * (box[3] - box[1])
-    width = min(box[2], bounds[2]) - max(box[0], bounds[0])
-    height = min(box[3], bounds[3]) - max(box[1], bounds[1])
-    return (width > 0.0 and height > 0.0 and width * height > _SHOWN_SHARE * area
-            and area >= least * least)
 
 
 @compiled

@@ -10,18 +10,30 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import UpdateOptions
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.update.alignment import Alignment, Known, align, known_landmarks
+from cliploc_ros.mapping.update.alignment import (
+    MIN_CONFIRMED,
+    Alignment,
+    Known,
+    align,
+    known_landmarks,
+)
 from cliploc_ros.mapping.update.identity import (
     compare_looks,
     decide_fates,
     renew_embeddings,
     why_not_comparable,
 )
-from cliploc_ros.mapping.update.judging import Judged, gather_objects, judge
+from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judged, gather_objects, judge
 from cliploc_ros.mapping.update.renewal import UpdateReport, describe, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
+
+# A larger offset of the recording's coordinate frame from the map's is noted [m] [deg].
+_LEAST_OFFSET_M, _LEAST_OFFSET_DEG = 0.03, 1.0
+# A recording that confirms a smaller share of the landmarks whose place it shows, or fewer than
+# MIN_CONFIRMED, does not belong to the map. A guess.
+_MIN_CONFIRMED_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -38,7 +50,7 @@ class UpdatedMap:
 
 
 def update_map(old: LandmarkMap, detections: PosedDetections,
-               options: UpdateOptions | None = None,
+               options: MappingOptions | None = None,
                embeddings: LandmarkEmbeddings | None = None) -> UpdatedMap:
     """Update a map with a new recording of its place.
 
@@ -46,6 +58,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     ----------
     detections : PosedDetections
         Of the new recording, with poses in the coordinate frame of the map or nearly so.
+    options : MappingOptions, optional
+        How new landmarks are built; with pose_errors, poses are refined against the map.
     embeddings : LandmarkEmbeddings, optional
         How the old landmarks look. Ignored if another encoder looked at the recording.
 
@@ -55,13 +69,13 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         The recording does not belong to this map, or no map can be made of it; the message says
         what to correct.
     """
-    options = options or UpdateOptions()
-    given = make_views(detections, options.mapping)
-    notes = check_input(detections, given, options.mapping)
-    known = known_landmarks(old, detections.class_names, options)
+    options = options or MappingOptions()
+    given = make_views(detections, options)
+    notes = check_input(detections, given, options)
+    known = known_landmarks(old, detections.class_names)
     aligned = align(given, known, options)
     judged = judge(detections, aligned.views, known, options)
-    _check_belongs(judged, options)
+    _check_belongs(judged)
     objects = gather_objects(aligned.views, known, judged, options)
     unlike = why_not_comparable(embeddings, detections)
     looks = None
@@ -69,9 +83,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         notes.append(f'looks are not compared: {unlike}')
     elif embeddings is not None:
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
-    fates = decide_fates(known, judged, objects, looks, options)
-    updated = renew(old, known, aligned.views, objects, fates, detections.class_names, options)
-    notes += _notes(old, known, aligned, detections, options)
+    fates = decide_fates(known, judged, objects, looks)
+    updated = renew(old, known, aligned.views, objects, fates, detections.class_names)
+    notes += _notes(old, known, aligned, detections)
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints[-1]) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
@@ -88,22 +102,22 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                       renew_embeddings(embeddings, updated.landmark_ids, detections, shown))
 
 
-def _check_belongs(judged: Judged, options: UpdateOptions) -> None:
+def _check_belongs(judged: Judged) -> None:
     """Refuse a recording that shows hardly any of the landmarks in their places."""
     count, there = len(judged.is_there), int(judged.is_there.sum())
-    in_view = int((judged.is_there | (judged.sight.expected[:count] >= options.least_views)).sum())
-    if there < min(options.min_confirmed, count) or there < options.min_confirmed_share * in_view:
+    in_view = int((judged.is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
+    if there < min(MIN_CONFIRMED, count) or there < _MIN_CONFIRMED_SHARE * in_view:
         raise MappingError(
             f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
             'are where the map says; check the map, the coordinate frame of the poses and the '
             'detector, give --pose-noise if the poses have errors, or build a new map')
 
 
-def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections,
-           options: UpdateOptions) -> list[str]:
+def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections
+           ) -> list[str]:
     """Return what the user should know of the input."""
     notes = []
-    if aligned.offset_m > options.least_offset_m or aligned.offset_deg > options.least_offset_deg:
+    if aligned.offset_m > _LEAST_OFFSET_M or aligned.offset_deg > _LEAST_OFFSET_DEG:
         notes.append(f'the poses are {aligned.offset_m * 100:.1f} cm and {aligned.offset_deg:.1f} '
                      'degrees off the map as a whole; this is corrected')
     unseen = sorted({old.class_ids[row] for row in np.nonzero(known.landmarks.classes < 0)[0]})
