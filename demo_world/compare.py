@@ -32,8 +32,9 @@ from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.recording.networks import Look
 from cliploc_ros.recording.recorder import record_every_frame
 from demo_world import train_detector
@@ -41,13 +42,13 @@ from demo_world import train_detector
 
 def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Queries:
     """Run the shipped detector and CLIP on the images of a world, against a map."""
-    detector = YoloDetector(YoloOptions(model=str(ASSETS / 'yolo.pt')))
+    detector = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt')))
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
     encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
     frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
-    return make_queries_of(record_every_frame(frames, Look(detector, encoder)), landmark_map,
-                           labels)
+    recorded = record_every_frame(frames, Look(detector.detect, encoder))
+    return make_queries_of(recorded, landmark_map, labels)
 
 
 def score_detector(sequence: Path) -> float:

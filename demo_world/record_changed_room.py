@@ -29,7 +29,7 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import make_views
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
 
 _ROUNDING = 128
@@ -60,7 +60,7 @@ def _look(walk: Path) -> PosedDetections:
     """Return what the demo's networks say of each image of a walk."""
     clip = ClipOptions(model=str(ASSETS / 'clip.json'),
                        pretrained=str(ASSETS / 'clip.safetensors'))
-    networks = RecordingOptions(YoloOptions(model=str(ASSETS / 'yolo.pt')), clip,
+    networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.pt')), clip,
                                 KeyframeOptions(0.0, 0.0), '')
     return record_once(tum_frames(read_tum(walk), find_camera(None, walk)[0]), networks,
                        walk.with_suffix('.npz')).detections

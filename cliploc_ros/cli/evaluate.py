@@ -16,7 +16,7 @@ from cliploc_ros.cli.sources import (
     add_network_options,
     add_topic_options,
     clip_options,
-    yolo_options,
+    detector_options,
 )
 from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -277,7 +277,7 @@ def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Querie
     from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
 
     frames = _frames(options)
-    yolo, clip = yolo_options(options), clip_options(options)
+    yolo, clip = detector_options(options), clip_options(options)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified])
     recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,

@@ -21,7 +21,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError
-from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.conversions import detections_to_msg
@@ -105,8 +105,8 @@ def read_picture(file: Path | None) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
-def answer(image_rgb: NDArray[np.uint8], detector: YoloDetector | None, localizer: FrameLocalizer,
-           parameters: RelocalizerParameters) -> Request:
+def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
+           localizer: FrameLocalizer, parameters: RelocalizerParameters) -> Request:
     """Answer a request for a picture as the nodes do, and measure it."""
     start = time.monotonic()
     found = _NOTHING if detector is None else detector.detect(image_rgb)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cliploc_ros.datasets.observations import Recorded
     from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.yolo_weights import YoloOptions
+    from cliploc_ros.models.protocols import DetectorOptions
 
 _NS_PER_S = 1_000_000_000
 # Of a recording, these change how its frames are read.
@@ -39,11 +39,11 @@ def add_network_options(group: Any) -> None:
                        help='(%(default)s: OpenVINO on a CPU where it is installed)')
 
 
-def yolo_options(options: argparse.Namespace, **more: Any) -> 'YoloOptions':
+def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptions':
     """Return the detector that the command line names."""
-    from cliploc_ros.models.yolo_weights import YoloOptions
+    from cliploc_ros.models.protocols import DetectorOptions
 
-    return with_detector(YoloOptions(model=options.model, device=options.device,
+    return with_detector(DetectorOptions(model=options.model, device=options.device,
                                      inference=options.inference, **more), options.profile)
 
 
@@ -152,7 +152,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
     clip = clip_options(options) if options.clip else None
-    yolo = yolo_options(options, conf=options.conf)
+    yolo = detector_options(options, conf=options.conf)
     reading = repr([str(getattr(options, name)) for name in _READING])
     return record_once(read_frames(options), RecordingOptions(
         yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,

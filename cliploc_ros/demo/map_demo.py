@@ -32,7 +32,7 @@ from cliploc_ros.evaluation.summary import Summary, summarize
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 
@@ -87,7 +87,7 @@ def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
                        pretrained=str(options.assets / 'clip.safetensors'))
     sequence = read_tum(options.assets / 'sequence')
     print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
-    look = LoadNetworks(YoloOptions(model=str(options.assets / 'yolo.pt')), clip)()
+    look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.pt')), clip)()
     recorded = record_every_frame(
         tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
     method = Method(options.method, options.values.options())

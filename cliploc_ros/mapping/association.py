@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which box shows which landmark: one to one in every frame, by greatest overlap in sum."""
+"""Which box shows which landmark, and which landmarks are one object.
+
+Boxes and landmarks belong together one to one in every frame, by greatest overlap in sum. Two
+landmarks that lie in one another are one object, unless frames show both of them apart. A
+detector may call one object by two names, in different frames or in one.
+"""
 
 from math import sqrt
 from typing import NamedTuple
@@ -183,7 +188,7 @@ def ious_with(views, rows, center, basis):
 def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                      pairs: list[tuple[int, int]], options: MappingOptions
                      ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks left after merging those pairs that are one object, and the boxes'."""
+    """Return the landmarks with those pairs merged that are one object, and shown for these."""
     landmarks, into = merge_pairs(views, landmarks, shown, pairs, options)
     is_kept = into == np.arange(len(into))
     numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-A process of errors holds on to the given poses (Prior). Odometry, where
-there is any, joins successive frames (cliploc_ros.mapping.odometry). Box edges give the same
-residuals as in cliploc_ros.mapping.fitting.
+A process of errors holds on to the given poses (Prior). Odometry, where there is any, joins
+successive frames (cliploc_ros.mapping.odometry). Box edges give the same residuals as in
+cliploc_ros.mapping.fitting.
 
 The normal equations have a block for each landmark, blocks for each pose and its successor, and
-a block for each box, which joins the two. Poses are eliminated: their part is banded. What is
-left for the landmarks is solved by conjugate gradients, so that memory grows with the number of
+a block for each box, which joins the two. Poses are eliminated: their part is banded. The
+rest for the landmarks is solved by conjugate gradients, so that memory grows with the number of
 boxes only (Agarwal et al., "Bundle Adjustment in the Large", ECCV 2010).
 """
 

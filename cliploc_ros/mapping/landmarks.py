@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The box of an ellipsoid in an image, and how it moves with the ellipsoid and the camera.
+"""Landmarks while a map is built: ellipsoids, their boxes in images, and derivatives of these.
 
 An ellipsoid is its centre c and a basis B (3, 3) whose columns are its semi-axes, so that its
 shape matrix is S = B B^T. In the camera, p = R c + t and G = R B, N = G G^T. Its outline's

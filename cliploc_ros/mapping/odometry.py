@@ -9,7 +9,8 @@ the map and centres c_k, it is off in the map's axes by
 
 whose errors are those of a random walk: their variances grow with the way. The loss is Huber's,
 which is convex: given poses with independent errors contradict odometry at first. Where wheels
-slip, its pull is bounded. What contradicts the given poses beyond the errors of both is left out.
+slip, its pull is bounded. Steps that contradict the given poses beyond the errors of both are left
+out.
 """
 
 from typing import NamedTuple

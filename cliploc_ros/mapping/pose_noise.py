@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate from the boxes how far the given poses are off.
+"""Estimate from the boxes how far the given poses are off, and what this leaves in a map.
 
 Errors of a pose move all boxes of a frame together; errors of the detector move each box on its
 own. The estimate maximizes the marginal likelihood of the boxes over the standard deviations of

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What mapping starts from: the detections of many frames, and the pose of each frame."""
+"""The input of mapping: the detections of many frames, and the pose of each frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.devices import resolve_device
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def resolve_profile(profile: str, device: str) -> Profile:
     return PROFILES[profile]
 
 
-def with_detector(options: YoloOptions, profile: str) -> YoloOptions:
+def with_detector(options: DetectorOptions, profile: str) -> DetectorOptions:
     """Return options that name a detector: that of the profile where the model is ''."""
     if options.model:
         return options
@@ -59,3 +59,18 @@ def with_encoder(options: ClipOptions, profile: str) -> ClipOptions:
                        pretrained=options.pretrained or ClipOptions.pretrained)
     chosen = resolve_profile(profile, options.device)
     return replace(options, model=chosen.clip_model, pretrained=chosen.clip_pretrained)
+
+
+def load_detector(options: DetectorOptions) -> ObjectDetector:
+    """Load a detector: the one place that knows which kinds there are.
+
+    Raises
+    ------
+    ModelError
+        The weights are missing or damaged, or are no detection model.
+    OptionsError
+        The device or the inference engine is missing.
+    """
+    from cliploc_ros.models.yolo_detector import YoloDetector
+
+    return YoloDetector(options)

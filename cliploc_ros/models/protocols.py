@@ -1,14 +1,48 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocols of the neural networks."""
+"""What a detector and an encoder have to do, whatever network is inside."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.models.devices import check_run
+
+
+@dataclass(frozen=True)
+class DetectorOptions:
+    """Which detector to load, and how to run it. The names are ultralytics' own.
+
+    OptionsError: for values out of range.
+    """
+
+    #: Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
+    #: ``.pt`` file, which is then downloaded once
+    model: str = 'yolov8x.pt'
+    conf: float = 0.1  #: Least confidence of a detection, 0 to 1
+    iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1
+    imgsz: int = 640  #: The network sees the image with its longer side scaled to this [px]
+    max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
+    device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
+    precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
+    cache_dir: str = ''  #: Folder for downloads and converted networks; '' is the user's cache
+    #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
+    inference: str = 'auto'
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_run(self.precision, self.inference)
+        for name in ('conf', 'iou'):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
+        for name in ('imgsz', 'max_det'):
+            if getattr(self, name) < 1:
+                raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
 
 
 class ImageTextEncoder(Protocol):
@@ -31,5 +65,15 @@ class ImageTextEncoder(Protocol):
 class ObjectDetector(Protocol):
     """Finds the objects in an image."""
 
+    device: str  #: Where the network runs
+    inference: str  #: What runs it, such as 'pytorch'
+    class_names: tuple[str, ...]  #: All classes that it knows
+
+    def configure(self, options: DetectorOptions) -> None:
+        """Change the options, except for model, device and inference."""
+
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
-        """Return the objects in an image (h, w, 3) uint8, boxes in pixels of that image."""
+        """Return the objects in an image (h, w, 3) uint8, the most confident first.
+
+        Boxes are in pixels of that image. ImageError: it has another shape or type, or no pixels.
+        """

@@ -28,8 +28,8 @@ from cliploc_ros.models.openvino_networks import (
     load_network,
     release_pages,
 )
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import (
-    YoloOptions,
     import_ultralytics,
     is_export,
     load_yolo,
@@ -80,7 +80,7 @@ class OpenVinoYolo:
         return np.asarray(rows[:, :6].numpy())
 
 
-def open_export(folder: Path, options: YoloOptions) -> OpenVinoYolo:
+def open_export(folder: Path, options: DetectorOptions) -> OpenVinoYolo:
     """Return the network of a folder that ``yolo export format=openvino`` made.
 
     ModelError: files are missing or damaged, or the network is for another task.
@@ -128,7 +128,7 @@ def _read_metadata(file: Path) -> dict[str, Any]:
         'end2end': bool(read.get('end2end'))}
 
 
-def load_converted(file: Path, options: YoloOptions) -> OpenVinoYolo:
+def load_converted(file: Path, options: DetectorOptions) -> OpenVinoYolo:
     """Return the network of a ``.pt`` file, converted once.
 
     ConversionError: OpenVINO cannot run it as PyTorch does. ModelError: the file is damaged or no
@@ -190,7 +190,7 @@ class YoloDetector:
     when the device or the inference engine is missing.
     """
 
-    def __init__(self, options: YoloOptions) -> None:
+    def __init__(self, options: DetectorOptions) -> None:
         import torch
 
         threads = torch.get_num_threads()
@@ -208,7 +208,7 @@ class YoloDetector:
         # Ultralytics leaves one core free on a CPU, for the whole process.
         torch.set_num_threads(threads)
 
-    def configure(self, options: YoloOptions) -> None:
+    def configure(self, options: DetectorOptions) -> None:
         """Change the options, except for model, device and inference."""
         stride = self._network.stride
         self._settings: dict[str, Any] = {
@@ -228,7 +228,7 @@ class YoloDetector:
             scores=rows[:, 4].astype(np.float64))
 
 
-def _load(options: YoloOptions, device: 'torch.device') -> TorchYolo | OpenVinoYolo:
+def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenVinoYolo:
     """Load the network for the inference engine that the options choose.
 
     With 'auto', PyTorch runs a network that OpenVINO cannot run as PyTorch does.

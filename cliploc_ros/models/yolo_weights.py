@@ -13,50 +13,18 @@ import os
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import check_run
 from cliploc_ros.models.files import check_weights_file, download, first_line
+from cliploc_ros.models.protocols import DetectorOptions
 
 _LEAST_STRIDE = 32
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class YoloOptions:
-    """Which YOLO to load, and how to run it. The names are ultralytics' own.
-
-    OptionsError: for values out of range.
-    """
-
-    #: Path of a ``.pt`` file or of a folder with an OpenVINO export, or the name of a published
-    #: ``.pt`` file, which is then downloaded once
-    model: str = 'yolov8x.pt'
-    conf: float = 0.1  #: Least confidence of a detection, 0 to 1
-    iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1
-    imgsz: int = 640  #: The network sees the image with its longer side scaled to this [px]
-    max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
-    device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
-    precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
-    cache_dir: str = ''  #: Folder for downloads and converted networks; '' is the user's cache
-    #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
-    inference: str = 'auto'
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_run(self.precision, self.inference)
-        for name in ('conf', 'iou'):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
-        for name in ('imgsz', 'max_det'):
-            if getattr(self, name) < 1:
-                raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
 
 
 @cache
@@ -99,7 +67,7 @@ def _is_restricted(ultralytics: Any) -> bool:
             and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
 
 
-def resolve_yolo_weights(options: YoloOptions) -> Path:
+def resolve_yolo_weights(options: DetectorOptions) -> Path:
     """Return the file or folder that the options name; download the file if necessary.
 
     ModelError: when it is missing, damaged or unknown, or the download fails.

@@ -12,9 +12,8 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.models.profiles import with_detector
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.profiles import load_detector, with_detector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage
@@ -32,7 +31,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
 
     def __init__(self) -> None:
         super().__init__('detector', DetectorParameters, RelocalizerParameters)
-        self._detector: YoloDetector | None = None
+        self._detector: ObjectDetector | None = None
         self._newest: LatestOnly[TimedImage] = LatestOnly(self.worker, self._detect)
         self._images = ImageSource(self, self.settings.values.image_transport, self._newest.offer)
         self._published = 0
@@ -52,12 +51,12 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def load(self) -> str:
         """Load the network."""
         parameters = self.settings.snapshot()
-        options = with_detector(yolo_options(parameters), parameters.profile)
-        self._detector = YoloDetector(options)
+        options = with_detector(detector_options(parameters), parameters.profile)
+        self._detector = load_detector(options)
         return f'detector {options.model} ({self._detector.inference})'
 
     @property
-    def detector(self) -> YoloDetector | None:
+    def detector(self) -> ObjectDetector | None:
         """Return the network, None unless it is loaded."""
         return self._detector
 
@@ -110,7 +109,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
         try:
-            self._detector.configure(yolo_options(self.settings.snapshot()))
+            self._detector.configure(detector_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
             times.begin('detection')
             detections = self._detector.detect(pixels)
@@ -128,9 +127,9 @@ class DetectorNode(ManagedNode[DetectorParameters]):
                 self._awaited_since = math.inf
 
 
-def yolo_options(parameters: DetectorParameters) -> YoloOptions:
+def detector_options(parameters: DetectorParameters) -> DetectorOptions:
     """Return the network's options."""
-    return YoloOptions(
+    return DetectorOptions(
         model=parameters.model, conf=parameters.conf, iou=parameters.iou, imgsz=parameters.imgsz,
         max_det=parameters.max_det, device=parameters.device, cache_dir=parameters.cache_dir,
         inference=parameters.inference)

@@ -18,9 +18,8 @@ from cliploc_ros.datasets.frames import RawFrame
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.protocols import ImageTextEncoder, ObjectDetector
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
 
 #: The most detections of an image that are used, as in the relocalizer node.
 MAX_DETECTIONS = 50
@@ -70,7 +69,7 @@ class SeenFrame:
 class LoadNetworks:
     """Loads detector and CLIP in the process that uses them."""
 
-    yolo: YoloOptions
+    yolo: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
     threads: int = 0  #: Of PyTorch on a CPU; 0 leaves its own choice
 
@@ -88,14 +87,15 @@ class LoadNetworks:
             torch.set_num_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return Look(YoloDetector(self.yolo), encoder)
+        return Look(load_detector(self.yolo).detect, encoder)
 
 
 @dataclass(frozen=True)
 class Look:
     """Runs detector and encoder on a raw frame."""
 
-    detector: ObjectDetector
+    #: ObjectDetector.detect, or another function that returns the objects in an image
+    detect: Callable[[NDArray[np.uint8]], Detections]
     encoder: ImageTextEncoder | None = None
 
     def __call__(self, raw: RawFrame) -> SeenFrame:
@@ -110,7 +110,7 @@ class Look:
         camera = frame.camera
         assert frame.map_from_camera is not None
         start = time.perf_counter()
-        detections = self.detector.detect(frame.image_rgb).usable(camera.width, camera.height,
+        detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
                                                                   MAX_DETECTIONS)
         detected = time.perf_counter()
         bboxes, open_edges = _undistorted(detections, camera)

@@ -32,7 +32,7 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -91,7 +91,7 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 class RecordingOptions:
     """How to look at a recording."""
 
-    yolo: YoloOptions
+    yolo: DetectorOptions
     clip: ClipOptions | None  #: None: no embeddings
     keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
     #: Says all else that the frames depend on, such as topics, mount and depth format
@@ -294,7 +294,7 @@ def _camera(seen: SeenFrame) -> Camera:
     return Camera(width, height, fx, fy, cx, cy)
 
 
-def _settings(options: YoloOptions | ClipOptions) -> dict[str, Any]:
+def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change what a network says."""
     return {name: value for name, value in asdict(options).items()
             if name not in ('cache_dir', 'max_batch', 'inference')}

@@ -41,8 +41,8 @@ from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.mapping.building import build_map
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.recording.networks import MAX_DETECTIONS
 from cliploc_ros.recording.networks import Look as Networks
@@ -128,13 +128,14 @@ class Looker:
 
     def __init__(self, folder: Path, model: str) -> None:
         self._folder, self._model = folder, model
-        self._detector: YoloDetector | None = None
+        self._detector: ObjectDetector | None = None
         self._code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
 
     def detect(self, image_rgb: Image) -> Detections:
         """Return the boxes in an image, as an ObjectDetector does."""
         def find() -> Detections:
-            self._detector = self._detector or YoloDetector(YoloOptions(self._model, conf=0.25))
+            self._detector = self._detector or load_detector(
+                DetectorOptions(self._model, conf=0.25))
             return self._detector.detect(image_rgb)
         return Detections(*self._kept(image_rgb, Path(self._model).stem, find))
 
@@ -200,7 +201,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
             raw for raw in place.mapped
             if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
         landmark_map = build_map(
-            record_every_frame(frames, Networks(looker)).detections).landmark_map \
+            record_every_frame(frames, Networks(looker.detect)).detections).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '

@@ -41,9 +41,9 @@ from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory
 from cliploc_ros.models.observer import Observer
-from cliploc_ros.models.profiles import PROFILES
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics
+from cliploc_ros.models.profiles import PROFILES, load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_weights import import_ultralytics
 from studies.speed.startup import write_random_checkpoint
 
 ENGINES = ('pytorch', 'openvino')
@@ -165,7 +165,8 @@ def _serve(engine: str, yolo: str, clip: str, folder: str, *, crops: int, device
     free_memory()
     imports_mib = _resident_mib()
     started = time.perf_counter()
-    detector = YoloDetector(YoloOptions(yolo, device=device, inference=engine, cache_dir=folder))
+    detector = load_detector(
+        DetectorOptions(yolo, device=device, inference=engine, cache_dir=folder))
     model, pretrained, file = json.loads(clip)
     options = ClipOptions(model, pretrained, file, device=device, inference=engine,
                           cache_dir=folder)
@@ -183,7 +184,7 @@ def _serve(engine: str, yolo: str, clip: str, folder: str, *, crops: int, device
 
 def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation]:
     """Return an image of the demo with enough boxes, and what the demo's networks say of it."""
-    detector = YoloDetector(YoloOptions(str(_ASSETS / 'yolo.pt'), inference='pytorch'))
+    detector = load_detector(DetectorOptions(str(_ASSETS / 'yolo.pt'), inference='pytorch'))
     camera, _ = find_camera(None, _ASSETS / 'sequence')
     for file in sorted((_ASSETS / 'sequence' / 'rgb').iterdir()):
         pixels_bgr = cv2.imread(str(file))

@@ -20,7 +20,7 @@ from cliploc_ros.demo import ASSETS
 from cliploc_ros.evaluation.recording import recorded_queries
 from cliploc_ros.models.clip_encoder import embed_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
 
 
@@ -39,7 +39,8 @@ def walk(tmp_path_factory):
         resolve_clip_weights(clip).key, landmark_map.landmark_ids, others.astype(np.float16),
         others[:0].astype(np.float16), np.zeros(len(others) + 1, np.int64)))
     return folder, landmark_map, RecordingOptions(
-        YoloOptions(model=str(ASSETS / 'yolo.pt'), device='cpu'), clip, EVERY_FRAME, 'every 24th')
+        DetectorOptions(model=str(ASSETS / 'yolo.pt'), device='cpu'), clip, EVERY_FRAME,
+        'every 24th')
 
 
 def similarities(walk, compare):

@@ -36,9 +36,9 @@ LOAD_YOLO = """
 import json, sys
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 try:
-    YoloDetector(YoloOptions('yolov8n', device='cpu', cache_dir=sys.argv[1]))
+    YoloDetector(DetectorOptions('yolov8n', device='cpu', cache_dir=sys.argv[1]))
 except ModelError as error:
     print(json.dumps({'error': str(error)}))
 """

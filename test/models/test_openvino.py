@@ -23,8 +23,9 @@ from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions, load_yolo
+from cliploc_ros.models.yolo_weights import load_yolo
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -206,11 +207,11 @@ sys.modules['openvino'] = None  # as where it is not installed
 logging.basicConfig(level=logging.INFO, format='%(levelname)s %(message)s')
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 for _ in range(2):
-    assert YoloDetector(YoloOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
+    assert YoloDetector(DetectorOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
 try:
-    YoloDetector(YoloOptions(sys.argv[1], device='cpu', inference='openvino'))
+    YoloDetector(DetectorOptions(sys.argv[1], device='cpu', inference='openvino'))
 except OptionsError as error:
     print(error)
 """
@@ -229,7 +230,7 @@ def test_without_openvino_pytorch_runs_and_one_line_says_so():
     {'inference': 'tensorrt'}, {'inference': 'openvino', 'precision': 'fp16'}])
 def test_an_impossible_inference_is_refused(change):
     with pytest.raises(OptionsError, match='inference'):
-        YoloDetector(YoloOptions(str(ASSETS / 'yolo.pt'), device='cpu', **change))
+        YoloDetector(DetectorOptions(str(ASSETS / 'yolo.pt'), device='cpu', **change))
 
 
 def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tmp_path, caplog):
@@ -270,7 +271,7 @@ def compare(first: YoloDetector, second: YoloDetector, images: list[np.ndarray])
 
 
 def detector(model: object, cache: Path, **changes) -> YoloDetector:
-    return YoloDetector(YoloOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
+    return YoloDetector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
 
 
 @pytest.mark.parametrize('imgsz', [640, 300])

@@ -8,7 +8,8 @@ import pytest
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import PROFILES, resolve_profile, with_detector, with_encoder
-from cliploc_ros.models.yolo_weights import YoloOptions, import_ultralytics
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_weights import import_ultralytics
 
 UNNAMED = ClipOptions(model='', pretrained='', device='cpu')
 
@@ -26,13 +27,13 @@ def test_published_networks_only():
 def test_a_cpu_is_balanced():
     assert resolve_profile('auto', 'cpu') is PROFILES['balanced']
     assert with_encoder(UNNAMED, 'auto').model == PROFILES['balanced'].clip_model
-    assert with_detector(YoloOptions('', device='cpu'), 'auto').model == 'yolov8m.pt'
+    assert with_detector(DetectorOptions('', device='cpu'), 'auto').model == 'yolov8m.pt'
 
 
 def test_the_paper_is_accurate():
     encoder = with_encoder(UNNAMED, 'accurate')
     assert (encoder.model, encoder.pretrained) == ('ViT-L-14', 'openai')
-    assert with_detector(YoloOptions(''), 'accurate').model == 'yolov8x.pt'
+    assert with_detector(DetectorOptions(''), 'accurate').model == 'yolov8x.pt'
 
 
 @pytest.mark.parametrize(('model', 'pretrained', 'path', 'named'), [
@@ -47,8 +48,8 @@ def test_names_override_a_profile(model, pretrained, path, named):
 
 
 def test_a_named_detector_overrides_a_profile():
-    assert with_detector(YoloOptions('mine.pt', conf=0.3), 'fast') == YoloOptions('mine.pt',
-                                                                                  conf=0.3)
+    mine = DetectorOptions('mine.pt', conf=0.3)
+    assert with_detector(mine, 'fast') == mine
 
 
 def test_an_unknown_profile():

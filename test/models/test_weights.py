@@ -14,8 +14,8 @@ from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.files import fingerprint_file
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
 
 
 def options(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:
@@ -131,23 +131,23 @@ def test_pickled_code_is_never_run(tmp_path, zipped):
     torch.save({'visual.proj': Hostile(proof)}, file, _use_new_zipfile_serialization=zipped)
     assert 'is no checkpoint of CLIP' in refusal(options('ViT-B-32', file, tmp_path))
     with pytest.raises(ModelError, match='is no detection model'):
-        YoloDetector(YoloOptions(str(file), device='cpu'))
+        YoloDetector(DetectorOptions(str(file), device='cpu'))
     assert not proof.exists()
 
 
 def test_where_pickled_code_would_run_only_a_path_is_loaded(shared_data, tmp_path, monkeypatch):
     """A PyTorch before 2.6 lacks this function."""
-    YoloDetector(YoloOptions(str(shared_data / 'weights/yolov8n_coco.pt'), device='cpu'))
+    YoloDetector(DetectorOptions(str(shared_data / 'weights/yolov8n_coco.pt'), device='cpu'))
     monkeypatch.delattr(torch.serialization, 'get_unsafe_globals_in_checkpoint')
     with pytest.raises(ModelError, match='would run code that yolov8n'):
-        YoloDetector(YoloOptions('yolov8n.pt', device='cpu', cache_dir=str(tmp_path)))
+        YoloDetector(DetectorOptions('yolov8n.pt', device='cpu', cache_dir=str(tmp_path)))
 
 
 @pytest.mark.parametrize('loaded_before', [False, True])
 def test_a_detector_is_no_clip(shared_data, tmp_path, loaded_before):
     file = shared_data / 'weights/yolov8n_coco.pt'
     if loaded_before:  # from here on PyTorch unpickles the classes of ultralytics
-        YoloDetector(YoloOptions(str(file), device='cpu'))
+        YoloDetector(DetectorOptions(str(file), device='cpu'))
     text = refusal(options('ViT-B-32', file, tmp_path))
     assert 'is no checkpoint of CLIP' in text and 'ultralytics' in text
 

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from cliploc_ros.errors import ImageError, ModelError, OptionsError
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -28,7 +28,7 @@ def weights(shared_data) -> Path:
 
 @pytest.fixture(scope='session')
 def detector(weights) -> YoloDetector:
-    return YoloDetector(YoloOptions(str(weights), device='cpu'))
+    return YoloDetector(DetectorOptions(str(weights), device='cpu'))
 
 
 @pytest.fixture(scope='session')
@@ -66,13 +66,13 @@ def test_colours_are_not_swapped(detector, office_rgb):
 
 
 def test_options_reach_the_network(weights, office_rgb):
-    few = YoloDetector(YoloOptions(
+    few = YoloDetector(DetectorOptions(
         str(weights), conf=0.5, max_det=3, imgsz=300, device='cpu')).detect(office_rgb)
     assert 0 < len(few) <= 3 and (few.scores >= 0.5).all()
 
 
 def test_half_precision(weights, detector, office_rgb):
-    half = YoloDetector(YoloOptions(str(weights), precision='fp16', device='cpu'))
+    half = YoloDetector(DetectorOptions(str(weights), precision='fp16', device='cpu'))
     assert abs(len(half.detect(office_rgb)) - len(detector.detect(office_rgb))) <= 3
 
 
@@ -96,7 +96,7 @@ def test_bad_image(detector, image):
 
 def test_threads_are_left_alone(weights):
     before = torch.get_num_threads()
-    YoloDetector(YoloOptions(str(weights), device='cpu'))
+    YoloDetector(DetectorOptions(str(weights), device='cpu'))
     assert torch.get_num_threads() == before
 
 
@@ -105,12 +105,12 @@ def test_names_of_files_do_not_matter(weights, office_rgb, tmp_path, name):
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
     shutil.copy(weights, file)
-    assert len(YoloDetector(YoloOptions(str(file), device='cpu')).detect(office_rgb)) > 5
+    assert len(YoloDetector(DetectorOptions(str(file), device='cpu')).detect(office_rgb)) > 5
 
 
 def refusal(file: Path) -> str:
     with pytest.raises(ModelError) as caught:
-        YoloDetector(YoloOptions(str(file), device='cpu'))
+        YoloDetector(DetectorOptions(str(file), device='cpu'))
     message = str(caught.value)
     assert str(file) in message and '\n' not in message and message.isascii()
     return message
@@ -140,7 +140,7 @@ def test_models_for_another_task(detector, tmp_path, task):
 
 def test_unknown_name():
     with pytest.raises(ModelError, match=r'did you mean .*yolov8x\.pt'):
-        YoloDetector(YoloOptions('yolo8x.pt', device='cpu'))
+        YoloDetector(DetectorOptions('yolo8x.pt', device='cpu'))
 
 
 @pytest.mark.parametrize('change', [
@@ -148,7 +148,7 @@ def test_unknown_name():
     {'conf': float('nan')}])
 def test_options_out_of_range(change):
     with pytest.raises(OptionsError, match=next(iter(change))):
-        YoloOptions(**change)
+        DetectorOptions(**change)
 
 
 WATCHED_RUN = """
@@ -165,8 +165,8 @@ sys.addaudithook(watch)
 
 import numpy as np
 from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import YoloOptions
-detector = YoloDetector(YoloOptions(sys.argv[1], device='cpu', cache_dir=sys.argv[2]))
+from cliploc_ros.models.protocols import DetectorOptions
+detector = YoloDetector(DetectorOptions(sys.argv[1], device='cpu', cache_dir=sys.argv[2]))
 assert detector.inference == 'openvino'
 for _ in range(3):
     detector.detect(np.full((480, 640, 3), 99, np.uint8))

@@ -22,7 +22,7 @@ from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.yolo_weights import YoloOptions
+from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import (
     EVERY_FRAME,
     KeyframeFilter,
@@ -91,7 +91,7 @@ def test_the_working_folder_says_nothing_of_a_recording(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = ASSETS / 'sequence'
     frames = Frames(source, 48, lambda wanted: iter(()))
-    options = RecordingOptions(YoloOptions(), ClipOptions())
+    options = RecordingOptions(DetectorOptions(), ClipOptions())
     before = observation_file(frames, options)
     (tmp_path / 'map.yaml').touch()
     os.utime(tmp_path, (1.0, 1.0))

@@ -28,7 +28,7 @@ from cliploc_ros.evaluation.summary import summarize
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.models.yolo_detector import YoloOptions
+from cliploc_ros.models.yolo_detector import DetectorOptions
 from cliploc_ros.recording.networks import LoadNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from cliploc_ros.studio import edits
@@ -124,7 +124,7 @@ def wake_ups(maps):
     sequence = read_tum(ASSETS / 'sequence')
     recorded = record_every_frame(
         tum_frames(sequence, find_camera(None, sequence.folder)[0]),
-        LoadNetworks(YoloOptions(model=str(ASSETS / 'yolo.pt')), clip)())
+        LoadNetworks(DetectorOptions(model=str(ASSETS / 'yolo.pt')), clip)())
     found = {}
     for name, landmark_map in maps.items():
         queries = make_queries_of(recorded, landmark_map,

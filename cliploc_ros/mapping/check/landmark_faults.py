@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Each landmark of a map: how well a recording supports it, and what is wrong with it."""
+"""Each landmark of a map: how well a recording supports it, and its faults."""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalize in recorded frames, with maps fitted to others, and in simulated ones."""
+"""Relocalize in recorded frames, and in simulated ones.
+
+Cross-validation over time: recorded frames are judged with landmarks fitted to other blocks of the
+recording. Simulated frames have the errors of the recording's detector.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says of each place of a map: its object is there, it is gone, or neither.
+"""Judge each place of a map by a recording: its object is there, it is gone, or neither.
 
 Boxes that no old landmark explains show new objects, which hide old places in turn.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The new map: what stays, what is fitted again, what moves, what is added and what goes.
+"""The new map, and the report on it: landmarks stay, are fitted again, move, come and go.
 
 A landmark keeps its id, labels and classes. In its place, it also keeps its ellipsoid, unless the
 recording knows it better: then the centre is the mean of both, each weighted by its inverse
