@@ -178,7 +178,8 @@ def source_stamp(module: str) -> str:
     while waiting:
         if (name := waiting.pop()) not in sources:
             sources[name], imported = _read_source(name)
-            waiting += imported
+            if name != __name__:  # no kernel calls what this module imports
+                waiting += imported
     return _hash(sorted(sources.items()))
 
 
