@@ -5,19 +5,15 @@
 The message objects are those of the rosbags library; their fields have rclpy's names.
 """
 
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.units import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -25,30 +21,6 @@ COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 DETECTIONS = 'vision_msgs/msg/Detection2DArray'
 POSE = 'geometry_msgs/msg/PoseStamped'
-_VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
-                'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
-
-
-@cache
-def typestore() -> Typestore:
-    """Return the types of ROS 2 Jazzy's common interfaces and the seven of vision_msgs.
-
-    All callers share it: do not register types in it.
-    """
-    store = get_typestore(Stores.ROS2_JAZZY)
-    folder = files('cliploc_ros.datasets') / 'vision_msgs' / 'msg'
-    for name in _VISION_MSGS:
-        definition = (folder / f'{name}.msg').read_text(encoding='utf-8')
-        store.register(get_types_from_msg(definition, f'vision_msgs/msg/{name}'))
-    return store
-
-
-def deserialize(data: bytes, msgtype: str, where: str) -> Any:
-    """Return a message of its bytes; DatasetError: they are no such message."""
-    try:
-        return typestore().deserialize_cdr(data, msgtype)
-    except Exception as error:  # the library raises what the bytes happen to cause
-        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error
 
 
 def stamp_ns(message: Any) -> int:

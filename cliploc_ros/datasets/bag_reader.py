@@ -14,7 +14,7 @@ from typing import Any, Self
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos
 from rosbags.rosbag2 import Reader, ReaderError
 
-from cliploc_ros.datasets.bag_messages import deserialize, typestore
+from cliploc_ros.datasets.bag_types import deserialize, typestore
 from cliploc_ros.errors import DatasetError
 
 

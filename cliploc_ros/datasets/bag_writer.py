@@ -25,7 +25,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
-from cliploc_ros.datasets.bag_messages import typestore
+from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.errors import DatasetError
 
 STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,

@@ -16,12 +16,11 @@ from cliploc_ros.datasets.bag_messages import (
     DETECTIONS,
     IMAGE,
     POSE,
-    deserialize,
     map_from_camera_of,
     pose_message,
-    typestore,
 )
 from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bag_types import deserialize, typestore
 from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.errors import DatasetError
 

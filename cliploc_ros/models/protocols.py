@@ -4,14 +4,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import check_run
+
+if TYPE_CHECKING:  # --help of the programs shows these options, and is fast
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from cliploc_ros.core.observation import Detections
 
 
 @dataclass(frozen=True)
@@ -50,15 +52,15 @@ class ImageTextEncoder(Protocol):
 
     key: str  #: Identifies model and weights: equal keys give equal embeddings
 
-    def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
-                     ) -> NDArray[np.float32]:
+    def encode_crops(self, image_rgb: 'NDArray[np.uint8]', bboxes_xyxy: 'NDArray[np.float64]'
+                     ) -> 'NDArray[np.float32]':
         """Return one embedding for each box of an image (h, w, 3) uint8, red first.
 
         The boxes (n, 4) are left, top, right, bottom [px]; each must overlap the image. The
         embeddings (n, d) have unit length.
         """
 
-    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
+    def encode_labels(self, labels: Sequence[str]) -> 'NDArray[np.float32]':
         """Return one embedding (L, d) for each of L labels, float32 rows of unit length."""
 
 
@@ -72,7 +74,7 @@ class ObjectDetector(Protocol):
     def configure(self, options: DetectorOptions) -> None:
         """Change the options, except for model, device and inference."""
 
-    def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
+    def detect(self, image_rgb: 'NDArray[np.uint8]') -> 'Detections':
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
         Boxes are in pixels of that image. ImageError: it has another shape or type, or no pixels.

@@ -9,8 +9,9 @@ import jazzy_bags
 import pytest
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 
-from cliploc_ros.datasets.bag_messages import stamp_ns, typestore
+from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.errors import DatasetError
 

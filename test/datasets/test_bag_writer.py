@@ -15,8 +15,8 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_messages import typestore
 from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.bag_writer import LATCHED_QOS, RELIABLE_QOS, BagWriter
 from cliploc_ros.errors import DatasetError
 

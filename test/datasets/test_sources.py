@@ -20,8 +20,8 @@ from cliploc_ros.datasets.bag_frames import (
     pose_sources,
     poses_of_topic,
 )
-from cliploc_ros.datasets.bag_messages import typestore
 from cliploc_ros.datasets.bag_poses import read_transforms
+from cliploc_ros.datasets.bag_types import typestore
 from cliploc_ros.datasets.bag_writer import BagWriter
 from cliploc_ros.datasets.poses import mount_from_numbers
 from cliploc_ros.errors import DatasetError
