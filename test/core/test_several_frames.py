@@ -73,6 +73,19 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     assert [match.landmark for match in found.matches] == shares[-1]
 
 
+@pytest.mark.filterwarnings('error')
+def test_last_frames_without_objects_take_no_confidence(room):
+    """The test for mirror images goes back to frames that show something."""
+    walk = [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(6)]
+    relocalizer = Relocalizer(room, OPTIONS)
+    confidences = [
+        relocalizer.relocalize([see(room, pose, None if step < shown else [])
+                                for step, pose in enumerate(walk)]).confidence
+        for shown in (6, 4, 2)]
+    assert confidences[0] > 0.99
+    assert confidences == pytest.approx([confidences[0]] * 3, abs=1e-3)
+
+
 def test_the_last_frame_is_the_one_asked_about(room, walk):
     relocalizer = Relocalizer(room, OPTIONS)
     frames = [replace(see(room, pose), stamp_ns=number) for number, pose in enumerate(walk)]

@@ -33,15 +33,16 @@ from cliploc_ros.core.search.candidates import match_frame
 
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])
-# Planes that are tried, poses that are refined, and frames that count, the last ones: a camera
-# mirrors them all. Chosen on mirrored images of TUM fr3.
+# Planes that are tried, poses that are refined, and frames with matches that count, the last ones:
+# a camera mirrors them all. Chosen on mirrored images of TUM fr3.
 _MOST_PLANES, _REFINED, _MOST_FRAMES = 16, 2, 3
 
 
 def chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
     """Return the probability that no mirror image explains the detections instead."""
-    joined = join_frames(joined.landmark_map, joined.options, joined.frames[-_MOST_FRAMES:])
-    matches = best.matches[-_MOST_FRAMES:]
+    first = [row for row, found in enumerate(best.matches) if found][-_MOST_FRAMES:][0]
+    joined = join_frames(joined.landmark_map, joined.options, joined.frames[first:])
+    matches = best.matches[first:]
     mirrored = _mirrored(joined)
     centers = joined.landmark_map.centers[
         sorted({one.landmark for found in matches for one in found})]
