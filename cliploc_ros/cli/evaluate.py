@@ -225,7 +225,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
 def _is_case(options: argparse.Namespace) -> bool:
     """Return whether --bag is a recorded request, without ground truth."""
-    from cliploc_ros.datasets.bag_reader import BagReader
+    from cliploc_ros.datasets.bags import BagReader
     from cliploc_ros.datasets.cases import is_case
 
     with BagReader(options.bag) as reader:

@@ -21,7 +21,7 @@ from cliploc_ros.command import (
     running_ros,
     split_ros_args,
 )
-from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from cliploc_ros.command import run_main
-from cliploc_ros.datasets.bag_writer import STORAGES
+from cliploc_ros.datasets.bags import STORAGES
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.tum import read_tum

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_poses import POSE_TYPES, read_pose_topic
-from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
-from cliploc_ros.datasets.bag_types import deserialize
+from cliploc_ros.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.datasets.poses import Poses, check_clock

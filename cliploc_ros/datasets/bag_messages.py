@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.bag_types import typestore
+from cliploc_ros.datasets.bags import typestore
 from cliploc_ros.units import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'

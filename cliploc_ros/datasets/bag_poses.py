@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.datasets.poses import Poses, TimedPoses
 from cliploc_ros.errors import DatasetError
 

@@ -19,9 +19,7 @@ from cliploc_ros.datasets.bag_messages import (
     map_from_camera_of,
     pose_message,
 )
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.bag_types import deserialize, typestore
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagReader, BagWriter, deserialize, typestore
 from cliploc_ros.errors import DatasetError
 
 VERDICT = '/verdict'

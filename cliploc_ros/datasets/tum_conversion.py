@@ -14,7 +14,7 @@ import numpy as np
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagWriter
 from cliploc_ros.datasets.tum import TumSequence
 from cliploc_ros.errors import DatasetError
 

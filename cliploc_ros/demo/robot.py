@@ -18,7 +18,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
+from cliploc_ros.datasets.bags import BagMessage, BagReader
 from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns

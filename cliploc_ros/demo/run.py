@@ -16,7 +16,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import TumSequence, read_tum
 from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum

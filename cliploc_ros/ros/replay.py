@@ -27,7 +27,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosgraph_msgs.msg import Clock
 
 from cliploc_ros.command import Interruption
-from cliploc_ros.datasets.bag_reader import BagMessage, BagReader, BagTopic
+from cliploc_ros.datasets.bags import BagMessage, BagReader, BagTopic
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 

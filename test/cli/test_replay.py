@@ -21,8 +21,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.bag_writer import LATCHED_QOS, BagWriter
+from cliploc_ros.datasets.bags import LATCHED_QOS, BagReader, BagWriter
 from cliploc_ros.datasets.intrinsics import PRESETS
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.tum import read_tum

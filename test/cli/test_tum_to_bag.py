@@ -16,7 +16,7 @@ from executables import PROJECT, SIZE, run, wait_until
 from cliploc_ros.cli.tum_to_bag import main
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_reader import BagReader
+from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.tum import read_tum
 

@@ -10,9 +10,7 @@ import pytest
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 
 from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bag_reader import BagMessage, BagReader
-from cliploc_ros.datasets.bag_types import typestore
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagMessage, BagReader, BagWriter, typestore
 from cliploc_ros.errors import DatasetError
 
 START_NS = 1_700_000_000_123_456_789

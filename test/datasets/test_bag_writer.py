@@ -15,9 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.bag_types import typestore
-from cliploc_ros.datasets.bag_writer import LATCHED_QOS, RELIABLE_QOS, BagWriter
+from cliploc_ros.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter, typestore
 from cliploc_ros.errors import DatasetError
 
 STAMP_NS = 1341847980722988001
@@ -191,7 +189,7 @@ def test_full_disk_leaves_nothing(tmp_path, storage):
         import resource, sys
         import numpy as np
         from cliploc_ros.datasets import bag_messages
-        from cliploc_ros.datasets.bag_writer import BagWriter
+        from cliploc_ros.datasets.bags import BagWriter
         from cliploc_ros.errors import DatasetError
         resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
         try:

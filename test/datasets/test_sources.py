@@ -21,8 +21,7 @@ from cliploc_ros.datasets.bag_frames import (
     poses_of_topic,
 )
 from cliploc_ros.datasets.bag_poses import read_transforms
-from cliploc_ros.datasets.bag_types import typestore
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagWriter, typestore
 from cliploc_ros.datasets.poses import mount_from_numbers
 from cliploc_ros.errors import DatasetError
 

@@ -12,8 +12,7 @@ from std_srvs.srv import Trigger
 from tester import make_frame
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.datasets.bag_reader import BagReader
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagReader, BagWriter
 from cliploc_ros.datasets.cases import read_case
 from cliploc_ros.errors import DatasetError
 

@@ -32,7 +32,7 @@ from cliploc_ros.datasets.bag_messages import (
     compressed_image_message,
     detections_message,
 )
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagWriter
 from cliploc_ros.ros.conversions import stamp_ns
 
 #: So many by default; CLIPLOC_SOAK_REQUESTS=10000 asks for more, in ten minutes.

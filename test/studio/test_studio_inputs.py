@@ -13,7 +13,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
-from cliploc_ros.datasets.bag_writer import BagWriter
+from cliploc_ros.datasets.bags import BagWriter
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.studio.images import open_images
 
