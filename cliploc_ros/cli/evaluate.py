@@ -200,10 +200,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
                 methods: 'Sequence[Method]') -> 'KeyframeLayer | None':
     """Return the layer of the map where a method, the map and the queries can use it.
 
-    Raises
-    ------
-    CliplocError
-        Keyframes are asked for, and cannot be used.
+    CliplocError: keyframes are asked for, and cannot be used.
     """
     from cliploc_ros.core.keyframes.layer import layer_path
 

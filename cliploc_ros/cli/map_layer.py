@@ -36,10 +36,7 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
 def check_layer_options(options: argparse.Namespace) -> None:
     """Refuse a layer that cannot be made, before the work is done.
 
-    Raises
-    ------
-    OptionsError
-        Names the options that do not go together.
+    OptionsError: the message names the options that do not go together.
     """
     if not options.keyframe_layer:
         if options.keyframe_images:
@@ -91,15 +88,12 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
     """Return the layer next to a map; None where there is none, or none is wanted.
 
+    MapError: the layer is wanted, and is missing or bad.
+
     Parameters
     ----------
     wanted : bool, optional
         None: a bad layer is left out with a note, as the relocalizer does.
-
-    Raises
-    ------
-    MapError
-        The layer is wanted, and is missing or bad.
     """
     from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 

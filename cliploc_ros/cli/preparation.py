@@ -55,6 +55,8 @@ class Request:
 def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bool) -> None:
     """Prepare both nodes, whose parameters rclpy got, and print progress and costs.
 
+    CliplocError: the message names the file, parameter or download to mend.
+
     Parameters
     ----------
     picture : Path or None
@@ -63,11 +65,6 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
         The folder to carry; None: the one that the parameters name.
     has_detector : bool
         Whether the robot runs this package's detector.
-
-    Raises
-    ------
-    CliplocError
-        Names the file, parameter or download to mend.
     """
     image_rgb = read_picture(picture)
     used: list[CommonParameters] = []
@@ -93,10 +90,7 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
 def read_picture(file: Path | None) -> NDArray[np.uint8]:
     """Return a picture (h, w, 3) uint8, red first; that of the demo if no file is named.
 
-    Raises
-    ------
-    ImageError
-        The file is no picture.
+    ImageError: the file is no picture.
     """
     file = file or min((ASSETS / 'sequence' / 'rgb').iterdir())
     image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -56,10 +56,7 @@ def make_parser() -> argparse.ArgumentParser:
 def prepare(options: argparse.Namespace) -> int:
     """Load both nodes as they start on the robot, and answer a request; return the exit code.
 
-    Raises
-    ------
-    CliplocError
-        Names the file, parameter or download to mend.
+    CliplocError: the message names the file, parameter or download to mend.
     """
     for file in options.params_file:
         read_parameter_file(file)  # its messages name the line

@@ -82,17 +82,14 @@ def make_parser() -> argparse.ArgumentParser:
 def replay(args: list[str], stop: Interruption) -> int:
     """Publish a recording until its end or until stopped; return the exit code.
 
+    CliplocError: for a recording or an option that cannot be used, or without ROS.
+
     Parameters
     ----------
     args : list of str
         The command line, including the arguments for ROS.
     stop : Interruption
         Ends the replay.
-
-    Raises
-    ------
-    CliplocError
-        For a recording or an option that cannot be used, or without ROS.
     """
     plain_args, ros_args = split_ros_args(args)
     options = make_parser().parse_args(plain_args)

@@ -137,10 +137,7 @@ def _add_network_options(parser: argparse.ArgumentParser) -> None:
 def read_source(options: argparse.Namespace) -> 'Recorded':
     """Return the observations of the source that the command line names.
 
-    Raises
-    ------
-    CliplocError
-        The source, the networks or the options cannot be used.
+    CliplocError: the source, the networks or the options cannot be used.
     """
     from cliploc_ros.datasets.observations import load_recorded
     from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
@@ -167,10 +164,7 @@ def source_of(options: argparse.Namespace) -> Path:
 def read_frames(options: argparse.Namespace) -> 'Frames':
     """Return the images of the source, with their poses; not for --observations.
 
-    Raises
-    ------
-    CliplocError
-        The source or the options cannot be used.
+    CliplocError: the source or the options cannot be used.
     """
     from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames

@@ -100,13 +100,7 @@ def serve(options: argparse.Namespace) -> int:
 
 
 def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocalizer | None]':
-    """Return the running relocalizer where it is asked for.
-
-    Raises
-    ------
-    OptionsError
-        There is no ROS.
-    """
+    """Return the running relocalizer where it is asked for; OptionsError: there is no ROS."""
     if not options.ros:
         return nullcontext()
     try:

@@ -59,10 +59,7 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Inter
             ) -> int:
     """Wake the robot up with the options of the command line; return the exit code.
 
-    Raises
-    ------
-    OptionsError
-        There is no ROS, or it does not start with these arguments.
+    OptionsError: there is no ROS, or it does not start with these arguments.
     """
     with needs_ros('wake_up'):
         from rclpy.exceptions import InvalidServiceNameException

@@ -127,10 +127,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                depth: DepthFormat | None = None) -> Frames:
     """Return the frames of a recording, a rosbag2 folder or file.
 
-    Raises
-    ------
-    DatasetError
-        A topic is missing, of another type, or empty, or the poses are of another time.
+    DatasetError: a topic is missing, of another type, or empty, or the poses are of another time.
     """
     if topics.depth == topics.image:
         raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')

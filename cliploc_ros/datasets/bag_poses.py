@@ -32,10 +32,7 @@ _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 def read_pose_topic(reader: BagReader, name: str) -> TimedPoses:
     """Return the poses of a topic of type PoseStamped, PoseWithCovarianceStamped or Odometry.
 
-    Raises
-    ------
-    DatasetError
-        The topic is missing, of another type, or a pose is invalid.
+    DatasetError: the topic is missing, of another type, or a pose is invalid.
     """
     pose_of = POSE_TYPES.get(reader.topic(name).msgtype)
     if pose_of is None:
@@ -96,17 +93,14 @@ def read_transforms(reader: BagReader, map_frame: str, camera_frame: str, max_ga
                     ) -> TransformChain:
     """Return how a camera moved in a map, from a recording's /tf and /tf_static.
 
+    DatasetError: the recording has no tf, or nothing connects the two frames.
+
     Parameters
     ----------
     map_frame, camera_frame : str
         Coordinate frames; the camera's is the optical one (z forward).
     max_gap_ns : int
         Greatest gap between two samples to interpolate over [ns].
-
-    Raises
-    ------
-    DatasetError
-        The recording has no tf, or nothing connects the two frames.
     """
     topics = [name for name in (TF, TF_STATIC) if name in reader.topics]
     for name in topics:

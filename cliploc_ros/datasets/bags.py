@@ -97,12 +97,8 @@ class BagReader:
     """Reads a rosbag2 folder, or a single .mcap or .db3 file, in order of recording.
 
     A context manager. It streams messages: memory does not grow with the recording. It unpacks
-    compressed files (zstd) into the temporary folder while it is open.
-
-    Raises
-    ------
-    DatasetError
-        On entry, if the recording cannot be read; the message names path and reason.
+    compressed files (zstd) into the temporary folder while it is open. DatasetError: on entry, if
+    the recording cannot be read; the message names path and reason.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -163,10 +159,7 @@ class BagReader:
     def topic(self, name: str) -> BagTopic:
         """Return a topic.
 
-        Raises
-        ------
-        DatasetError
-            If the recording has no topic of that name; the message lists its topics.
+        DatasetError: the recording has no topic of that name; the message lists its topics.
         """
         if name not in self._topics:
             recorded = ', '.join(f'{one.name} ({one.msgtype})' for one in self._topics.values())
@@ -177,17 +170,14 @@ class BagReader:
                  stop_ns: int | None = None) -> Iterator[BagMessage]:
         """Yield messages in the order of their stamps.
 
+        DatasetError: for an unknown topic, or at a damaged part of the recording.
+
         Parameters
         ----------
         topics : collection of str, optional
             Names of topics; all of them by default.
         start_ns, stop_ns : int, optional
             Yield only messages at or after start_ns and before stop_ns [ns].
-
-        Raises
-        ------
-        DatasetError
-            For an unknown topic, or at a damaged part of the recording.
         """
         names = self._topics if topics is None else topics
         connections = self._connections({self.topic(name).name for name in names})
@@ -206,11 +196,8 @@ class BagReader:
     def deserialize(self, message: BagMessage) -> Any:
         """Turn a message's bytes into an object with the fields of its type.
 
-        Raises
-        ------
-        DatasetError
-            If the type is unknown here or was recorded with another definition, or if the
-            bytes do not fit it.
+        DatasetError: the type is unknown here or was recorded with another definition, or if the
+        bytes do not fit it.
         """
         topic = self.topic(message.topic)
         store = typestore()
@@ -262,8 +249,9 @@ class BagReader:
 class BagWriter:
     """Writes a rosbag2 folder as Jazzy does (metadata version 9).
 
-    A context manager. It builds the recording beside its final path and moves it there when it
-    is complete. If the block raises, nothing remains.
+    A context manager. It builds the recording beside its final path and moves it there when it is
+    complete. If the block raises, nothing remains. DatasetError: the path exists or cannot be
+    written, for example because the disk is full.
 
     Parameters
     ----------
@@ -271,11 +259,6 @@ class BagWriter:
         The folder to make. Its parent must exist.
     storage : str
         ``sqlite3`` or ``mcap``.
-
-    Raises
-    ------
-    DatasetError
-        If the path exists or cannot be written, for example because the disk is full.
     """
 
     def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:

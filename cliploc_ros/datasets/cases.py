@@ -43,13 +43,7 @@ class CaseFrame:
     odom_from_camera: NDArray[np.float64] | None = None  #: (4, 4): where odometry placed the frame
 
     def message(self, name: str) -> Any:
-        """Return one of the three messages.
-
-        Raises
-        ------
-        DatasetError
-            Its bytes are no such message.
-        """
+        """Return one of the three messages; DatasetError: its bytes are no such message."""
         msgtype = {'image': self.image_type, 'camera_info': CAMERA_INFO,
                    'detections': DETECTIONS}[name]
         return deserialize(getattr(self, name), msgtype, name)
@@ -66,10 +60,7 @@ class Case:
 def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
     """Write a case as a rosbag2 folder, which must not exist.
 
-    Raises
-    ------
-    DatasetError
-        It cannot be written; nothing remains of it.
+    DatasetError: it cannot be written; nothing remains of it.
     """
     image_type = case.frames[-1].image_type
     image = '/image' if image_type == IMAGE else '/image/compressed'
@@ -104,13 +95,7 @@ def is_case(path: Path) -> bool:
 
 
 def read_case(path: Path) -> Case:
-    """Read a case.
-
-    Raises
-    ------
-    DatasetError
-        Names what is missing or broken.
-    """
+    """Read a case; DatasetError: the message names what is missing or broken."""
     with BagReader(path) as reader:
         topics = [name for name in ('/image', '/image/compressed') if name in reader.topics]
         if not topics:

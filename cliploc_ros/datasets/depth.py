@@ -59,6 +59,8 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
                       ) -> NDArray[np.float32]:
     """Return the depths (h, w) [m] of a decoded depth image, NaN where there is none.
 
+    DatasetError: the image is of another type.
+
     Parameters
     ----------
     counts : ndarray (h, w)
@@ -67,11 +69,6 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
         Metres of one count. None: 1 mm for uint16, 1 m for float.
     where : str
         File or message, for the error.
-
-    Raises
-    ------
-    DatasetError
-        The image is of another type.
     """
     if counts.ndim != 2 or counts.dtype not in (np.uint16, np.float32, np.float64):
         raise DatasetError(f'{where}: is no depth image of 16-bit integers or floats, but '
@@ -158,10 +155,7 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
 def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
     """Refuse depths of boxes that no camera in a room or hall measures.
 
-    Raises
-    ------
-    DatasetError
-        The median is implausible; says how to give the unit.
+    DatasetError: the median is implausible; says how to give the unit.
     """
     known = depths_m[np.isfinite(depths_m)]
     if len(known) == 0:

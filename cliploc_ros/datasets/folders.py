@@ -45,10 +45,7 @@ def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions | N
                ) -> Frames:
     """Return the frames of a TUM folder, taken by one camera; without depth.
 
-    Raises
-    ------
-    DatasetError
-        There are no poses, or they are of another time.
+    DatasetError: there are no poses, or they are of another time.
     """
     files = [ImageFile(stamp, path) for stamp, path in
              zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
@@ -59,10 +56,7 @@ def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions | N
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     """Return the frames of a folder with depth: of 7-Scenes, or TUM RGB-D.
 
-    Raises
-    ------
-    DatasetError
-        The folder has neither layout, or poses and intrinsics are missing.
+    DatasetError: the folder has neither layout, or poses and intrinsics are missing.
     """
     if not folder.is_dir():
         raise DatasetError(f'{folder}: no such folder')

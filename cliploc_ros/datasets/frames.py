@@ -53,10 +53,7 @@ class RawFrame:
     def decode(self) -> Frame:
         """Return the frame.
 
-        Raises
-        ------
-        DatasetError
-            The image cannot be decoded, or its camera is invalid.
+        DatasetError: the image cannot be decoded, or its camera is invalid.
         """
         image_rgb, camera = self.color()
         return Frame(self.stamp_ns, image_rgb, camera, self.map_from_camera,
@@ -113,10 +110,7 @@ def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Ca
                   depth: DepthFormat | None = None) -> Frames:
     """Return the frames of image files taken by one camera.
 
-    Raises
-    ------
-    DatasetError
-        The poses are of another time than the images.
+    DatasetError: the poses are of another time than the images.
     """
     check_clock(poses, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
     form = depth or DepthFormat()
@@ -134,10 +128,7 @@ def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Ca
 def read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
     """Return an image file (h, w, 3), red first, and its camera.
 
-    Raises
-    ------
-    DatasetError
-        The image cannot be decoded, or is not of the camera's size.
+    DatasetError: the image cannot be decoded, or is not of the camera's size.
     """
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:

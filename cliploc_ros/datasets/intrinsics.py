@@ -31,6 +31,8 @@ _SEQUENCE_NAME = re.compile(r'(?<![a-z])(?:freiburg|fr)([123])(?![0-9])', re.IGN
 def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     """Return the camera of a sequence, and for the user where its intrinsics are from.
 
+    DatasetError: neither choice nor folder determines the camera, or the file is invalid.
+
     Parameters
     ----------
     choice : str or None
@@ -38,11 +40,6 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
         ``camera.json`` or, without one, the TUM camera that the folder's name contains.
     folder : Path
         The sequence's folder.
-
-    Raises
-    ------
-    DatasetError
-        Neither choice nor folder determines the camera, or the file is invalid.
     """
     if choice is not None and choice in PRESETS:
         return PRESETS[choice], f'preset {choice}'
@@ -61,12 +58,8 @@ def read_camera(path: str | Path) -> Camera:
     """Read a camera.json.
 
     The file holds a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and,
-    for a lens with distortion, ``distortion_model`` and its coefficients ``d``.
-
-    Raises
-    ------
-    DatasetError
-        A field is missing, unknown or invalid; the message names file and field.
+    for a lens with distortion, ``distortion_model`` and its coefficients ``d``. DatasetError: a
+    field is missing, unknown or invalid; the message names file and field.
     """
     path = Path(path)
     try:

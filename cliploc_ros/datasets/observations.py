@@ -62,13 +62,9 @@ class Recorded:
 def load_observations(path: str | Path) -> PosedDetections:
     """Read and validate an observation file.
 
-    Frames are put in the order of time. A frame may lack boxes; a file may lack frames with
-    boxes only if mapping is told so later.
-
-    Raises
-    ------
-    DatasetError
-        Names the file, the array, what is wrong with it, and what to do.
+    Frames are put in the order of time. A frame may lack boxes; a file may lack frames with boxes
+    only if mapping is told so later. DatasetError: the message names the file, the array, what is
+    wrong with it, and what to do.
     """
     return load_recorded(path).detections
 
@@ -111,10 +107,7 @@ def load_recorded(path: str | Path) -> Recorded:
 def save_observations(path: str | Path, detections: PosedDetections) -> None:
     """Write an observation file in one step: an existing file is replaced complete, or stays.
 
-    Raises
-    ------
-    DatasetError
-        The detections are malformed, or the file cannot be written.
+    DatasetError: the detections are malformed, or the file cannot be written.
     """
     _write(Path(path), _arrays_of(detections))
 

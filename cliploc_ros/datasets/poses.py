@@ -50,12 +50,8 @@ class TimedPoses:
                      ) -> 'TimedPoses':
         """Return the poses of unsorted samples (x, y, z, qx, qy, qz, qw).
 
-        Of equal stamps the first counts.
-
-        Raises
-        ------
-        DatasetError
-            A sample is not finite or has no unit quaternion.
+        Of equal stamps the first counts. DatasetError: a sample is not finite or has no unit
+        quaternion.
         """
         stamps, order = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
         samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
@@ -119,10 +115,7 @@ def slerp(start_xyzw: NDArray[np.float64], end_xyzw: NDArray[np.float64], fracti
 def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
     """Return a mount (4, 4) given as x y z [m] and a quaternion qx qy qz qw.
 
-    Raises
-    ------
-    DatasetError
-        The quaternion is far from unit.
+    DatasetError: the quaternion is far from unit.
     """
     norm = float(np.linalg.norm(numbers[3:]))
     if not (np.isfinite(numbers).all() and abs(norm - 1.0) < _MAX_NORM_ERROR):
@@ -134,10 +127,7 @@ def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
 def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:
     """Refuse poses that do not overlap the time of the images.
 
-    Raises
-    ------
-    DatasetError
-        There are no poses, or they are of another time; says by how much.
+    DatasetError: there are no poses, or they are of another time; says by how much.
     """
     span = poses.span_ns
     if span is None:

@@ -140,15 +140,12 @@ class Queries:
 def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
     """Read and validate a query file.
 
+    DatasetError: the message names file, array and error.
+
     Parameters
     ----------
     landmark_ids : collection of str, optional
         The map's landmarks; the file must contain no others.
-
-    Raises
-    ------
-    DatasetError
-        Names file, array and error.
     """
     path = Path(path)
     arrays = _SCHEMA.read(path)
@@ -164,10 +161,7 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
 def save_queries(path: str | Path, queries: Queries) -> None:
     """Write a query file atomically; an existing one is replaced.
 
-    Raises
-    ------
-    DatasetError
-        If the queries are invalid or the file cannot be written.
+    DatasetError: the queries are invalid or the file cannot be written.
     """
     path = Path(path)
     try:

@@ -54,11 +54,7 @@ def read_tum(folder: str | Path) -> TumSequence:
     """Read a TUM RGB-D folder, except for the pixels of its images.
 
     It holds ``rgb.txt``, the images that this lists, and optionally ``groundtruth.txt``.
-
-    Raises
-    ------
-    DatasetError
-        Names the file and the line that is invalid.
+    DatasetError: the message names the file and the line that is invalid.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -73,12 +69,8 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
     """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
 
     Lines may have any order; of equal stamps the first counts. ``#`` begins a comment.
-
-    Raises
-    ------
-    DatasetError
-        A line does not hold eight numbers, or its quaternion is far from unit norm; the message
-        names file and line.
+    DatasetError: a line does not hold eight numbers, or its quaternion is far from unit norm; the
+    message names file and line.
     """
     samples: dict[int, list[float]] = {}
     for where, line in _data_lines(Path(path)):
@@ -106,17 +98,14 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
 def parse_stamp_ns(text: str, where: str) -> int:
     """Convert decimal seconds to nanoseconds exactly, without a float.
 
+    DatasetError: the text is no number, or outside the range of a ROS time.
+
     Parameters
     ----------
     text : str
         Seconds, as ``1341847980.722988`` or ``1.341847980722988e9``.
     where : str
         File and line, for the message.
-
-    Raises
-    ------
-    DatasetError
-        The text is no number, or outside the range of a ROS time.
     """
     try:
         seconds = Decimal(text)
@@ -130,10 +119,7 @@ def parse_stamp_ns(text: str, where: str) -> int:
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
     """Return the stamps [ns] and files that a list such as rgb.txt names.
 
-    Raises
-    ------
-    DatasetError
-        Naming the file and line that cannot be used.
+    DatasetError: the message names the file and line that cannot be used.
     """
     if not path.exists():
         raise DatasetError(f'{path}: no such file; a TUM folder lists its images in rgb.txt')

@@ -41,10 +41,7 @@ class ConversionOptions:
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic.
 
-        Raises
-        ------
-        DatasetError
-            If the prefix is no valid ROS namespace.
+        DatasetError: the prefix is no valid ROS namespace.
         """
         if _NAMESPACE.fullmatch(self.prefix) is None:
             raise DatasetError(f'prefix {self.prefix!r} is no ROS namespace, such as /camera')
@@ -65,9 +62,10 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 progress: Progress = iter) -> ConversionResult:
     """Write a sequence as a rosbag2 recording.
 
-    Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth`` and, if
-    given, ``detections``. All headers of a frame have exactly the image's stamp, which is
-    also the time of recording.
+    Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth`` and, if given,
+    ``detections``. All headers of a frame have exactly the image's stamp, which is also the time
+    of recording. DatasetError: an image is invalid, no image has detections, or the output cannot
+    be written. No partial recording remains.
 
     Parameters
     ----------
@@ -79,12 +77,6 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
         Recorded detections by stamp [ns].
     progress : callable
         Wraps the iterable of images, to show progress.
-
-    Raises
-    ------
-    DatasetError
-        An image is invalid, no image has detections, or the output cannot be written. No partial
-        recording remains.
     """
     recorded = detections or {}
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):

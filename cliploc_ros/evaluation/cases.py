@@ -29,10 +29,7 @@ from cliploc_ros.models.observer import Observer
 def options_of(case: Case) -> RelocalizerOptions:
     """Return the options that a case was recorded with; no clock cuts the search.
 
-    Raises
-    ------
-    DatasetError
-        The case does not hold them.
+    DatasetError: the case does not hold them.
     """
     given = case.report.get('options')
     known = {field.name for field in fields(RelocalizerOptions)}
@@ -57,17 +54,14 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
                 layer: KeyframeLayer | None = None) -> Relocalization:
     """Answer a case again with a map: as it was recorded, or with another one.
 
+    CliplocError: a message or the report is broken.
+
     Parameters
     ----------
     observer : Observer, optional
         Compares the crops of a frame with the map, where the options need it.
     layer : KeyframeLayer, optional
         Keyframes of the map.
-
-    Raises
-    ------
-    CliplocError
-        A message or the report is broken.
     """
     options, parameters = options_of(case), parameters_of(case)
     session = Localizer(Relocalizer(landmark_map, options))

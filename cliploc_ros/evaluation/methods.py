@@ -40,6 +40,8 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
                   ) -> tuple[Method, ...]:
     """Return the methods with some names.
 
+    OptionsError: the message names the word, or the file, the method and the option.
+
     Parameters
     ----------
     words : iterable of str
@@ -51,11 +53,6 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         height range, deviations of vertical and tilt, and crops from them.
     landmarks : int
         Number of landmarks of the map; it limits k.
-
-    Raises
-    ------
-    OptionsError
-        Names the word, or the file, the method and the option.
     """
     methods: dict[str, Method] = {}
     for word in words:

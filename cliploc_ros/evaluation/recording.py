@@ -31,18 +31,15 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
                      map_files: Sequence[str], compare: str) -> Queries:
     """Return the images with ground truth as queries; detector and CLIP run once.
 
+    CliplocError: from loading the networks and from recording. A folder that cannot be written
+    gives a warning only.
+
     Parameters
     ----------
     options : RecordingOptions
         With CLIP.
     map_files, compare
         See load_encoder_for_map.
-
-    Raises
-    ------
-    CliplocError
-        From loading the networks and from recording. A folder that cannot be written gives a
-        warning only.
     """
     assert options.clip is not None
     labels = embed_map(options.clip, landmark_map, map_files, compare)

@@ -53,17 +53,14 @@ class RunError(CliplocError):
 def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
     """Return the outcomes of all tasks, in their order; show a progress bar.
 
+    RunError: workers died at a task: without its outcomes the rest would not be a fair sample.
+
     Parameters
     ----------
     make_search : MakeWork
         Makes the function that returns the outcomes of a task, a sequence.
     what : str
         Name of the tasks in the plural.
-
-    Raises
-    ------
-    RunError
-        Workers died at a task: without its outcomes the rest would not be a fair sample.
     """
     found = {}
     with closing(run_tasks(make_search, tasks, workers=workers)) as results:
@@ -179,6 +176,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
                     frames: Sequence[QueryFrame] = (), **running: Any) -> list[Summary]:
     """Run methods, print the table, write all files to a folder; return their summaries.
 
+    CliplocError: the run cannot be resumed, or a file cannot be written.
+
     Parameters
     ----------
     out : Path
@@ -191,11 +190,6 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
         Frames of the query file, for the times of detector and CLIP.
     running
         trials, workers, scheduler, layer, noisy: see run_methods.
-
-    Raises
-    ------
-    CliplocError
-        The run cannot be resumed, or a file cannot be written.
     """
     swept = [replace(one, name=f'{one.name}{_AT}{count}',
                      options=replace(one.options, iterations=count))
@@ -239,15 +233,12 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
 def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
     """Return the results of an unfinished run, or begin the log of a new one.
 
+    OptionsError: the log belongs to another run (names what differs), or is damaged.
+
     Parameters
     ----------
     run : mapping
         Description of the run, as JSON keeps it.
-
-    Raises
-    ------
-    OptionsError
-        The log belongs to another run (names what differs), or is damaged.
     """
     entries, is_damaged = log.read()
     if not (entries or is_damaged):

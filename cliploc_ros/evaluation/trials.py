@@ -95,15 +95,12 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
                  ) -> tuple[Query, ...]:
     """Return the queries of a file, with similarities in the map's order.
 
+    DatasetError: the queries were recorded against another map.
+
     Parameters
     ----------
     every_frame : bool
         Use the neighbouring frames as queries, too.
-
-    Raises
-    ------
-    DatasetError
-        The queries were recorded against another map.
     """
     column = {one: number for number, one in enumerate(queries.landmark_ids)}
     missing = [one for one in landmark_map.landmark_ids if one not in column]

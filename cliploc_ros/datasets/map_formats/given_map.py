@@ -86,17 +86,13 @@ class ImportedMap(NamedTuple):
 def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
     """Return a given map in the coordinate frame and unit of ours.
 
-    Landmarks that no map can hold are left out.
+    Landmarks that no map can hold are left out. DatasetError: no landmark is left; the message
+    says why the first one was left out.
 
     Parameters
     ----------
     source : str
         What the landmarks say of where they come from.
-
-    Raises
-    ------
-    DatasetError
-        No landmark is left; the message says why the first one was left out.
     """
     kept: dict[str, GivenLandmark] = {}
     left_out = list(given.left_out)
@@ -124,15 +120,12 @@ def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
 def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:
     """Return an imported map fitted to the boxes of an observation file.
 
+    CliplocError: the file is invalid, or nothing can be fitted to it.
+
     Parameters
     ----------
     keep_unsupported : bool
         Keep landmarks that cannot be fitted, where the file has them.
-
-    Raises
-    ------
-    CliplocError
-        The file is invalid, or nothing can be fitted to it.
     """
     detections = load_observations(observations)
     before = imported.landmark_map
@@ -186,10 +179,7 @@ def make_id(class_id: str, number: int | str) -> str:
 def read_bytes(path: Path) -> bytes:
     """Return the content of a regular file that is neither empty nor too large.
 
-    Raises
-    ------
-    DatasetError
-        Names the file and what is wrong with it.
+    DatasetError: the message names the file and what is wrong with it.
     """
     try:
         if not S_ISREG(path.stat().st_mode):
@@ -208,10 +198,7 @@ def read_bytes(path: Path) -> bytes:
 def read_class_names(path: Path) -> tuple[str, ...]:
     """Read a text file with one class name in each line.
 
-    Raises
-    ------
-    DatasetError
-        Names the file and the line to correct.
+    DatasetError: the message names the file and the line to correct.
     """
     try:
         lines = read_bytes(path).decode('utf-8-sig').splitlines()
@@ -225,13 +212,7 @@ def read_class_names(path: Path) -> tuple[str, ...]:
 
 
 def class_name(names: Sequence[str], index: int) -> str:
-    """Return the name of a class.
-
-    Raises
-    ------
-    DatasetError
-        The list of names has no such index.
-    """
+    """Return the name of a class; DatasetError: the list of names has no such index."""
     if not 0 <= index < len(names):
         raise DatasetError(f'class index {index} is not among {len(names)} names; name the '
                            'classes that the map was made with: --class-names FILE')

@@ -41,8 +41,9 @@ class _NodeError(Exception):
 def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read a map of MSG-Loc.
 
-    Class weights are the shares of the detections. Likelihoods serve where a node lacks them:
-    they sum to more than 1, and say which classes the detector confuses.
+    Class weights are the shares of the detections. Likelihoods serve where a node lacks them: they
+    sum to more than 1, and say which classes the detector confuses. DatasetError: the message
+    names the file and what is wrong with it.
 
     Parameters
     ----------
@@ -50,11 +51,6 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
         A JSON file.
     class_names : sequence of str
         Of the class indices; a file may also name classes.
-
-    Raises
-    ------
-    DatasetError
-        Names the file and what is wrong with it.
     """
     try:
         tree = json.loads(read_bytes(path))

@@ -55,17 +55,12 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read the objects of a GOReloc map, NAME.objects.
 
     Class weights are the counts of its categories. An object without a category, or that is no
-    ellipsoid, is left out.
+    ellipsoid, is left out. DatasetError: the message names the file and what is wrong with it.
 
     Parameters
     ----------
     class_names : sequence of str
         Of the category indices.
-
-    Raises
-    ------
-    DatasetError
-        Names the file and what is wrong with it.
     """
     given = GivenMap([], [], [])
     try:
@@ -93,17 +88,14 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
 def read_oaslam(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read the objects of an OA-SLAM map.
 
+    DatasetError: the message names the file and what is wrong with it.
+
     Parameters
     ----------
     path : Path
         map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks.
     class_names : sequence of str
         Of the category indices.
-
-    Raises
-    ------
-    DatasetError
-        Names the file and what is wrong with it.
     """
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)
@@ -170,10 +162,7 @@ def _add(given: GivenMap, shown: str, landmark_id: str, name: str, quadric: list
 def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
     """Return centre, semi-axes and quaternion x, y, z, w of a dual quadric, 16 numbers by rows.
 
-    Raises
-    ------
-    QuadricError
-        It is no ellipsoid.
+    QuadricError: it is no ellipsoid.
     """
     if len(numbers) != 16:
         raise QuadricError(f'its dual quadric has {len(numbers)} numbers, not 16')

@@ -32,12 +32,8 @@ def read_table(path: Path) -> GivenMap:
     """Read a map from a table.
 
     A row without an id gets its class and number as one, a row without a label its class. A table
-    without qx, qy, qz and qw has ellipsoids along the axes of its coordinate frame.
-
-    Raises
-    ------
-    DatasetError
-        Names the file, the line and the column to correct.
+    without qx, qy, qz and qw has ellipsoids along the axes of its coordinate frame. DatasetError:
+    the message names the file, the line and the column to correct.
     """
     text = _decode(read_bytes(path), path).lstrip()
     delimiter = max(',;\t', key=text.split('\n', 1)[0].count)

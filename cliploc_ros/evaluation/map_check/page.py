@@ -56,12 +56,8 @@ def write_report(folder: Path, name: str, report: CheckReport,
                  pictures: Iterable[tuple[str, str, bytes]]) -> None:
     """Write the page and the JSON file of a check of a named map, each in one step.
 
-    Pictures have a name, a caption and a PNG each.
-
-    Raises
-    ------
-    OptionsError
-        A file cannot be written; the old one stays.
+    Pictures have a name, a caption and a PNG each. OptionsError: a file cannot be written; the old
+    one stays.
     """
     data = _finite({'map': name, **report.as_dict()})
     write_text(folder / DATA, json.dumps(data, indent=1, allow_nan=False))
