@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import (
     add_layer_options,
@@ -19,13 +19,13 @@ from cliploc_ros.cli.map_layer import (
 )
 from cliploc_ros.cli.sources import add_source_options, clip_options, read_source, source_of
 from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
-from cliploc_ros.errors import DatasetError, MappingError, OptionsError
+from cliploc_ros.errors import MappingError, OptionsError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+    from cliploc_ros.mapping.options import PoseErrors
 
 EPILOG = """\
 examples:
@@ -95,11 +95,13 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
+    from cliploc_ros.files.storage import write_text
     from cliploc_ros.make_map import find_labeller, make_map, update_map
+    from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
     # Refuse an output whose folder is missing, before the work is done.
-    path, update = options.out, options.update
+    path, update, name = options.out, options.update, source_of(options).name
     if not path.parent.is_dir():
         raise MappingError(f'{path}: there is no folder {path.parent}; create it')
     if path.is_dir():
@@ -109,7 +111,12 @@ def build(options: argparse.Namespace) -> int:
         LandmarkMap.from_file(update)
         if options.refine_mount:
             raise OptionsError('--refine-mount is for new maps, not for --update')
-    mapping = _mapping_options(options)
+    mapping = MappingOptions(
+        pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
+        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
+        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
+        min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
+        source=f'build_map {name}', random_seed=options.seed)
     recorded = read_source(options)
     detections = recorded.detections
     if recorded.without_pose:
@@ -118,7 +125,6 @@ def build(options: argparse.Namespace) -> int:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = find_labeller(detections, partial(clip_options, options) if options.clip else None,
                              options.vocabulary)
-    name = source_of(options).name
     if update is None:
         with StageBar() as bar:
             made = make_map(detections, labeller, mapping, *layer_input(options), bar.show)
@@ -137,23 +143,12 @@ def build(options: argparse.Namespace) -> int:
     if made.layer is not None:
         lines.append(write_layer(path, made.layer))
     if options.report is not None:
-        _write_report(options.report, made.report.as_dict())
+        write_text(options.report, json.dumps(made.report.as_dict(), indent=1))
     print('\n'.join(lines))
     if labeller.note:
         print(f'note: {labeller.note}')
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s')
     return 0
-
-
-def _mapping_options(options: argparse.Namespace) -> 'MappingOptions':
-    from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
-
-    return MappingOptions(
-        pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
-        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
-        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
-        min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
-        source=f'build_map {source_of(options).name}', random_seed=options.seed)
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
@@ -178,16 +173,6 @@ def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]'
     given = correction if options.mount is None else mount_from_numbers(options.mount) @ correction
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
-
-
-def _write_report(path: Path, report: dict[str, Any]) -> None:
-    from cliploc_ros.files.storage import replace_file
-
-    try:
-        with replace_file(path) as partial:
-            partial.write_text(json.dumps(report, indent=1))
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
 
 
 if __name__ == '__main__':

@@ -14,7 +14,7 @@ from cliploc_ros.command import printable, run_main
 from cliploc_ros.errors import DatasetError, MapError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.datasets.map_formats.given_map import GivenMap, ImportedMap, Placement
+    from cliploc_ros.datasets.map_formats.given_map import GivenMap
 
 _FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
 _LEFT_OUT_SHOWN = 10
@@ -74,14 +74,23 @@ def import_map(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.datasets.map_formats.given_map import place, refit
+    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.files.storage import write_text
 
     begin = time.monotonic()
     _check_paths(options)
-    placement = _placement(options)
+    if not 0.0 < options.scale < float('inf'):
+        raise OptionsError(f'--scale {options.scale}: must be above 0')
+    if not options.frame_id.strip():
+        raise OptionsError('--frame-id: must not be empty')
+    try:
+        map_from_given = mount_from_numbers(options.transform)
+    except DatasetError as error:
+        raise OptionsError(f'--transform: {error}') from error
     given = _read(options)
     try:
-        imported = place(given, placement,
-                         f'import_map {options.format} {options.input.name}')
+        imported = place(given, f'import_map {options.format} {options.input.name}',
+                         options.frame_id, options.scale, map_from_given)
     except DatasetError as error:
         raise DatasetError(f'{options.input}: {error}') from error
     result = refit(imported, options.refit, options.keep_unsupported) if options.refit else (
@@ -95,7 +104,9 @@ def import_map(options: argparse.Namespace) -> int:
     if note := remove_layer(options.out):
         print(note)
     if options.report is not None:
-        _write_report(options.report, result)
+        write_text(options.report, json.dumps({
+            'landmarks': len(result.landmark_map), 'lines': result.notes,
+            'left_out': [one._asdict() for one in result.left_out]}, indent=1))
     print('\n'.join(printable(line) for line in result.notes))
     print(f'left out: {len(result.left_out)}')
     for one in result.left_out[:_LEFT_OUT_SHOWN]:
@@ -122,21 +133,6 @@ def _check_paths(options: argparse.Namespace) -> None:
                 raise OptionsError(f'--{name} {path} is an input; name another file')
 
 
-def _placement(options: argparse.Namespace) -> 'Placement':
-    from cliploc_ros.datasets.map_formats.given_map import Placement
-    from cliploc_ros.datasets.poses import mount_from_numbers
-
-    if not 0.0 < options.scale < float('inf'):
-        raise OptionsError(f'--scale {options.scale}: must be above 0')
-    if not options.frame_id.strip():
-        raise OptionsError('--frame-id: must not be empty')
-    try:
-        map_from_given = mount_from_numbers(options.transform)
-    except DatasetError as error:
-        raise OptionsError(f'--transform: {error}') from error
-    return Placement(options.frame_id, options.scale, map_from_given)
-
-
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
     from cliploc_ros.datasets.map_formats.given_map import COCO, read_class_names
@@ -151,18 +147,6 @@ def _read(options: argparse.Namespace) -> 'GivenMap':
     names = COCO if options.class_names is None else read_class_names(options.class_names)
     readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
     return readers[options.format](options.input, names)
-
-
-def _write_report(path: Path, result: 'ImportedMap') -> None:
-    from cliploc_ros.files.storage import replace_file
-
-    report = {'landmarks': len(result.landmark_map), 'lines': result.notes,
-              'left_out': [one._asdict() for one in result.left_out]}
-    try:
-        with replace_file(path) as partial:
-            partial.write_text(json.dumps(report, indent=1))
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be written: {error.strerror}') from error
 
 
 if __name__ == '__main__':

@@ -109,18 +109,18 @@ def save_observations(path: str | Path, detections: PosedDetections) -> None:
 
     DatasetError: the detections are malformed, or the file cannot be written.
     """
-    _write(Path(path), _arrays_of(detections))
+    _write(Path(path), detections, {})
 
 
 def save_recorded(path: str | Path, recorded: Recorded) -> None:
     """Write an observation file that says how it came about; see save_observations."""
-    _write(Path(path), _arrays_of(recorded.detections) | {
+    _write(Path(path), recorded.detections, {
         'stamps_ns': recorded.stamps_ns, 'detector_ms': recorded.detector_ms,
         'clip_ms': recorded.clip_ms, 'described': np.array(recorded.described),
         'image_counts': np.array([recorded.images, recorded.without_pose])})
 
 
-def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
+def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
     camera = detections.camera
     names = np.array(detections.class_names, dtype=np.str_)
     arrays: dict[str, NDArray[Any]] = {
@@ -131,16 +131,12 @@ def _arrays_of(detections: PosedDetections) -> dict[str, NDArray[Any]]:
         'class_ids': names[detections.classes] if len(names) else np.empty(0, dtype=np.str_),
         'scores': detections.scores,
         'map_from_camera': detections.map_from_camera,
-        'timestamps': detections.stamps_s,
+        'timestamps': detections.stamps_s, **more,
     }
     for name in _OPTIONAL:
         if (values := getattr(detections, name)) is not None:
             arrays[name] = values
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
-    return arrays
-
-
-def _write(path: Path, arrays: Arrays) -> None:
     # embeddings do not compress, and take minutes to try
     _SCHEMA.write(path, arrays, compress='embeddings' not in arrays)

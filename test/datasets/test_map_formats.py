@@ -30,7 +30,6 @@ from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.datasets.map_formats.given_map import (
     COCO,
     GivenMap,
-    Placement,
     place,
     read_class_names,
 )
@@ -39,7 +38,7 @@ from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oas
 from cliploc_ros.datasets.map_formats.table import read_table
 from cliploc_ros.errors import DatasetError
 
-HERE = Placement('map', 1.0, np.eye(4))
+HERE = ('map', 1.0, np.eye(4))
 CUP, BOOK = COCO.index('cup'), COCO.index('book')
 SPHERE = dual_quadric([1, 2, 3], [0.1, 0.2, 0.3], [0, 0, 0, 1])
 
@@ -65,7 +64,7 @@ def shapes(landmark_map):
 
 
 def import_all(given: GivenMap, placement=HERE):
-    return place(given, placement, 'a test')
+    return place(given, 'a test', *placement)
 
 
 def check_equal(imported, true_map):
@@ -149,7 +148,7 @@ def test_scale_and_transform(true_map, tmp_path):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn.as_matrix(), [5.0, 6.0, 7.0]
     path = write(tmp_path / 'm.csv', table_text(true_map))
-    found = import_all(read_table(path), Placement('world', 2.0, pose)).landmark_map
+    found = import_all(read_table(path), ('world', 2.0, pose)).landmark_map
     assert found.frame_id == 'world'
     np.testing.assert_allclose(
         found.centers, turn.apply(2.0 * true_map.centers) + pose[:3, 3], atol=1e-9)

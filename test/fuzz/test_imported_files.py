@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.datasets.map_formats.given_map import COCO, Placement, place
+from cliploc_ros.datasets.map_formats.given_map import COCO, place
 from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
 from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 from cliploc_ros.datasets.map_formats.table import read_table
@@ -67,7 +67,7 @@ def read(folder, name, content):
     """Read a file; what comes of it must be a map that can be written and read."""
     (folder / name).write_bytes(content)
     try:
-        found = place(READERS[name](folder / name), Placement('map', 1.0, np.eye(4)), 'theirs')
+        found = place(READERS[name](folder / name), 'theirs', 'map', 1.0, np.eye(4))
     except DatasetError as error:
         assert len(str(error)) < 1000
         return

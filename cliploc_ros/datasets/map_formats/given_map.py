@@ -3,7 +3,7 @@
 """What a reader of a map format returns, and how it becomes a map of ours."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from stat import S_ISREG
 from typing import NamedTuple
@@ -66,15 +66,6 @@ class GivenMap(NamedTuple):
     notes: list[str]
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Where a given map lies: x_map = map_from_given @ (scale * x_given)."""
-
-    frame_id: str  #: Coordinate frame of the map
-    scale: float  #: Metres in one unit of length of the file
-    map_from_given: NDArray[np.float64]  #: (4, 4)
-
-
 class ImportedMap(NamedTuple):
     """A map of ours, what was left out and why, and what to say about it."""
 
@@ -83,7 +74,8 @@ class ImportedMap(NamedTuple):
     notes: tuple[str, ...]
 
 
-def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
+def place(given: GivenMap, source: str, frame_id: str, scale: float,
+          map_from_given: NDArray[np.float64]) -> ImportedMap:
     """Return a given map in the coordinate frame and unit of ours.
 
     Landmarks that no map can hold are left out. DatasetError: no landmark is left; the message
@@ -93,12 +85,17 @@ def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
     ----------
     source : str
         What the landmarks say of where they come from.
+    frame_id : str
+        Coordinate frame of the map, where x_map = map_from_given @ (scale * x_given).
+    scale : float
+        Metres in one unit of length of the file.
+    map_from_given : ndarray (4, 4)
     """
     kept: dict[str, GivenLandmark] = {}
     left_out = list(given.left_out)
     for landmark in given.landmarks:
         reason = ('its id occurs before' if landmark.landmark_id in kept
-                  else _reason_against(landmark, placement.scale))
+                  else _reason_against(landmark, scale))
         if reason is None:
             kept[landmark.landmark_id] = landmark
         else:
@@ -107,12 +104,12 @@ def place(given: GivenMap, placement: Placement, source: str) -> ImportedMap:
         why = f'; the first one: {left_out[0].reason}' if left_out else ''
         raise DatasetError(f'none of its {len(left_out)} landmarks can be used{why}')
     ids, labels, class_ids, centers, semi_axes, quats, details = zip(*kept.values(), strict=True)
-    turn = placement.map_from_given[:3, :3]
+    turn = map_from_given[:3, :3]
     rotations = Rotation.from_matrix(turn) * Rotation.from_quat(np.array(quats, dtype=np.float64))
     landmark_map = LandmarkMap(
-        placement.frame_id, ids, labels, class_ids,
-        np.array(centers) * placement.scale @ turn.T + placement.map_from_given[:3, 3],
-        np.array(semi_axes) * placement.scale, rotations.as_quat(),
+        frame_id, ids, labels, class_ids,
+        np.array(centers) * scale @ turn.T + map_from_given[:3, 3],
+        np.array(semi_axes) * scale, rotations.as_quat(),
         tuple(replace(one, source=source) for one in details))
     return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
 
