@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images and cameras from messages, read by rclpy or by rosbags.
+"""Images, cameras and detections from messages, read by rclpy or by rosbags.
 
 No field of a message is taken for valid.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import cv2
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.errors import CameraError, ImageError
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
 # The places of red, green and blue in each pixel, and its bytes.
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
@@ -151,3 +153,50 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
                       msg.distortion_model, distortion)
     except CameraError as error:
         raise CameraError(f'camera_info: {name}: {error}') from error
+
+
+def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) -> Detections:
+    """Return the detections of a vision_msgs/Detection2DArray, each with its most confident class.
+
+    A detection without a class gets the empty name, which no landmark has.
+
+    Parameters
+    ----------
+    class_map : mapping, optional
+        The map's names for some of the detector's classes, see parse_class_map.
+    """
+    names, classes, scores, boxes = class_map or {}, [], [], []
+    for detection in msg.detections:
+        hypotheses = [(one.hypothesis.score, one.hypothesis.class_id) for one in detection.results]
+        # the first of equal scores; NaN sorts last
+        score, name = max(hypotheses, default=(0.0, ''), key=lambda pair: (
+            -math.inf if math.isnan(pair[0]) else pair[0]))
+        classes.append(names.get(name, name))
+        scores.append(score)
+        box, center = detection.bbox, detection.bbox.center
+        boxes.append((center.position.x, center.position.y, center.theta, box.size_x, box.size_y))
+    x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
+    # A turned box becomes the upright one around it. With theta 0 the sizes stay exactly equal. An
+    # infinite angle gives a box of NaN, which is left out later.
+    with np.errstate(invalid='ignore'):
+        cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
+    return Detections(
+        np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
+        tuple(classes), np.array(scores, dtype=np.float64))
+
+
+def parse_class_map(text: str) -> dict[str, str]:
+    """Return the map's name for each class of the detector that has another, of the parameter.
+
+    OptionsError: a pair has not the form theirs=ours, or a name occurs twice.
+    """
+    found: dict[str, str] = {}
+    for pair in filter(None, map(str.strip, text.split(','))):
+        theirs, sign, ours = (part.strip() for part in pair.partition('='))
+        if not (theirs and sign and ours):
+            raise OptionsError(f"class_map: '{pair}' is not of the form theirs=ours")
+        if theirs in found:
+            raise OptionsError(f"class_map: '{theirs}' occurs twice")
+        found[theirs] = ours
+    return found

@@ -81,28 +81,6 @@ def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]
     return _make(POSE, header=_header(stamp, frame_id), pose=_pose(map_from_camera))
 
 
-def detections_of(message: Any) -> Detections:
-    """Read a vision_msgs/Detection2DArray, as rosbags or rclpy deserializes it.
-
-    The best hypothesis of each detection counts; one without has class '' and score 0.
-    """
-    boxes, class_ids, scores = [], [], []
-    for detection in message.detections:
-        centre, box = detection.bbox.center.position, detection.bbox
-        half_x, half_y = box.size_x / 2, box.size_y / 2
-        boxes.append([centre.x - half_x, centre.y - half_y, centre.x + half_x, centre.y + half_y])
-        guesses = [(result.hypothesis.score, result.hypothesis.class_id)
-                   for result in detection.results]
-        score, class_id = max(guesses, default=(0.0, ''))
-        class_ids.append(class_id)
-        scores.append(score)
-    return Detections(
-        bboxes_xyxy=np.array(boxes, dtype=np.float64).reshape(-1, 4),
-        class_ids=tuple(class_ids),
-        scores=np.array(scores, dtype=np.float64),
-    )
-
-
 def map_from_camera_of(message: Any) -> NDArray[np.float64]:
     """Read the pose (4, 4) of a geometry_msgs/PoseStamped."""
     position, orientation = message.pose.position, message.pose.orientation

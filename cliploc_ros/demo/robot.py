@@ -20,8 +20,9 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.bags import BagMessage, BagReader
 from cliploc_ros.demo.processes import DemoError
+from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detections_from_msg, stamp_ns
+from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.replay import create_publisher
 from cliploc_ros.units import NS_PER_S
 

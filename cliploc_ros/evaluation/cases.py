@@ -19,10 +19,14 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.bag_messages import detections_of
 from cliploc_ros.datasets.cases import Case
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.messages import (
+    camera_from_msg,
+    detections_from_msg,
+    image_from_msg,
+    parse_class_map,
+)
 from cliploc_ros.models.observer import Observer
 
 
@@ -66,8 +70,7 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
     options, parameters = options_of(case), parameters_of(case)
     session = Localizer(Relocalizer(landmark_map, options))
     keyframes = None if layer is None else KeyframeLocalizer(layer)
-    pairs = (pair.partition('=') for pair in parameters['class_map'].split(',') if pair.strip())
-    names = {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
+    class_map = parse_class_map(parameters['class_map'])
     found = None
     for frame in case.frames:
         # as the node makes it
@@ -75,10 +78,8 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
         height, width = image.shape[:2]
         camera = camera_from_msg(frame.message('camera_info'), (width, height),
                                  parameters['rectified'])
-        detections = detections_of(frame.message('detections'))
-        detections = replace(detections, class_ids=tuple(
-            names.get(name, name) for name in detections.class_ids)
-            ).usable(width, height, parameters['max_detections'])
+        detections = detections_from_msg(frame.message('detections'), class_map).usable(
+            width, height, parameters['max_detections'])
         observation = Observation(camera, detections, stamp_ns=frame.stamp_ns,
                                   up_in_camera=frame.up_in_camera,
                                   odom_from_camera=frame.odom_from_camera)

@@ -14,8 +14,9 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.ros.answer import Answer, Verdict
-from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
+from cliploc_ros.ros.conversions import detections_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.parameters import RelocalizerParameters
 

@@ -3,8 +3,7 @@
 """Conversion of messages to values and back. No field of a message is taken for valid."""
 
 import importlib
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,40 +30,6 @@ DETECTION_TYPES = ('vision_msgs', 'yolo_msgs')
 def stamp_ns(stamp: Time) -> int:
     """Return a message's time stamp in nanoseconds."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-
-
-def detections_from_msg(msg: Detection2DArray, class_map: Mapping[str, str] | None = None
-                        ) -> Detections:
-    """Return the detections of a message, each with its most confident class.
-
-    A detection without a class gets the empty name, which no landmark has.
-
-    Parameters
-    ----------
-    class_map : mapping, optional
-        The map's names for some of the detector's classes.
-    """
-    names = class_map or {}
-    best = [max((result.hypothesis for result in detection.results),
-                key=_confidence, default=ObjectHypothesis())
-            for detection in msg.detections]
-    boxes = [(box.center.position.x, box.center.position.y, box.center.theta, box.size_x,
-              box.size_y) for box in (detection.bbox for detection in msg.detections)]
-    x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
-    # A turned box becomes the upright one around it. With theta 0 the sizes stay exactly equal. An
-    # infinite angle gives a box of NaN, which is left out later.
-    with np.errstate(invalid='ignore'):
-        cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
-    width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
-    return Detections(
-        np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
-        tuple(names.get(hypothesis.class_id, hypothesis.class_id) for hypothesis in best),
-        np.array([hypothesis.score for hypothesis in best], dtype=np.float64))
-
-
-def _confidence(hypothesis: ObjectHypothesis) -> float:
-    """Return the score to sort by; NaN sorts last."""
-    return hypothesis.score if not math.isnan(hypothesis.score) else -math.inf
 
 
 def detections_to_msg(detections: Detections, header: Header) -> Detection2DArray:

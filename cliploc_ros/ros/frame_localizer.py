@@ -43,14 +43,16 @@ from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.messages import (
+    camera_from_msg,
+    detections_from_msg,
+    image_from_msg,
+    parse_class_map,
+)
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import ObservedCrops, Observer
 from cliploc_ros.models.profiles import with_encoder
-from cliploc_ros.ros.conversions import (
-    detections_from_msg,
-    stamp_ns,
-)
+from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_parameters import load_hashed_map, map_files, path_of
@@ -216,7 +218,7 @@ class FrameLocalizer:
         height, width = image.shape[:2]
         camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
         detections = detections_from_msg(
-            frame.detections, parameters.class_names()).usable(
+            frame.detections, parse_class_map(parameters.class_map)).usable(
                 width, height, parameters.max_detections)
         place = state.place
         observation = Observation(

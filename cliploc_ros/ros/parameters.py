@@ -15,6 +15,7 @@ from cliploc_ros.core.options import (
     RelocalizerOptions,
 )
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.messages import parse_class_map
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
@@ -191,7 +192,7 @@ class RelocalizerParameters(CommonParameters):
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
         if self.publish_tf and not self.base_frame:
             raise OptionsError('publish_tf: needs the parameter base_frame')
-        self.class_names()
+        parse_class_map(self.class_map)
         self.options()
 
     def options(self) -> RelocalizerOptions:
@@ -213,20 +214,3 @@ class RelocalizerParameters(CommonParameters):
             time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
             else _SEARCH_SHARE * self.timeout_s)
 
-    def class_names(self) -> dict[str, str]:
-        """Return the map's class name for each of the detector's that has another.
-
-        Raises
-        ------
-        OptionsError
-            A pair of class_map has not the form theirs=ours, or a name occurs twice.
-        """
-        found: dict[str, str] = {}
-        for pair in filter(None, map(str.strip, self.class_map.split(','))):
-            theirs, sign, ours = (part.strip() for part in pair.partition('='))
-            if not (theirs and sign and ours):
-                raise OptionsError(f"class_map: '{pair}' is not of the form theirs=ours")
-            if theirs in found:
-                raise OptionsError(f"class_map: '{theirs}' occurs twice")
-            found[theirs] = ours
-        return found

@@ -19,6 +19,7 @@ from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.messages import detections_from_msg
 
 FORMS = [(storage, form) for storage in ('sqlite3', 'mcap') for form in ('raw', 'compressed')]
 
@@ -91,7 +92,7 @@ def test_real_sequence_round_trip(shared_data, tmp_path, storage, form):
         expected_bgr = cv2.imread(str(path))
         np.testing.assert_array_equal(decode_rgb(message), expected_bgr[:, :, ::-1])
     for message, stamp in zip(topics['/detections'], sequence.stamps_ns, strict=True):
-        detections = bag_messages.detections_of(message)
+        detections = detections_from_msg(message)
         np.testing.assert_array_equal(detections.bboxes_xyxy, recorded[stamp].bboxes_xyxy)
         np.testing.assert_array_equal(detections.scores, recorded[stamp].scores)
         assert detections.class_ids == recorded[stamp].class_ids

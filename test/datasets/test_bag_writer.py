@@ -17,6 +17,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter, typestore
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.messages import detections_from_msg
 
 STAMP_NS = 1341847980722988001
 CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))
@@ -69,7 +70,7 @@ def test_detections_come_back(tmp_path, storage):
     message = bag_messages.detections_message(STAMP_NS, 'camera', detections)
     _, array = write_one(tmp_path / 'bag', storage, bag_messages.DETECTIONS, message)
     assert [bag_messages.stamp_ns(one) for one in (array, *array.detections)] == [STAMP_NS] * 3
-    again = bag_messages.detections_of(array)
+    again = detections_from_msg(array)
     np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
     np.testing.assert_array_equal(again.scores, detections.scores)
     assert again.class_ids == detections.class_ids
@@ -85,9 +86,9 @@ def test_best_hypothesis_counts():
         pose=result.pose,
     )
     message.detections[0].results = [result, better]
-    assert bag_messages.detections_of(message).class_ids == ('bowl',)
+    assert detections_from_msg(message).class_ids == ('bowl',)
     message.detections[0].results = []
-    assert bag_messages.detections_of(message).class_ids == ('',)
+    assert detections_from_msg(message).class_ids == ('',)
 
 
 def test_pose_comes_back(tmp_path, storage):

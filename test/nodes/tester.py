@@ -21,7 +21,8 @@ from std_srvs.srv import Empty, Trigger
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.ros.conversions import detections_from_msg, detections_to_msg, stamp_ns
+from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.ros.conversions import detections_to_msg, stamp_ns
 from cliploc_ros.ros.qos import LATCHED
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)

@@ -23,9 +23,8 @@ from vision_msgs.msg import (
 from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError
-from cliploc_ros.messages import camera_from_msg, image_from_msg
+from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
 from cliploc_ros.ros.conversions import (
-    detections_from_msg,
     detections_to_msg,
     pose_array_msg,
     pose_to_msg,

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.messages import parse_class_map
 from cliploc_ros.ros.node.parameters import ParameterRow, markdown_table, yaml_defaults
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
@@ -195,8 +196,8 @@ def test_mounts_that_fit(mount):
 
 def test_classes_get_the_maps_names():
     given = RelocalizerParameters(class_map=' tvmonitor=tv , potted plant = plant,')
-    assert given.class_names() == {'tvmonitor': 'tv', 'potted plant': 'plant'}
-    assert RelocalizerParameters().class_names() == {}
+    assert parse_class_map(given.class_map) == {'tvmonitor': 'tv', 'potted plant': 'plant'}
+    assert parse_class_map(RelocalizerParameters().class_map) == {}
 
 
 @pytest.mark.parametrize('text', ['tv', 'tv=', '=tv', 'a=b, a=c'])
