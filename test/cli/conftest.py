@@ -14,10 +14,8 @@ def start():
     processes = []
 
     def start_process(module: str, *args: object, **options) -> subprocess.Popen:
-        process = subprocess.Popen(
-            command(module, *args), cwd=PROJECT, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
-        )
+        process = subprocess.Popen(command(module, *args), cwd=PROJECT, text=True,
+                                   stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
         processes.append(process)
         return process
 

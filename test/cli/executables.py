@@ -50,10 +50,8 @@ def command(module: str, *args: object) -> list[str]:
 
 def run(module: str, *args: object, **options) -> subprocess.CompletedProcess:
     """Run an executable to its end."""
-    return subprocess.run(
-        command(module, *args), cwd=PROJECT, text=True, capture_output=True,
-        timeout=TIMEOUT_S, **options,
-    )
+    return subprocess.run(command(module, *args), cwd=PROJECT, text=True, capture_output=True,
+                          timeout=TIMEOUT_S, **options)
 
 
 @dataclass(frozen=True)
@@ -71,14 +69,10 @@ def write_sequence(folder: Path, count: int = 4, suffix: str = 'png') -> SmallSe
     (folder / 'rgb').mkdir(parents=True)
     random = np.random.default_rng(0)
     stamps = [f'{100 + index / 10:.6f}' for index in range(count)]
-    images = [
-        random.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8) for _ in stamps
-    ]
+    images = [random.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8) for _ in stamps]
     for stamp, image in zip(stamps, images, strict=True):
         assert cv2.imwrite(str(folder / 'rgb' / f'{stamp}.{suffix}'), image)
-    (folder / 'rgb.txt').write_text(
-        ''.join(f'{stamp} rgb/{stamp}.{suffix}\n' for stamp in stamps)
-    )
+    (folder / 'rgb.txt').write_text(''.join(f'{stamp} rgb/{stamp}.{suffix}\n' for stamp in stamps))
     (folder / 'groundtruth.txt').write_text(
         ''.join(f'{100.1 + index / 100:.2f} {index} 0 0 0 0 0 1\n' for index in range(200))
     )

@@ -58,13 +58,8 @@ def indent(text: str, spaces: int) -> str:
     return '\n'.join(' ' * spaces + line for line in text.splitlines())
 
 
-def metadata_yaml(
-    storage: str,
-    topics: list[Topic],
-    files: list[tuple[str, list[Message]]],
-    compression_format: str = '',
-    compression_mode: str = '',
-) -> str:
+def metadata_yaml(storage: str, topics: list[Topic], files: list[tuple[str, list[Message]]],
+                  compression_format: str = '', compression_mode: str = '') -> str:
     """Return metadata.yaml; files are names on disk and their content."""
     everything = [message for _, messages in files for message in messages]
     start, length = time_range(everything)
@@ -115,14 +110,8 @@ def time_range(messages: list[Message]) -> tuple[int, int]:
     return min(stamps), max(stamps) - min(stamps)
 
 
-def write_bag(
-    folder: Path,
-    storage: str,
-    topics: list[Topic],
-    parts: list[list[Message]],
-    compression: str = '',
-    **options,
-) -> Path:
+def write_bag(folder: Path, storage: str, topics: list[Topic], parts: list[list[Message]],
+              compression: str = '', **options) -> Path:
     """Write a recording of one or several files; compression is '', 'FILE' or 'MESSAGE'."""
     folder.mkdir()
     write, suffix = {'sqlite3': (write_db3, 'db3'), 'mcap': (write_mcap, 'mcap')}[storage]
@@ -187,12 +176,8 @@ def write_db3(path: Path, topics: list[Topic], messages: list[Message]) -> None:
     connection.close()
 
 
-def write_mcap(
-    path: Path,
-    topics: list[Topic],
-    messages: list[Message],
-    chunk_compression: str | None = '',
-) -> None:
+def write_mcap(path: Path, topics: list[Topic], messages: list[Message],
+               chunk_compression: str | None = '') -> None:
     """A file of rosbag2_storage_mcap: one chunk, compressed '', 'zstd' or 'lz4'.
 
     With ``chunk_compression=None`` there are no chunks, as under the preset fastwrite.
@@ -227,13 +212,8 @@ def write_mcap(
     path.write_bytes(file)
 
 
-def add_chunk(
-    file: bytearray,
-    body: bytes,
-    index: dict[int, list[tuple[int, int]]],
-    messages: list[Message],
-    compression: str,
-) -> bytes:
+def add_chunk(file: bytearray, body: bytes, index: dict[int, list[tuple[int, int]]],
+              messages: list[Message], compression: str) -> bytes:
     """Append a chunk and its message indexes; return the record of its index."""
     compress = {'': bytes, 'zstd': zstd.compress, 'lz4': lz4.frame.compress}[compression]
     data = compress(body)

@@ -26,13 +26,10 @@ def string_cdr(text: str) -> bytes:
 
 
 CHATTER = jazzy_bags.Topic('/chatter', 'std_msgs/msg/String', 'string data\n', STRING_HASH)
-LATCHED = jazzy_bags.Topic(
-    '/robot_description', 'std_msgs/msg/String', 'string data\n', STRING_HASH,
-    durability='transient_local',
-)
-SENSOR = jazzy_bags.Topic(
-    '/status', 'std_msgs/msg/String', 'string data\n', STRING_HASH, reliability='best_effort'
-)
+LATCHED = jazzy_bags.Topic('/robot_description', 'std_msgs/msg/String', 'string data\n',
+                           STRING_HASH, durability='transient_local')
+SENSOR = jazzy_bags.Topic('/status', 'std_msgs/msg/String', 'string data\n', STRING_HASH,
+                          reliability='best_effort')
 TOPICS = [CHATTER, LATCHED, SENSOR]
 
 
@@ -185,9 +182,8 @@ def test_missing_recording_and_topic_are_named(tmp_path):
 
 
 def test_other_definition_of_a_type_is_refused(tmp_path):
-    other = jazzy_bags.Topic(
-        '/chatter', 'std_msgs/msg/String', 'string text\n', 'RIHS01_' + '0' * 64
-    )
+    other = jazzy_bags.Topic('/chatter', 'std_msgs/msg/String', 'string text\n',
+                             'RIHS01_' + '0' * 64)
     unknown = jazzy_bags.Topic('/odd', 'my_msgs/msg/Odd', 'int32 x\n', 'RIHS01_' + '1' * 64)
     messages = [
         jazzy_bags.Message('/chatter', START_NS, string_cdr('x')),

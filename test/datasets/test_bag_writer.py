@@ -137,10 +137,8 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, storage):
 
 
 def test_database_has_jazzys_tables(tmp_path):
-    write_one(
-        tmp_path / 'bag', 'sqlite3', bag_messages.POSE,
-        bag_messages.pose_message(STAMP_NS, 'world', np.eye(4)),
-    )
+    write_one(tmp_path / 'bag', 'sqlite3', bag_messages.POSE,
+              bag_messages.pose_message(STAMP_NS, 'world', np.eye(4)))
     connection = sqlite3.connect(tmp_path / 'bag' / 'bag.db3')
     tables = {name for (name,) in connection.execute('SELECT name FROM sqlite_master')}
     assert tables >= {'schema', 'metadata', 'topics', 'message_definitions', 'messages'}
