@@ -17,7 +17,13 @@ from cliploc_ros.cli.map_layer import (
     layer_input,
     write_layer,
 )
-from cliploc_ros.cli.sources import add_source_options, clip_options, read_source, source_of
+from cliploc_ros.cli.sources import (
+    add_source_options,
+    clip_options,
+    mount_of,
+    read_source,
+    source_of,
+)
 from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
 from cliploc_ros.errors import MappingError, OptionsError
 
@@ -168,9 +174,9 @@ def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
 def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
     """Return the corrected mount as the option --mount takes it."""
     from cliploc_ros.core.geometry.transforms import quaternion_from_transform
-    from cliploc_ros.datasets.poses import mount_from_numbers
 
-    given = correction if options.mount is None else mount_from_numbers(options.mount) @ correction
+    mount = mount_of(options.mount)
+    given = correction if mount is None else mount @ correction
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 

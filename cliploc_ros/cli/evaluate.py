@@ -17,6 +17,7 @@ from cliploc_ros.cli.sources import (
     add_topic_options,
     clip_options,
     detector_options,
+    mount_of,
 )
 from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -257,52 +258,42 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
     """Return the queries of a file, or record them."""
     from cliploc_ros.datasets.queries import load_queries, save_queries
+    from cliploc_ros.evaluation.recording import recorded_queries
+    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
 
     if options.queries is not None:
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or --tum')
         return load_queries(options.queries, landmark_map.landmark_ids)
-    queries = _record(options, landmark_map)
+    frames = _frames(options)
+    reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
+                    options.ground_truth, options.body_from_camera, options.rectified])
+    recording = RecordingOptions(detector_options(options), clip_options(options), EVERY_FRAME,
+                                 reading, options.workers or 1, options.scheduler)
+    queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
+                               options.landmark_embeddings)
+    if without := frames.count - len(queries):
+        print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
+              flush=True)
     if options.save_queries is not None:
         save_queries(options.save_queries, queries)
         print(f'wrote {options.save_queries}', flush=True)
     return queries
 
 
-def _record(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
-    from cliploc_ros.evaluation.recording import recorded_queries
-    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
-
-    frames = _frames(options)
-    yolo, clip = detector_options(options), clip_options(options)
-    reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
-                    options.ground_truth, options.body_from_camera, options.rectified])
-    recording = RecordingOptions(yolo, clip, EVERY_FRAME, reading, options.workers or 1,
-                                 options.scheduler)
-    queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
-                               options.landmark_embeddings)
-    without = frames.count - len(queries)
-    if without:
-        print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
-              flush=True)
-    return queries
-
-
 def _frames(options: argparse.Namespace) -> 'Frames':
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, poses_of_topic
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+    from cliploc_ros.datasets.bag_poses import poses_of_topic
     from cliploc_ros.datasets.folders import tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
-    from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum
 
     if options.tum is not None:
         sequence = read_tum(options.tum).every(options.every)
         return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
-    mount = options.body_from_camera
     return bag_frames(
         options.bag, BagTopics(options.image, options.camera_info, options.rectified),
-        poses_of_topic(options.ground_truth, body_from_camera=None if mount is None
-                       else mount_from_numbers(mount)))
+        poses_of_topic(options.ground_truth, body_from_camera=mount_of(options.body_from_camera)))
 
 
 def _cores() -> int:

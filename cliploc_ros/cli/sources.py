@@ -3,6 +3,7 @@
 """Options that name a recording and say how to look at it, and what comes of them."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,16 +11,19 @@ from typing import TYPE_CHECKING, Any
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
+from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from cliploc_ros.datasets.bag_frames import ReadPoses
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from cliploc_ros.datasets.bag_poses import ReadPoses
     from cliploc_ros.datasets.frames import DepthFormat, Frames
     from cliploc_ros.datasets.observations import Recorded
     from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.protocols import DetectorOptions
 
-_NS_PER_S = 1_000_000_000
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
@@ -44,7 +48,7 @@ def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptio
     from cliploc_ros.models.protocols import DetectorOptions
 
     return with_detector(DetectorOptions(model=options.model, device=options.device,
-                                     inference=options.inference, **more), options.profile)
+                                         inference=options.inference, **more), options.profile)
 
 
 def clip_options(options: argparse.Namespace) -> 'ClipOptions':
@@ -148,11 +152,10 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         return load_recorded(options.observations)
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
-    clip = clip_options(options) if options.clip else None
-    yolo = detector_options(options, conf=options.conf)
-    reading = repr([str(getattr(options, name)) for name in _READING])
     return record_once(read_frames(options), RecordingOptions(
-        yolo, clip, KeyframeOptions(*options.keyframes), reading, options.workers,
+        detector_options(options, conf=options.conf),
+        clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
+        repr([str(getattr(options, name)) for name in _READING]), options.workers,
         options.scheduler), options.record_to, _odometry(options))
 
 
@@ -169,7 +172,6 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
     from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
-    from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
 
     if options.bag is not None:
@@ -181,20 +183,24 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
     folder = FolderOptions(
         options.intrinsics,
         None if options.trajectory is None else read_tum_trajectory(options.trajectory),
-        round(options.max_gap * _NS_PER_S),
-        None if options.mount is None else mount_from_numbers(options.mount),
-        _depth_format(options))
+        round(options.max_gap * NS_PER_S),
+        mount_of(options.mount), _depth_format(options))
     if options.rgbd is not None:
         return rgbd_frames(options.rgbd, folder)
     return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
                       folder)
 
 
+def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
+    """Return the mount (4, 4) that an option gives; None where it is not given."""
+    from cliploc_ros.datasets.poses import mount_from_numbers
+
+    return None if numbers is None else mount_from_numbers(numbers)
+
+
 def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
     """Return what reads the poses of a bag."""
-    from cliploc_ros.datasets.bag_frames import pose_sources, poses_of_topic
-    from cliploc_ros.datasets.bag_poses import read_transforms
-    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_tf, poses_of_topic
     from cliploc_ros.datasets.tum import read_tum_trajectory
 
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
@@ -203,8 +209,7 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
         there = ', '.join(pose_sources(options.bag)) or 'none'
         raise DatasetError(f'{options.bag}: say where the poses are: --pose-topic, --map-frame '
                            f'(tf) or --trajectory; topics with poses here: {there}')
-    max_gap_ns = round(options.max_gap * _NS_PER_S)
-    mount = None if options.mount is None else mount_from_numbers(options.mount)
+    max_gap_ns, mount = round(options.max_gap * NS_PER_S), mount_of(options.mount)
     if options.pose_topic is not None:
         return poses_of_topic(options.pose_topic, max_gap_ns, mount)
     if options.trajectory is not None:
@@ -213,30 +218,25 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
         return lambda reader, camera_frame: poses
     if mount is not None:
         raise OptionsError('--mount is not for --map-frame: tf knows the mount')
-    return lambda reader, camera_frame: read_transforms(
-        reader, options.map_frame, options.camera_frame or camera_frame.removeprefix('/'),
-        max_gap_ns)
+    return poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns)
 
 
 def _odometry(options: argparse.Namespace) -> 'Poses | None':
     """Return the camera of a bag by odometry; None where none is asked for."""
-    from cliploc_ros.datasets.bag_frames import bag_odometry, poses_of_topic
-    from cliploc_ros.datasets.bag_poses import read_transforms
-    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.datasets.bag_frames import bag_odometry
+    from cliploc_ros.datasets.bag_poses import poses_of_tf, poses_of_topic
 
-    max_gap_ns = round(options.max_gap * _NS_PER_S)
+    max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is not None:
-        return bag_odometry(options.bag, options.image, lambda reader, camera_frame:
-                            read_transforms(reader, options.odometry_frame, options.camera_frame
-                                            or camera_frame.removeprefix('/'), max_gap_ns))
-    if options.odometry_topic is None:
+        read = poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns)
+    elif options.odometry_topic is None:
         return None
-    if options.map_frame is not None:
+    elif options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
                            '--odometry-frame')
-    mount = None if options.mount is None else mount_from_numbers(options.mount)
-    return bag_odometry(options.bag, options.image,
-                        poses_of_topic(options.odometry_topic, max_gap_ns, mount))
+    else:
+        read = poses_of_topic(options.odometry_topic, max_gap_ns, mount_of(options.mount))
+    return bag_odometry(options.bag, options.image, read)
 
 
 def _depth_format(options: argparse.Namespace) -> 'DepthFormat':

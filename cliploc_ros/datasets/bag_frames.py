@@ -5,7 +5,7 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bag_poses import POSE_TYPES, read_pose_topic
+from cliploc_ros.datasets.bag_poses import ReadPoses
 from cliploc_ros.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
@@ -41,8 +41,6 @@ _CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 _MAX_DEPTH_DELAY_NS = 20_000_000
 # Images that wait for their depth. A depth image is recorded at most this many images later.
 _MAX_WAITING = 15
-#: Makes the poses of an open recording; given the coordinate frame of its images.
-ReadPoses = Callable[[BagReader, str], Poses]
 _Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']
 
 
@@ -107,20 +105,6 @@ class BagTopics:
     #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
     #: none
     depth: str = ''
-
-
-def poses_of_topic(name: str, max_gap_ns: int = 0,
-                   body_from_camera: NDArray[np.float64] | None = None) -> ReadPoses:
-    """Return what reads the poses of a topic, see TimedPoses."""
-    return lambda reader, camera_frame: replace(
-        read_pose_topic(reader, name), max_gap_ns=max_gap_ns, body_from_camera=body_from_camera)
-
-
-def pose_sources(bag: Path) -> list[str]:
-    """Return the topics of a recording that may hold poses, /tf among them."""
-    with BagReader(bag) as reader:
-        return [topic.name for topic in reader.topics.values()
-                if (topic.msgtype in POSE_TYPES or topic.name == '/tf') and topic.message_count]
 
 
 def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,

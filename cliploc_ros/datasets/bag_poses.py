@@ -8,6 +8,7 @@ a gap between two samples has a limit.
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,32 +20,46 @@ from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.datasets.poses import Poses, TimedPoses
 from cliploc_ros.errors import DatasetError
 
-#: Where each type of message has its pose.
-POSE_TYPES: dict[str, Callable[[Any], Any]] = {
+# Where each type of message has its pose.
+_POSE_TYPES: dict[str, Callable[[Any], Any]] = {
     'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
     'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
     'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
 }
-TF, TF_STATIC = '/tf', '/tf_static'
+#: Makes the poses of an open recording; given the coordinate frame of its images.
+ReadPoses = Callable[[BagReader, str], Poses]
+_TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 
 
-def read_pose_topic(reader: BagReader, name: str) -> TimedPoses:
-    """Return the poses of a topic of type PoseStamped, PoseWithCovarianceStamped or Odometry.
+def pose_sources(bag: Path) -> list[str]:
+    """Return the topics of a recording that may hold poses, /tf among them."""
+    with BagReader(bag) as reader:
+        return [topic.name for topic in reader.topics.values()
+                if (topic.msgtype in _POSE_TYPES or topic.name == _TF) and topic.message_count]
 
-    DatasetError: the topic is missing, of another type, or a pose is invalid.
+
+def poses_of_topic(name: str, max_gap_ns: int = 0,
+                   body_from_camera: NDArray[np.float64] | None = None) -> ReadPoses:
+    """Return what reads a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
+
+    Its parameters are those of TimedPoses. DatasetError, when it reads: the topic is missing, of
+    another type, or a pose is invalid.
     """
-    pose_of = POSE_TYPES.get(reader.topic(name).msgtype)
-    if pose_of is None:
-        raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, not '
-                           f'{" or ".join(POSE_TYPES)}')
-    stamps, rows = [], []
-    for recorded in reader.messages([name]):
-        message = reader.deserialize(recorded)
-        pose = pose_of(message)
-        stamps.append(stamp_ns(message))
-        rows.append(_numbers(pose.position, pose.orientation))
-    return TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}')
+    def read(reader: BagReader, camera_frame: str) -> TimedPoses:
+        pose_of = _POSE_TYPES.get(reader.topic(name).msgtype)
+        if pose_of is None:
+            raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, '
+                               f'not {" or ".join(_POSE_TYPES)}')
+        stamps, rows = [], []
+        for recorded in reader.messages([name]):
+            message = reader.deserialize(recorded)
+            pose = pose_of(message)
+            stamps.append(stamp_ns(message))
+            rows.append(_numbers(pose.position, pose.orientation))
+        poses = TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}')
+        return replace(poses, max_gap_ns=max_gap_ns, body_from_camera=body_from_camera)
+    return read
 
 
 @dataclass(frozen=True)
@@ -89,63 +104,54 @@ class TransformChain:
         return np.asarray(invert_transform(ancestor_from[0]) @ ancestor_from[1])
 
 
-def read_transforms(reader: BagReader, map_frame: str, camera_frame: str, max_gap_ns: int
-                    ) -> TransformChain:
-    """Return how a camera moved in a map, from a recording's /tf and /tf_static.
+def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int) -> ReadPoses:
+    """Return what reads how a camera moved in a map, from /tf and /tf_static.
 
-    DatasetError: the recording has no tf, or nothing connects the two frames.
+    DatasetError, when it reads: the recording has no tf, or nothing connects the two frames.
 
     Parameters
     ----------
     map_frame, camera_frame : str
-        Coordinate frames; the camera's is the optical one (z forward).
+        Coordinate frames; the camera's is the optical one (z forward), by default the images'.
     max_gap_ns : int
         Greatest gap between two samples to interpolate over [ns].
     """
-    topics = [name for name in (TF, TF_STATIC) if name in reader.topics]
-    for name in topics:
-        if reader.topic(name).msgtype != _TF_TYPE:
-            raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, '
-                               f'not {_TF_TYPE}')
-    if not topics:
-        raise DatasetError(f'{reader.path}: has neither {TF} nor {TF_STATIC}; record them, or '
-                           'name a topic or file of poses')
-    parents = _read_parents(reader, topics, map_frame, camera_frame)
-    up, down = _find_way(parents, map_frame, camera_frame, reader)
-    links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
-    return TransformChain(tuple(links[child] for child in up),
-                          tuple(links[child] for child in down))
+    def read(reader: BagReader, image_frame: str) -> TransformChain:
+        topics = [name for name in (_TF, _TF_STATIC) if name in reader.topics]
+        for name in topics:
+            if reader.topic(name).msgtype != _TF_TYPE:
+                raise DatasetError(f'{reader.path}: {name} is of type '
+                                   f'{reader.topic(name).msgtype}, not {_TF_TYPE}')
+        if not topics:
+            raise DatasetError(f'{reader.path}: has neither {_TF} nor {_TF_STATIC}; record them, '
+                               'or name a topic or file of poses')
+        parents, up, down = _find_way(reader, topics, map_frame,
+                                      camera_frame or _name(image_frame))
+        links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
+        return TransformChain(tuple(links[child] for child in up),
+                              tuple(links[child] for child in down))
+    return read
 
 
-def _read_parents(reader: BagReader, topics: Collection[str], map_frame: str, camera_frame: str
-                  ) -> dict[str, str]:
-    """Return the parent of each frame, read until it connects the two that count."""
+def _find_way(reader: BagReader, topics: Collection[str], map_frame: str, camera_frame: str
+              ) -> tuple[dict[str, str], list[str], list[str]]:
+    """Return the parents, and the frames below the common ancestor from the map and the camera.
+
+    It reads until the two are connected.
+    """
     parents: dict[str, str] = {}
+    up, down = [map_frame], [camera_frame]
     for recorded in reader.messages(topics):
         count = len(parents)
         for transform in reader.deserialize(recorded).transforms:
             parents.setdefault(_name(transform.child_frame_id), _name(transform.header.frame_id))
-        if len(parents) > count and (
-                _ancestors(parents, map_frame)[-1] == _ancestors(parents, camera_frame)[-1]):
-            break
-    return parents
-
-
-def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
-    """Return a frame and its ancestors, up to the root; a loop is cut."""
-    way = [frame]
-    while way[-1] in parents and parents[way[-1]] not in way:
-        way.append(parents[way[-1]])
-    return way
-
-
-def _find_way(parents: Mapping[str, str], map_frame: str, camera_frame: str, reader: BagReader
-              ) -> tuple[list[str], list[str]]:
-    """Return the frames below the common ancestor: from the map up, and from the camera up."""
-    up, down = _ancestors(parents, map_frame), _ancestors(parents, camera_frame)
+        if len(parents) > count:
+            up, down = _ancestors(parents, map_frame), _ancestors(parents, camera_frame)
+            if up[-1] == down[-1]:
+                break
     common = next((frame for frame in down if frame in up), None)
     if common is not None:
-        return up[:up.index(common)], down[:down.index(common)]
+        return parents, up[:up.index(common)], down[:down.index(common)]
     known = {*parents, *parents.values()}
     for frame in (map_frame, camera_frame):
         if frame not in known:
@@ -154,6 +160,14 @@ def _find_way(parents: Mapping[str, str], map_frame: str, camera_frame: str, rea
     raise DatasetError(
         f"{reader.path}: tf does not connect '{map_frame}' and '{camera_frame}': their roots are "
         f"'{up[-1]}' and '{down[-1]}'; did the localizer run during the recording?")
+
+
+def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
+    """Return a frame and its ancestors, up to the root; a loop is cut."""
+    way = [frame]
+    while way[-1] in parents and parents[way[-1]] not in way:
+        way.append(parents[way[-1]])
+    return way
 
 
 def _read_links(reader: BagReader, topics: Collection[str], children: Collection[str],
@@ -176,13 +190,13 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
     links: dict[str, Poses] = {}
     for child in children:
         where = f"{reader.path}: tf of '{child}'"
-        stamps, rows = samples.get(TF_STATIC, {}).get(child, ([], []))
+        stamps, rows = samples.get(_TF_STATIC, {}).get(child, ([], []))
         if stamps:
             fixed = TimedPoses.from_samples(stamps[-1:], rows[-1:], where).pose_at(stamps[-1])
             assert fixed is not None
             links[child] = FixedPose(fixed)
         else:
-            links[child] = replace(TimedPoses.from_samples(*samples[TF][child], where),
+            links[child] = replace(TimedPoses.from_samples(*samples[_TF][child], where),
                                    max_gap_ns=max_gap_ns)
     return links
 

@@ -69,7 +69,7 @@ class SeenFrame:
 class LoadNetworks:
     """Loads detector and CLIP in the process that uses them."""
 
-    yolo: DetectorOptions
+    detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
     threads: int = 0  #: Of PyTorch on a CPU; 0 leaves its own choice
 
@@ -87,7 +87,7 @@ class LoadNetworks:
             torch.set_num_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return Look(load_detector(self.yolo).detect, encoder)
+        return Look(load_detector(self.detector).detect, encoder)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 class RecordingOptions:
     """How to look at a recording."""
 
-    yolo: DetectorOptions
+    detector: DetectorOptions
     clip: ClipOptions | None  #: None: no embeddings
     keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
     #: Says all else that the frames depend on, such as topics, mount and depth format
@@ -107,7 +107,7 @@ class RecordingOptions:
         result is the same on any number of workers and on a cluster.
         """
         threads = 0 if self.workers == 1 and not self.scheduler else 1
-        return LoadNetworks(self.yolo, self.clip, threads)
+        return LoadNetworks(self.detector, self.clip, threads)
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
@@ -120,12 +120,12 @@ def observation_file(frames: Frames, options: RecordingOptions) -> Path:
 def describe(frames: Frames, options: RecordingOptions) -> str:
     """Return all that the observations depend on, as JSON."""
     clip = options.clip
-    files = [options.yolo.model]
+    files = [options.detector.model]
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
     return json.dumps({
         'source': [frames.source.name, _state(frames.source.resolve()), frames.count],
-        'yolo': _settings(options.yolo), 'clip': None if clip is None else _settings(clip),
+        'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # the path of '' would be the working folder, which changes with every file written there
         'files': [_state(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})

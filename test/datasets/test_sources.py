@@ -13,14 +13,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_frames import (
-    BagTopics,
-    bag_frames,
-    bag_odometry,
-    pose_sources,
-    poses_of_topic,
-)
-from cliploc_ros.datasets.bag_poses import read_transforms
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
+from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_tf, poses_of_topic
 from cliploc_ros.datasets.bags import BagWriter, typestore
 from cliploc_ros.datasets.poses import mount_from_numbers
 from cliploc_ros.errors import DatasetError
@@ -155,24 +149,20 @@ def tf_messages(*, static=True, parent='odom'):
 
 def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
-        reader, 'map', camera, 1000 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
     expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
     np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
     # the correction comes too rarely for a smaller gap
-    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
-        reader, 'map', camera, 500 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 500 * MS)).read()
     assert frame.map_from_camera is None
     # a map that is a leaf of the tree
-    frame, = bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
-        reader, 'base', camera, 0)).read()
+    frame, = bag_frames(bag, BagTopics(), poses_of_tf('base', None, 0)).read()
     np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
 
 
 def test_odometry_is_read_from_tf(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    odometry = bag_odometry(bag, '/image', lambda reader, camera: read_transforms(
-        reader, 'odom', camera, 200 * MS))
+    odometry = bag_odometry(bag, '/image', poses_of_tf('odom', None, 200 * MS))
     # map -> odom moves, and is no part of it
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
     assert odometry.pose_at(START + 1200 * MS) is None
@@ -195,8 +185,7 @@ def test_odometry_is_read_from_tf(tmp_path):
 def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
     bag = write_bag(tmp_path / 'bag', [450], messages)
     with pytest.raises(DatasetError, match=expected):
-        bag_frames(bag, BagTopics(), lambda reader, camera: read_transforms(
-            reader, *frames, 1000 * MS))
+        bag_frames(bag, BagTopics(), poses_of_tf(*frames, 1000 * MS))
 
 
 def test_stamps_of_another_clock(tmp_path):
