@@ -60,17 +60,8 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     """
     if not folder.is_dir():
         raise DatasetError(f'{folder}: no such folder')
-    if (folder / 'rgb.txt').exists():
-        return _tum_rgbd_frames(folder, options)
-    if found := [match for path in folder.iterdir()
-                 if (match := _SEVEN_SCENES_NAME.fullmatch(path.name))]:
-        numbers = {int(match[1]): folder / match[0] for match in found}
-        return _seven_scenes_frames(folder, dict(sorted(numbers.items())), options)
-    raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
-                       '(7-Scenes); give a folder of one of these layouts')
-
-
-def _tum_rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
+    if not (folder / 'rgb.txt').exists():
+        return _seven_scenes_frames(folder, options)
     sequence = read_tum(folder)
     if not (folder / 'depth.txt').exists():
         raise DatasetError(f'{folder}: has no depth.txt; map from it with --tum, without depth')
@@ -86,14 +77,19 @@ def _tum_rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     return folder_frames(folder, files, _poses(sequence, options), camera, form)
 
 
-def _seven_scenes_frames(folder: Path, images: dict[int, Path], options: FolderOptions) -> Frames:
+def _seven_scenes_frames(folder: Path, options: FolderOptions) -> Frames:
     """Return the frames of 7-Scenes, whose poses are the depth camera's."""
+    images = {int(match[1]): path for path in folder.iterdir()
+              if (match := _SEVEN_SCENES_NAME.fullmatch(path.name))}
+    if not images:
+        raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
+                           '(7-Scenes); give a folder of one of these layouts')
     files, poses = [], {}
     form = DepthFormat(options.depth.unit_m or MILLIMETRE,
                        options.depth.camera or _SEVEN_SCENES_DEPTH)
     assert form.camera is not None
     depth_from_color = make_transform(np.eye(3), -np.array(form.camera.color_from_depth))
-    for number, path in images.items():
+    for number, path in sorted(images.items()):
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
         stamp = number * NS_PER_S // _SEVEN_SCENES_HZ

@@ -151,23 +151,6 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
         more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
         raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
                            f'not know{more}')
-    return _make_queries(arrays)
-
-
-def save_queries(path: str | Path, queries: Queries) -> None:
-    """Write a query file atomically; an existing one is replaced.
-
-    DatasetError: the queries are invalid or the file cannot be written.
-    """
-    path = Path(path)
-    try:
-        arrays = _make_arrays(queries)
-    except ValueError as error:  # arrays of different widths
-        raise DatasetError(f'{path}: cannot be written: {error}') from error
-    _SCHEMA.write(path, arrays, compress=True)
-
-
-def _make_queries(arrays: Arrays) -> Queries:
     fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
     # A float64 of today's seconds resolves 0.24 us: round to microseconds.
     stamps_ns = (arrays['stamps_ns'].tolist() if 'stamps_ns' in arrays else
@@ -188,27 +171,37 @@ def _make_queries(arrays: Arrays) -> Queries:
     return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
 
 
-def _make_arrays(queries: Queries) -> dict[str, NDArray[Any]]:
+def save_queries(path: str | Path, queries: Queries) -> None:
+    """Write a query file atomically; an existing one is replaced.
+
+    DatasetError: the queries are invalid or the file cannot be written.
+    """
+    path = Path(path)
     frames = queries.frames
 
     def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
         return np.concatenate([none, *(getattr(one, name) for one in frames)])
 
-    return {
-        'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
-        'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
-        'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
-        'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
-        'class_ids': np.array([name for one in frames for name in one.class_ids], dtype=np.str_),
-        'scores': rows('scores', np.empty(0)),
-        'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
-                             ).astype(np.float32),
-        'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
-        'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
-        # Python's division of integers rounds once, NumPy's twice.
-        'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
-        'query_group': np.array([one.group for one in frames], dtype=np.int64),
-        'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
-        'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-        **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
-    }
+    try:
+        arrays = {
+            'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
+            'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
+            'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
+            'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
+            'class_ids': np.array([name for one in frames for name in one.class_ids],
+                                  dtype=np.str_),
+            'scores': rows('scores', np.empty(0)),
+            'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
+                                 ).astype(np.float32),
+            'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
+            'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
+            # Python's division of integers rounds once, NumPy's twice.
+            'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
+            'query_group': np.array([one.group for one in frames], dtype=np.int64),
+            'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
+            'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+            **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
+        }
+    except ValueError as error:  # arrays of different widths
+        raise DatasetError(f'{path}: cannot be written: {error}') from error
+    _SCHEMA.write(path, arrays, compress=True)

@@ -35,7 +35,13 @@ def read_table(path: Path) -> GivenMap:
     without qx, qy, qz and qw has ellipsoids along the axes of its coordinate frame. DatasetError:
     the message names the file, the line and the column to correct.
     """
-    text = _decode(read_bytes(path), path).lstrip()
+    content = read_bytes(path)
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # of a spreadsheet
+    try:
+        text = content.decode('utf-16' if is_utf16 else 'utf-8-sig').lstrip()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f'{path}: not a text file in UTF-8 (byte {error.start}); save the '
+                           'table as CSV in UTF-8') from error
     delimiter = max(',;\t', key=text.split('\n', 1)[0].count)
     reader = csv.reader(io.StringIO(text, newline=''), delimiter=delimiter, strict=True)
     given = GivenMap([], [], [])
@@ -57,16 +63,6 @@ def read_table(path: Path) -> GivenMap:
     except csv.Error as error:
         raise DatasetError(f'{path}: line {reader.line_num}: {error}') from error
     return given
-
-
-def _decode(content: bytes, path: Path) -> str:
-    """Return a text in UTF-8 or, where a spreadsheet says so in its first bytes, UTF-16."""
-    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    try:
-        return content.decode('utf-16' if is_utf16 else 'utf-8-sig')
-    except UnicodeDecodeError as error:
-        raise DatasetError(f'{path}: not a text file in UTF-8 (byte {error.start}); save the '
-                           'table as CSV in UTF-8') from error
 
 
 def _read_header(cells: Sequence[str], path: Path) -> list[str]:
