@@ -88,12 +88,8 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
     """Return the layer next to a map; None where there is none, or none is wanted.
 
-    MapError: the layer is wanted, and is missing or bad.
-
-    Parameters
-    ----------
-    wanted : bool, optional
-        None: a bad layer is left out with a note, as the relocalizer does.
+    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError: the
+    layer is wanted, and is missing or bad.
     """
     from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 

@@ -66,7 +66,11 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     has_detector : bool
         Whether the robot runs this package's detector.
     """
-    image_rgb = read_picture(picture)
+    file = picture or min((ASSETS / 'sequence' / 'rgb').iterdir())
+    image_bgr = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image_bgr is None:
+        raise ImageError(f'{file} cannot be read as a picture: name a JPEG or PNG file')
+    image_rgb = np.ascontiguousarray(image_bgr[:, :, ::-1], dtype=np.uint8)
     used: list[CommonParameters] = []
     detector = None
     if has_detector:
@@ -85,18 +89,6 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
         print('\n'.join(carrying(cache_dir, used)))
-
-
-def read_picture(file: Path | None) -> NDArray[np.uint8]:
-    """Return a picture (h, w, 3) uint8, red first; that of the demo if no file is named.
-
-    ImageError: the file is no picture.
-    """
-    file = file or min((ASSETS / 'sequence' / 'rgb').iterdir())
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise ImageError(f'{file} cannot be read as a picture: name a JPEG or PNG file')
-    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
 def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,

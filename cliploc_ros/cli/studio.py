@@ -130,7 +130,10 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)
     finder = _phrase_finder(options, recording, images)
-    document = Document(options.map or _free_path())
+    # a new map gets the first name that no map has
+    names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
+    document = Document(options.map or next(
+        path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
     return Studio(document, recording, images, finder, layer)
 
@@ -151,12 +154,6 @@ def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
     clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
                        device=options.device)
     return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording, images)
-
-
-def _free_path() -> Path:
-    """Return where a new map goes: the first name that no map has."""
-    names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
-    return next(path for path in map(Path, names) if not path.exists())
 
 
 if __name__ == '__main__':

@@ -140,12 +140,8 @@ class Queries:
 def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
     """Read and validate a query file.
 
-    DatasetError: the message names file, array and error.
-
-    Parameters
-    ----------
-    landmark_ids : collection of str, optional
-        The map's landmarks; the file must contain no others.
+    With `landmark_ids`, those of a map, the file must contain no others. DatasetError: the message
+    names file, array and error.
     """
     path = Path(path)
     arrays = _SCHEMA.read(path)

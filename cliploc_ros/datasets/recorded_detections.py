@@ -23,12 +23,8 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
     "detections": [{"class_id": "book", "score": 0.58, "bbox_xyxy": [173, 138, 219, 208]}]}]}``;
     ``image_size`` is optional. A frame without detections has an empty entry.
 
-    DatasetError: the message names file, frame and field.
-
-    Parameters
-    ----------
-    image_size : (int, int), optional
-        Expected width and height of the images [px].
+    `image_size` is the expected width and height of the images [px]. DatasetError: the message
+    names file, frame and field.
     """
     path = Path(path)
 

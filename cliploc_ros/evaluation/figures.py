@@ -3,6 +3,7 @@
 """The paper's figures and others, as PNG and SVG."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
@@ -280,10 +281,21 @@ def _reliability(one: Summary) -> Figure:
 
 
 def _consistency(summaries: Sequence[Summary]) -> Figure:
+    """Draw the distribution of the normalized squared errors of accepted poses."""
     figure, axes = new_axes('squared error in its own covariance (NEES)',
                             'share of accepted poses below')
-    draw_consistency(axes, {one.method: one.nees[one.accepted] for one in summaries
-                            if one.nees.size and one.accepted.any()})
+    levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
+    axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
+              label='ideal')
+    axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
+                 label='95 % ellipsoid')
+    judged = {one.method: one.nees[one.accepted] for one in summaries
+              if one.nees.size and one.accepted.any()}
+    for (name, squares), color in zip(judged.items(), cycle(_JUDGED_COLORS), strict=False):
+        axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
+                  color=color, linewidth=1.4,
+                  label=f'{name}: {within_ellipsoid(squares):.3f} within')
+    axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
     add_legend(figure)
     return figure
 
@@ -347,10 +359,7 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
                                                             NDArray[np.bool_]]]) -> None:
     """Draw the share of right poses over confidence, with 95 % intervals.
 
-    Parameters
-    ----------
-    judged : mapping of str to (ndarray (n,), ndarray (n,) of bool)
-        Confidences, and whether each pose is right, by name.
+    `judged` maps names to confidences (n,) and to whether each pose is right (n,).
     """
     axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
     for number, (name, (confidence, right)) in enumerate(judged.items()):
@@ -365,28 +374,6 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
                           markersize=5, linewidth=1.0,
                           label=f'{name} ({len(right)} poses)' if row == bins.min() else None)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-
-
-def draw_consistency(axes: Axes, nees: Mapping[str, NDArray[np.float64]]) -> None:
-    """Draw the distribution of the normalized squared errors (NEES).
-
-    Parameters
-    ----------
-    nees : mapping of str to ndarray (n,)
-        Of accepted poses, by name, see normalized_square.
-    """
-    levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
-    axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
-              label='ideal')
-    axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
-                 label='95 % ellipsoid')
-    for number, (name, squares) in enumerate(nees.items()):
-        if not len(squares):
-            continue
-        axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
-                  color=_JUDGED_COLORS[number % len(_JUDGED_COLORS)], linewidth=1.4,
-                  label=f'{name}: {within_ellipsoid(squares):.3f} within')
-    axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
 
 
 def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:

@@ -78,10 +78,7 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
 def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]:
     """Return queries with the features of their images; those without an image stay.
 
-    Parameters
-    ----------
-    queries : sequence of Query
-        Recorded from these frames.
+    The queries were recorded from these frames.
     """
     waiting: dict[int, deque[int]] = defaultdict(deque)
     for row, query in enumerate(queries):

@@ -36,7 +36,7 @@ from cliploc_ros.evaluation.summary import (
 )
 from cliploc_ros.evaluation.trials import Query, Result, run_trial
 from cliploc_ros.files.log import Log
-from cliploc_ros.files.parallel import MakeWork, run_tasks
+from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
 from cliploc_ros.units import NS_PER_S
 
@@ -48,28 +48,6 @@ _AT = '@'
 
 class RunError(CliplocError):
     """The run could not be finished."""
-
-
-def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
-    """Return the outcomes of all tasks, in their order; show a progress bar.
-
-    RunError: workers died at a task: without its outcomes the rest would not be a fair sample.
-
-    Parameters
-    ----------
-    make_search : MakeWork
-        Makes the function that returns the outcomes of a task, a sequence.
-    what : str
-        Name of the tasks in the plural.
-    """
-    found = {}
-    with closing(run_tasks(make_search, tasks, workers=workers)) as results:
-        for task, outcomes in tqdm(results, what, len(tasks), disable=None):
-            if outcomes is None:
-                raise RunError(f'workers died again and again at one of the {what}; use fewer '
-                               '--workers')
-            found[task] = outcomes
-    return [one for task in tasks for one in found[task]]
 
 
 class _Part(NamedTuple):
@@ -223,8 +201,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
         write_text(out / 'results.json', as_json(own))
         write_text(out / 'summary.csv', as_csv(summaries))
         if figures:
-            _draw(out, parts_of(landmark_map)[0].landmark_map, queries, own, summaries,
-                  _by_count(summarize(results), methods), frames)
+            _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results, summaries,
+                  methods, frames)
         log.remove()
     print(f'results: {out.resolve()}', flush=True)
     return summaries
@@ -233,12 +211,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
 def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
     """Return the results of an unfinished run, or begin the log of a new one.
 
-    OptionsError: the log belongs to another run (names what differs), or is damaged.
-
-    Parameters
-    ----------
-    run : mapping
-        Description of the run, as JSON keeps it.
+    `run` is the description of the run, as JSON keeps it. OptionsError: the log belongs to another
+    run (names what differs), or is damaged.
     """
     entries, is_damaged = log.read()
     if not (entries or is_damaged):
@@ -291,31 +265,27 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Seque
 
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
-          results: Sequence[Result], summaries: Sequence[Summary],
-          sweep: dict[str, dict[int, Summary]], frames: Sequence[QueryFrame]) -> None:
+          results: Sequence[Result], summaries: Sequence[Summary], methods: Sequence[Method],
+          frames: Sequence[QueryFrame]) -> None:
     try:
         from cliploc_ros.evaluation.figures import draw_all
     except ImportError as error:
         print(f'no figures: {error}; install matplotlib', flush=True)
         return
-    observing = {stage: np.array([getattr(frame, name) for frame in frames])
-                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
-    draw_all(out, landmark_map, queries, results, summaries, sweep,
-             {stage: float(np.nanmean(times)) for stage, times in observing.items()
-              if np.isfinite(times).any()})
-
-
-def _by_count(summaries: Sequence[Summary], methods: Sequence[Method]
-              ) -> dict[str, dict[int, Summary]]:
-    """Return the summaries of each sampling method, by their number of iterations."""
-    counts: dict[str, dict[int, Summary]] = {}
+    # the summaries of each sampling method, by their number of iterations
+    sweep: dict[str, dict[int, Summary]] = {}
     iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
-    for one in summaries:
+    for one in summarize(results):
         name, _, count = one.method.partition(_AT)
         if name in iterations:
-            counts.setdefault(name, {})[int(count or iterations[name])] = one
-    return {name: dict(sorted(found.items())) for name, found in counts.items()
-            if len(found) > 1}
+            sweep.setdefault(name, {})[int(count or iterations[name])] = one
+    observing = {stage: np.array([getattr(frame, name) for frame in frames])
+                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
+    draw_all(out, landmark_map, queries, [one for one in results if _AT not in one.method],
+             summaries, {name: dict(sorted(found.items())) for name, found in sweep.items()
+                         if len(found) > 1},
+             {stage: float(np.nanmean(times)) for stage, times in observing.items()
+              if np.isfinite(times).any()})
 
 
 def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:

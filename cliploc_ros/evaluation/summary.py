@@ -122,10 +122,7 @@ def wilson_interval(right: float, count: float, deviations: float = 1.96) -> tup
 def summarize(results: Iterable[Result]) -> list[Summary]:
     """Return a summary of each method, in their order.
 
-    Parameters
-    ----------
-    results : iterable of Result
-        Sorted by method, trial and query, as run_methods returns them.
+    The results are sorted by method, trial and query, as run_methods returns them.
     """
     return [_summary(method, list(rows))
             for method, rows in groupby(results, key=lambda result: result.method)]
@@ -198,12 +195,8 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     """Return the cells of the table, its header first.
 
     A '~' marks methods that the queries are too few to separate from the best one. Where a method
-    used keyframes, there are columns for the source of its poses.
-
-    Parameters
-    ----------
-    summaries : sequence of Summary
-        Of the same queries.
+    used keyframes, there are columns for the source of its poses. All summaries are of the same
+    queries.
     """
     best = find_best(summaries)
     rows = [_HEADER, *(_row(one, best) for one in summaries)]

@@ -95,12 +95,8 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
                  ) -> tuple[Query, ...]:
     """Return the queries of a file, with similarities in the map's order.
 
-    DatasetError: the queries were recorded against another map.
-
-    Parameters
-    ----------
-    every_frame : bool
-        Use the neighbouring frames as queries, too.
+    With `every_frame` the neighbouring frames are queries, too. DatasetError: the queries were
+    recorded against another map.
     """
     column = {one: number for number, one in enumerate(queries.landmark_ids)}
     missing = [one for one in landmark_map.landmark_ids if one not in column]
@@ -124,10 +120,7 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
     """Run one trial of a method, numbered from 0, on some queries.
 
-    Parameters
-    ----------
-    keyframes : KeyframeLocalizer, optional
-        Of the map's layer, for methods that use keyframes and queries with features.
+    `keyframes` are of the map's layer, for methods that use keyframes and queries with features.
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))

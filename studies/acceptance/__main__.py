@@ -12,8 +12,10 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +23,8 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.run import run_all
+from cliploc_ros.evaluation.run import RunError
+from cliploc_ros.files.parallel import MakeWork, run_tasks
 from cliploc_ros.files.storage import make_folder
 from studies.acceptance import fit
 from studies.acceptance.looks import (
@@ -50,6 +53,28 @@ from studies.worlds.places import KINDS
 # compared: on demand, such a pose would be taken from the first of them.
 _LOWEST = 1e-6
 _EXCHANGED = 'share of the landmarks that have exchanged places'
+
+
+def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
+    """Return the outcomes of all tasks, in their order; show a progress bar.
+
+    RunError: workers died at a task: without its outcomes the rest would not be a fair sample.
+
+    Parameters
+    ----------
+    make_search : MakeWork
+        Makes the function that returns the outcomes of a task, a sequence.
+    what : str
+        Name of the tasks in the plural.
+    """
+    found = {}
+    with closing(run_tasks(make_search, tasks, workers=workers)) as results:
+        for task, outcomes in tqdm(results, what, len(tasks), disable=None):
+            if outcomes is None:
+                raise RunError(f'workers died again and again at one of the {what}; use fewer '
+                               '--workers')
+            found[task] = outcomes
+    return [one for task in tasks for one in found[task]]
 
 
 def _judge(options: argparse.Namespace) -> None:

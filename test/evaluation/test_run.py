@@ -17,7 +17,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.queries import Queries
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.evaluation.methods import parse_methods
-from cliploc_ros.evaluation.run import RunError, count_trials, read_results, run_all, run_methods
+from cliploc_ros.evaluation.run import count_trials, read_results, run_methods
 from cliploc_ros.evaluation.summary import notes, summarize
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.files.log import Log
@@ -42,23 +42,6 @@ def without_times(results):
 @pytest.fixture(scope='module')
 def results(room, questions, methods):
     return run_methods(room, methods, questions, trials=3)
-
-
-class MakeEven:
-    """Makes a function that returns a number twice, and dies at 7."""
-
-    def __call__(self):
-        def work(task):
-            if task == 7:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return [task, task]
-        return work
-
-
-def test_outcomes_are_all_there_in_order_or_there_are_none():
-    assert run_all(MakeEven(), range(4), 'numbers', 2) == [0, 0, 1, 1, 2, 2, 3, 3]
-    with pytest.raises(RunError, match='workers died again and again at one of the numbers'):
-        run_all(MakeEven(), range(9), 'numbers', 2)
 
 
 def test_every_method_trial_and_query_is_there(results, methods, questions):

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of precision and recall: every request counts once, in every mode that is possible."""
 
+import os
 import re
+import signal
 
 import pytest
 
 from cliploc_ros.errors import CliplocError
-from studies.acceptance.__main__ import run
+from cliploc_ros.evaluation.run import RunError
+from studies.acceptance.__main__ import run, run_all
 from studies.acceptance.places import ALL, FIVE, MODES, ONE, Simulated
 from studies.acceptance.searches import Outcome, acceptance_table
 
@@ -66,3 +69,20 @@ def test_a_place_elsewhere_has_false_accepts_only():
 def test_bad_options_are_named(words):
     with pytest.raises(CliplocError):
         run(words.split())
+
+
+class MakeEven:
+    """Makes a function that returns a number twice, and dies at 7."""
+
+    def __call__(self):
+        def work(task):
+            if task == 7:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return [task, task]
+        return work
+
+
+def test_outcomes_are_all_there_in_order_or_there_are_none():
+    assert run_all(MakeEven(), range(4), 'numbers', 2) == [0, 0, 1, 1, 2, 2, 3, 3]
+    with pytest.raises(RunError, match='workers died again and again at one of the numbers'):
+        run_all(MakeEven(), range(9), 'numbers', 2)

@@ -117,12 +117,8 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
 def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:
     """Return an imported map fitted to the boxes of an observation file.
 
+    `keep_unsupported` keeps landmarks that cannot be fitted, where the file has them.
     CliplocError: the file is invalid, or nothing can be fitted to it.
-
-    Parameters
-    ----------
-    keep_unsupported : bool
-        Keep landmarks that cannot be fitted, where the file has them.
     """
     detections = load_observations(observations)
     before = imported.landmark_map

@@ -55,12 +55,8 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read the objects of a GOReloc map, NAME.objects.
 
     Class weights are the counts of its categories. An object without a category, or that is no
-    ellipsoid, is left out. DatasetError: the message names the file and what is wrong with it.
-
-    Parameters
-    ----------
-    class_names : sequence of str
-        Of the category indices.
+    ellipsoid, is left out. `class_names` are those of the category indices. DatasetError: the
+    message names the file and what is wrong with it.
     """
     given = GivenMap([], [], [])
     try:
