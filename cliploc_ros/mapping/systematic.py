@@ -222,7 +222,7 @@ def linearize_boxes(views: Views, rows: NDArray[np.int64], numbers: NDArray[np.i
     """Return residuals and derivatives of some rows, whose landmarks are numbers."""
     count = len(rows)
     linear = Linear(np.zeros((count, 4)), np.zeros((count, 4)),
-                     np.zeros((count, 4, LANDMARK_SIZE)), np.zeros((count, 4, POSE_SIZE)))
+                    np.zeros((count, 4, LANDMARK_SIZE)), np.zeros((count, 4, POSE_SIZE)))
     _linearize_all(views, rows, numbers, landmarks.centers, landmarks.bases, *linear)
     return linear
 

@@ -111,7 +111,7 @@ class Look:
         assert frame.map_from_camera is not None
         start = time.perf_counter()
         detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
-                                                                  MAX_DETECTIONS)
+                                                         MAX_DETECTIONS)
         detected = time.perf_counter()
         bboxes, open_edges = _undistorted(detections, camera)
         rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN

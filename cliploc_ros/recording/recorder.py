@@ -202,7 +202,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
     entries, _ = log.read()
     seen: dict[int, SeenFrame] = {}
     if entries[:1] == [run]:
-        seen = {one.place: one for one in entries[1:]}
+        seen = {one.place: one for one in entries[1:] if isinstance(one, SeenFrame)}
     else:
         log.restart([run])
     if seen:
@@ -221,9 +221,9 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
 
 
 def _parse_entry(line: bytes) -> Any:
-    """Return the first entry, which says what run it is, or the frame of any other one."""
+    """Return what run it is, which the first entry says, or the frame of any other entry."""
     entry = json.loads(line)
-    return SeenFrame.from_bytes(base64.b64decode(entry['frame'])) if 'frame' in entry else entry
+    return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
 
 
 @contextmanager

@@ -134,8 +134,8 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not file.exists()
-    with journal.open('ab') as cut_off:
-        cut_off.write(b'\x00\x10')
+    with journal.open('ab') as damaged:
+        damaged.write(b'{"run": 1}\n{"other": 1}\n[]\n\x00\x10')
     assert main(command) == 0
     assert_equal(load_recorded(file), load_recorded(recorded))
     assert not journal.exists()
