@@ -8,14 +8,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from cliploc_ros.command import run_main
 from cliploc_ros.datasets.bags import STORAGES
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 
 EPILOG = """\
 topics (with --prefix camera: /camera/image and so on):
@@ -58,16 +52,23 @@ def make_parser() -> argparse.ArgumentParser:
     images.add_argument('--compressed', dest='image_format', action='store_const',
                         const='compressed',
                         help='write the bytes of the image files as compressed images')
-    defaults = ConversionOptions()
-    parser.add_argument('--prefix', default=defaults.prefix, help='namespace of all topics')
-    parser.add_argument('--camera-frame', default=defaults.camera_frame,
+    parser.add_argument('--prefix', default='', help='namespace of all topics')
+    parser.add_argument('--camera-frame', default='camera_optical_frame',
                         help='default: %(default)s')
-    parser.add_argument('--world-frame', default=defaults.world_frame, help='default: %(default)s')
+    parser.add_argument('--world-frame', default='world', help='default: %(default)s')
     return parser
 
 
 def convert(options: argparse.Namespace) -> int:
     """Convert, and print what was written and how many images lack something."""
+    # Late, so that --help is fast.
+    from tqdm import tqdm
+
+    from cliploc_ros.datasets.intrinsics import find_camera
+    from cliploc_ros.datasets.recorded_detections import read_recorded_detections
+    from cliploc_ros.datasets.tum import read_tum
+    from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+
     begin = time.monotonic()
     sequence = read_tum(options.folder).every(options.every)
     camera, origin = find_camera(options.intrinsics, options.folder)
