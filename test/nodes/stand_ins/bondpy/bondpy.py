@@ -8,6 +8,7 @@ The message is a KeyValue, whose fields check their types, in place of bond/msg/
 import threading
 
 from diagnostic_msgs.msg import KeyValue
+from rclpy.duration import Duration
 
 
 class Bond:
@@ -42,4 +43,6 @@ class Bond:
         self.sub.destroy()
         self._ended.set()
         self._publish('dead')
+        # the real one may lose this message; its peer then misses the heartbeat instead
+        self.pub.wait_for_all_acked(Duration(seconds=5))
         self.pub.destroy()
