@@ -123,10 +123,7 @@ def needs_ros(program: str) -> Iterator[None]:
 def running_ros(args: Sequence[str]) -> Iterator[None]:
     """Run rclpy without its signal handlers.
 
-    Raises
-    ------
-    OptionsError
-        It does not start with these arguments.
+    OptionsError: it does not start with these arguments.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions

@@ -60,10 +60,7 @@ class CameraInfoMessage(Protocol):
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
     """Return an image (h, w, 3) uint8, red first.
 
-    Raises
-    ------
-    ImageError
-        A field is invalid; the message names it.
+    ImageError: a field is invalid; the message names it.
     """
     return _decoded(msg) if isinstance(msg, CompressedImageMessage) else _unpacked(msg)
 
@@ -102,10 +99,7 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
 def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
     """Return width and height as a JPEG or PNG declares them, before it is decoded.
 
-    Raises
-    ------
-    ImageError
-        The data is neither.
+    ImageError: the data is neither.
     """
     if data.startswith(_PNG) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])

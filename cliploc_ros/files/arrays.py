@@ -124,10 +124,7 @@ class Schema:
     def read(self, path: Path) -> dict[str, NDArray[Any]]:
         """Return the arrays of a file, validated; optional ones that it lacks are missing.
 
-        Raises
-        ------
-        CliplocError
-            Names the file, the array, what is wrong with it, and what to do.
+        CliplocError: names the file, the array, what is wrong with it, and what to do.
         """
         if not path.is_file():
             raise self.error(f'{path}: no such {self.kind}')
@@ -145,10 +142,7 @@ class Schema:
     def write(self, path: Path, arrays: Arrays, compress: bool = False) -> None:
         """Write a file in one step: an existing file is replaced complete, or stays.
 
-        Raises
-        ------
-        CliplocError
-            The arrays are invalid, or the file cannot be written.
+        CliplocError: the arrays are invalid, or the file cannot be written.
         """
         save: Any = np.savez_compressed if compress else np.savez
         try:

@@ -322,10 +322,7 @@ def _connect(address: str) -> Iterator['Client']:
 def _check_package(client: 'Client', address: str) -> None:
     """Refuse workers whose results may differ.
 
-    Raises
-    ------
-    WorkersError
-        A worker has other sources of this package, or none.
+    WorkersError: a worker has other sources of this package, or none.
     """
     def look() -> str | None:
         # sent by value, so that it runs where this package is missing

@@ -27,10 +27,7 @@ def replace_file(path: Path) -> Iterator[Path]:
     removes it, and the old file stays. A symbolic link is followed and stays, and an existing
     file keeps its mode.
 
-    Raises
-    ------
-    OSError
-        The folder is missing, read-only or full.
+    OSError: the folder is missing, read-only or full.
     """
     path = Path(os.path.realpath(path))
     partial = path.with_name(f'.{os.getpid()}.{path.name}')
@@ -49,10 +46,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 def make_folder(folder: Path) -> None:
     """Create the output folder and its parents.
 
-    Raises
-    ------
-    OptionsError
-        The folder cannot be created or written to.
+    OptionsError: the folder cannot be created or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -135,10 +135,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
               progress: Progress | None = None) -> BuiltMap:
     """Build a map from posed detections.
 
-    Raises
-    ------
-    MappingError
-        No map can be made of this input; the message says what to correct.
+    MappingError: no map can be made of this input; the message says what to correct.
     """
     options = options or MappingOptions()
     tell = progress or (lambda stage, share: None)

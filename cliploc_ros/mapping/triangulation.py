@@ -124,10 +124,7 @@ def correct_scale(views: Views, detections: PosedDetections, scale: float | None
                   ) -> tuple[Views, list[str]]:
     """Return the views with depth of the right scale, and notes.
 
-    Raises
-    ------
-    MappingError
-        The scale is so far off that depth must have another unit.
+    MappingError: the scale is so far off that depth must have another unit.
     """
     if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
         return views, []

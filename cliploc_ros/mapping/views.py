@@ -138,10 +138,7 @@ def number_viewpoints(map_from_camera: NDArray[np.float64]) -> NDArray[np.int64]
 def check_input(detections: PosedDetections, views: Views, options: MappingOptions) -> list[str]:
     """Return notes on the input.
 
-    Raises
-    ------
-    MappingError
-        No map can be made of it; the message says what to correct.
+    MappingError: no map can be made of it; the message says what to correct.
     """
     if len(detections.classes) == 0:
         raise MappingError(f'the {len(detections)} frames have no detections; check the detector, '

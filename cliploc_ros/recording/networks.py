@@ -76,10 +76,7 @@ class LoadNetworks:
     def __call__(self) -> Callable[[RawFrame], SeenFrame]:
         """Return the function that looks at a frame.
 
-        Raises
-        ------
-        ModelError, OptionsError
-            From loading.
+        ModelError or OptionsError: from loading.
         """
         if self.threads:
             import torch
@@ -101,10 +98,7 @@ class Look:
     def __call__(self, raw: RawFrame) -> SeenFrame:
         """Return what the networks say about a frame with a pose.
 
-        Raises
-        ------
-        DatasetError
-            The image or depth image cannot be used.
+        DatasetError: the image or depth image cannot be used.
         """
         frame = raw.decode()
         camera = frame.camera

@@ -247,10 +247,7 @@ def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, en
               described: str) -> Recorded:
     """Return the observations of frames in the order of time.
 
-    Raises
-    ------
-    DatasetError
-        There are no frames, or they are of several cameras.
+    DatasetError: there are no frames, or they are of several cameras.
     """
     if not seen:
         raise DatasetError(f'{source}: none of {keyframes.asked} images has a pose; interpolate '

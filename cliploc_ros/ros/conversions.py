@@ -80,10 +80,7 @@ class DetectionType(NamedTuple):
 def detection_type(package: str) -> DetectionType:
     """Return the message type of a package.
 
-    Raises
-    ------
-    OptionsError
-        The package is not installed.
+    OptionsError: the package is not installed.
     """
     if package == 'vision_msgs':
         return DetectionType(Detection2DArray, lambda msg: msg)

@@ -184,10 +184,7 @@ class FrameLocalizer:
     def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'FrameLocalizer':
         """Return a localizer for the map as it is now; the encoder stays the same.
 
-        Raises
-        ------
-        CliplocError
-            Names what to fix in the map; this localizer stays as it was.
+        CliplocError: names what to fix in the map; this localizer stays as it was.
         """
         options = parameters.options()
         files = map_files(parameters)
@@ -208,10 +205,7 @@ class FrameLocalizer:
         `parameters` are as they are now, `state` is that at the stamp of the frame. No crops are
         compared after `deadline` (monotonic clock) [s].
 
-        Raises
-        ------
-        CliplocError
-            Names what to fix in the frame or in the parameters.
+        CliplocError: names what to fix in the frame or in the parameters.
         """
         times.begin('decoding')
         image = image_from_msg(frame.image)
@@ -295,10 +289,7 @@ class FrameLocalizer:
 def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocalizer:
     """Load map and, if the matching type asks for it, CLIP.
 
-    Raises
-    ------
-    CliplocError
-        Names the file, parameter or download to mend.
+    CliplocError: names the file, parameter or download to mend.
     """
     if parameters.cache_dir:
         KERNEL_FOLDERS.prefer(resolve_cache_dir(parameters.cache_dir) / 'kernels')

@@ -68,10 +68,7 @@ def map_files(parameters: RelocalizerParameters) -> list[str]:
 def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
     """Return the map of files, or of the node's own parameters where no file is given.
 
-    Raises
-    ------
-    MapError
-        Names the source, the landmark and the field to fix.
+    MapError: names the source, the landmark and the field to fix.
     """
     if files:
         return join_maps([LandmarkMap.from_file(file) for file in files], files)
@@ -101,10 +98,7 @@ def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]
     The hash is the beginning of what `cat FILE... | sha256sum` prints. A map in parameters has
     the hash of its landmarks.
 
-    Raises
-    ------
-    MapError
-        See load_map; or a file changes again and again.
+    MapError: see load_map; or a file changes again and again.
     """
     for _ in range(_ATTEMPTS):
         before = _hash_of(files)

@@ -198,10 +198,7 @@ class RelocalizerParameters(CommonParameters):
     def options(self) -> RelocalizerOptions:
         """Return the method's options.
 
-        Raises
-        ------
-        OptionsError
-            Names the parameter and its allowed values.
+        OptionsError: names the parameter and its allowed values.
         """
         names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s',
                                                                   'height_range_m'}

@@ -79,11 +79,8 @@ class PlayReport:
 class Player:
     """Publishes an open recording; `stop` ends every wait and the playback within milliseconds.
 
-    Raises
-    ------
-    DatasetError
-        If nothing is left to play, a topic is not recorded, or a type is not installed or
-        has another definition.
+    DatasetError: if nothing is left to play, a topic is not recorded, or a type is not installed
+    or has another definition.
     """
 
     def __init__(
@@ -108,10 +105,7 @@ class Player:
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
         """Wait until each of some topics, by recorded name, has a subscriber; of all if empty.
 
-        Raises
-        ------
-        DatasetError
-            If a topic is not played, or has no subscriber in time; the message names it.
+        DatasetError: if a topic is not played, or has no subscriber in time; the message names it.
         """
         names = list(topics) or list(self._publishers)
         if unknown := [name for name in names if name not in self._publishers]:
@@ -130,10 +124,7 @@ class Player:
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
         """Publish the messages, each at its time; `on_message` is called after each.
 
-        Raises
-        ------
-        DatasetError
-            Where the recording is damaged.
+        DatasetError: where the recording is damaged.
         """
         counts = self._publish_latched()
         messages = self._read_ahead()
@@ -258,10 +249,7 @@ class _Ticker:
 def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
     """Return the topics to play.
 
-    Raises
-    ------
-    DatasetError
-        If a named topic is not recorded, or nothing is left to play.
+    DatasetError: if a named topic is not recorded, or nothing is left to play.
     """
     names = list(reader.topics) if options.topics is None else list(options.topics)
     for name in (*names, *options.exclude, *options.remap):
@@ -278,10 +266,7 @@ def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
 def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
     """Make a publisher, named before ROS's own remapping, with the QoS that was recorded.
 
-    Raises
-    ------
-    DatasetError
-        If the type is not installed, or differs from the recorded one.
+    DatasetError: if the type is not installed, or differs from the recorded one.
     """
     publisher: Publisher = node.create_publisher(
         message_class(topic), name, qos_profile(topic.offered_qos)
@@ -293,10 +278,7 @@ def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
 def message_class(topic: BagTopic) -> Any:
     """Return the installed class of a topic's messages.
 
-    Raises
-    ------
-    DatasetError
-        Naming the package to install.
+    DatasetError: naming the package to install.
     """
     package, _, name = topic.msgtype.partition('/')
     namespace, _, name = name.rpartition('/')

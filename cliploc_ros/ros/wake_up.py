@@ -248,10 +248,7 @@ class WakeUp(Node):
     def run(self) -> Outcome:
         """Look until a pose is accepted or time is up; end a turn under way in any case.
 
-        Raises
-        ------
-        KeyboardInterrupt
-            The event is set; no turn is under way.
+        KeyboardInterrupt: the event is set; no turn is under way.
         """
         try:
             return self._look_about()

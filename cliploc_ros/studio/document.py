@@ -41,10 +41,7 @@ class Document:
     notes : tuple of str
         What a person should know of the files.
 
-    Raises
-    ------
-    CliplocError
-        The file is no map, another studio edits it, or its folder is not writable.
+    CliplocError: the file is no map, another studio edits it, or its folder is not writable.
     """
 
     def __init__(self, path: Path):

@@ -50,10 +50,8 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
     """Return some searched frames, the last one of which is to be localized.
 
-    Raises
-    ------
-    OptionsError
-        odom_from_camera is missing or no rigid transform; there are no frames or too many.
+    OptionsError: odom_from_camera is missing or no rigid transform; there are no frames or too
+    many.
     """
     cameras = cameras_from_last([one.observation for one in frames])
     rig = make_rig([one.scene for one in frames], cameras,

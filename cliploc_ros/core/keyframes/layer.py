@@ -209,10 +209,7 @@ def layer_path(map_path: str | os.PathLike[str]) -> Path:
 def save_layer(path: Path, layer: KeyframeLayer) -> None:
     """Write a layer in one step: an existing file is replaced complete, or stays.
 
-    Raises
-    ------
-    MapError
-        The file cannot be written.
+    MapError: the file cannot be written.
     """
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
@@ -230,10 +227,7 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
 def remove_layer(map_path: str | os.PathLike[str]) -> str:
     """Remove the layer of a map that another one has replaced; return a note, '' without one.
 
-    Raises
-    ------
-    MapError
-        The file cannot be removed.
+    MapError: the file cannot be removed.
     """
     path = layer_path(map_path)
     try:
@@ -249,10 +243,7 @@ def remove_layer(map_path: str | os.PathLike[str]) -> str:
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
     """Read the layer of a map.
 
-    Raises
-    ------
-    MapError
-        The file is invalid or belongs to another map; says what to do.
+    MapError: the file is invalid or belongs to another map; says what to do.
     """
     arrays = _SCHEMA.read(path)
     try:

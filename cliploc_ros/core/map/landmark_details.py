@@ -67,10 +67,7 @@ def read_details(tree: Mapping[str, Any], where: str) -> LandmarkDetails:
     Labels are two lists of equal length, ``{text: [...], weight: [...]}``, since a ROS parameter
     holds no list of mappings; such a list, ``[{text: ..., weight: ...}, ...]``, is read as well.
 
-    Raises
-    ------
-    MapError
-        Names the landmark and the field to correct.
+    MapError: names the landmark and the field to correct.
     """
     values: dict[str, Any] = {}
     for name in OPTIONAL_FIELDS:

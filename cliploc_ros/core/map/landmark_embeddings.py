@@ -104,10 +104,7 @@ def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Seque
 
     Landmarks that were removed from the map are left out, and added ones are unknown.
 
-    Raises
-    ------
-    MapError
-        The file is invalid, or it has none of these landmarks.
+    MapError: the file is invalid, or it has none of these landmarks.
     """
     path = embeddings_path(map_path)
     if not path.exists():
@@ -121,10 +118,7 @@ def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Seque
 def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings:
     """Read and validate a file of landmark embeddings.
 
-    Raises
-    ------
-    MapError
-        Names the file, the array, what is wrong with it, and what to do.
+    MapError: names the file, the array, what is wrong with it, and what to do.
     """
     arrays = _SCHEMA.read(Path(path))
     return LandmarkEmbeddings(
@@ -137,10 +131,7 @@ def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkE
                              ) -> None:
     """Write landmark embeddings in one step: an existing file is replaced complete, or stays.
 
-    Raises
-    ------
-    MapError
-        The embeddings are malformed, or the file cannot be written.
+    MapError: the embeddings are malformed, or the file cannot be written.
     """
     _SCHEMA.write(Path(path), {
         'encoder_key': np.array(embeddings.encoder_key, dtype=np.str_),

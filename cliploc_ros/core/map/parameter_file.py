@@ -55,11 +55,8 @@ _PLAIN = 6
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the tree of a YAML file: dicts, lists, str, int, float, bool and None.
 
-    Raises
-    ------
-    MapError
-        The file is unreadable, not a regular file, too large, no YAML mapping, nested too deeply,
-        or has an alias or a repeated key. The message names file and line.
+    MapError: the file is unreadable, not a regular file, too large, no YAML mapping, nested too
+    deeply, or has an alias or a repeated key. The message names file and line.
     """
     return parse_parameters(read_text(path), path)
 
@@ -67,10 +64,7 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
 def read_text(path: str | os.PathLike[str]) -> str:
     """Return the text of a regular file in UTF-8 that is not too large.
 
-    Raises
-    ------
-    MapError
-        Names the file and what is wrong with it.
+    MapError: names the file and what is wrong with it.
     """
     path = Path(path)
     try:

@@ -104,10 +104,7 @@ def check_k(k: int, landmark_count: int) -> None:
 def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    Raises
-    ------
-    OptionsError
-        The map has fewer than k landmarks.
+    OptionsError: the map has fewer than k landmarks.
     """
     detection_count, landmark_count = similarities.shape
     check_k(k, landmark_count)

@@ -80,11 +80,8 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                  options: RelocalizerOptions, deadline: float) -> SearchedFrame:
     """Search one frame, until a deadline of time.perf_counter [s].
 
-    Raises
-    ------
-    OptionsError
-        Similarities that the matching type needs are missing or of the wrong shape, or the
-        vertical is no unit vector.
+    OptionsError: similarities that the matching type needs are missing or of the wrong shape, or
+    the vertical is no unit vector.
     """
     scene, left_out = match_frame(landmark_map, observation, options)
     vertical = _vertical(observation, options)

@@ -36,10 +36,7 @@ class CoordinateFrames:
     def open(self) -> 'TransformBuffer':
         """Listen to transforms from now on, so that those of the first image are known.
 
-        Raises
-        ------
-        NoTransformError
-            tf2_ros is not installed.
+        NoTransformError: tf2_ros is not installed.
         """
         buffer = self._buffer
         if buffer is None:
@@ -96,10 +93,7 @@ class CoordinateFrames:
 
         The error says to publish it, or `remedy`.
 
-        Raises
-        ------
-        NoTransformError
-            tf2 is not installed or has no such transform in time.
+        NoTransformError: tf2 is not installed or has no such transform in time.
         """
         buffer = self.open()
         try:

@@ -223,10 +223,7 @@ class FrameSource:
     def open(self) -> None:
         """Allow calls of next_frame.
 
-        Raises
-        ------
-        OptionsError
-            The type of the detections is not installed.
+        OptionsError: the type of the detections is not installed.
         """
         with self._changed:
             self._detections = detection_type(self._package)

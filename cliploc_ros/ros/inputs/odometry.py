@@ -171,10 +171,7 @@ class OdometryWindow:
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64]:
         """Return odom_from_robot (4, 4) at an instant, between two messages by interpolation.
 
-        Raises
-        ------
-        NoOdometryError
-            The instant is before or after all poses, or in a gap between them.
+        NoOdometryError: the instant is before or after all poses, or in a gap between them.
         """
         row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         if row < len(self._poses) and self._poses[row].stamp_ns == stamp_ns:
@@ -408,10 +405,7 @@ class OdometrySource:
     def pose_at(self, stamp: Time) -> BodyPose:
         """Return where odometry had the robot at the stamp of an image.
 
-        Raises
-        ------
-        NoOdometryError
-            Odometry does not cover that time.
+        NoOdometryError: odometry does not cover that time.
         """
         at_ns = stamp_ns(stamp)
         with self._heard:

@@ -97,10 +97,7 @@ class RobotStateSource:
         While the mount is not known, half of the time until `deadline` (monotonic clock) [s] may
         pass, and half remains for a newer image.
 
-        Raises
-        ------
-        NoTransformError
-            The mount is not known.
+        NoTransformError: the mount is not known.
         """
         camera_from_base = self._mount(image, parameters, deadline)
         up_in_camera = None

@@ -80,10 +80,7 @@ class ParameterRow:
     def validated(self, value: Any) -> Value:
         """Return a value in the parameter's type; an integer becomes a float where that is meant.
 
-        Raises
-        ------
-        OptionsError
-            Names the parameter and what it allows.
+        OptionsError: names the parameter and what it allows.
         """
         if isinstance(self.default, float) and type(value) is int:
             value = float(value)
@@ -169,10 +166,7 @@ class NodeParameters[P: Parameters]:
     def snapshot(self) -> P:
         """Return the values.
 
-        Raises
-        ------
-        OptionsError
-            A value given at start-up is not allowed, or the values do not fit together.
+        OptionsError: a value given at start-up is not allowed, or the values do not fit together.
         """
         if self._problems:
             raise OptionsError('parameter ' + '; '.join(self._problems.values()))

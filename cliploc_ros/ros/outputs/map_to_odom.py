@@ -46,10 +46,7 @@ class MapToOdom:
     def open(self) -> None:
         """Broadcast from now on, as soon as there is a pose.
 
-        Raises
-        ------
-        NoTransformError
-            tf2_ros is not installed.
+        NoTransformError: tf2_ros is not installed.
         """
         try:
             from tf2_ros import TransformBroadcaster
