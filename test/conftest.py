@@ -127,6 +127,13 @@ def pytest_sessionfinish(session, exitstatus):
 
 
 @pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    from crash_proof import CrashProofScheduling  # pytest-xdist may be missing
+
+    return CrashProofScheduling(config, log)
+
+
+@pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node, error):
     """Take over a worker's list of tests that do not run; every worker has the same."""
     node.config.stash[NOT_RUN] |= getattr(node, 'workeroutput', {}).get('not_run', {})
