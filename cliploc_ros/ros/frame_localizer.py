@@ -196,7 +196,7 @@ class FrameLocalizer:
             observer = observer.with_labels(embed_map(
                 _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings))
         return FrameLocalizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
-                         load_keyframes(parameters, landmark_map))
+                              load_keyframes(parameters, landmark_map))
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -230,7 +230,7 @@ class FrameLocalizer:
             found = localizer.localize(observation, crops=crops, recognizer=recognizer)
         else:
             found = localizer.localize(observation, place.run, parameters.fuse_frames,
-                                     parameters.fuse_window_s, crops, recognizer)
+                                       parameters.fuse_window_s, crops, recognizer)
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
@@ -305,7 +305,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
-                     load_keyframes(parameters, landmark_map))
+                          load_keyframes(parameters, landmark_map))
 
 
 def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated sensors besides the camera, made of the true poses and of noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.observation import Observation
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query
 
@@ -32,30 +31,7 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
     found = []
     for query in queries:
         rng = np.random.default_rng([seed, query.number])
-        up = _turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
-        found.append(replace(query, observation=replace(query.observation, up_in_camera=up)))
-    return tuple(found)
-
-
-def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg: float,
-                     seed: int = 0) -> tuple[Query, ...]:
-    """Return queries with a known vertical, wrong by the same in all frames of a group.
-
-    That is the error of a sensor, or of its mount.
-
-    Parameters
-    ----------
-    groups : sequence of int
-        The group of each.
-    noise_deg : float
-        Standard deviation of the error on each of two axes [deg].
-    seed : int
-        Equal seeds give equal noise.
-    """
-    found = []
-    for query, group in zip(queries, groups, strict=True):
-        turn = np.radians(noise_deg) * np.random.default_rng([seed, abs(group), 2]).normal(size=3)
-        up = Rotation.from_rotvec(turn).apply(query.map_from_camera[2, :3])
+        up = turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
         found.append(replace(query, observation=replace(query.observation, up_in_camera=up)))
     return tuple(found)
 
@@ -97,65 +73,6 @@ def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: fl
     return tuple(found[query.number] for query in queries)
 
 
-def tilted_vertical(queries: Sequence[Query], angle_deg: float, seed: int = 0
-                    ) -> tuple[Query, ...]:
-    """Return queries whose verticals are off by an angle, all frames of one in one direction."""
-    found = []
-    for query in queries:
-        def change(one: Observation, number: int = query.number) -> Observation:
-            rng = np.random.default_rng([seed, number, 2])
-            return one if one.up_in_camera is None else replace(one, up_in_camera=_turned(
-                one.up_in_camera, np.radians(angle_deg), rng))
-
-        found.append(_of_all_frames(query, change))
-    return tuple(found)
-
-
-def wrong_mount(queries: Sequence[Query], angle_deg: float, seed: int = 0) -> tuple[Query, ...]:
-    """Return queries of a camera that is turned in its mount by an angle, one way for each.
-
-    The robot's tilt and odometry reach the camera through the mount, so both are wrong.
-    """
-    found = []
-    for query in queries:
-        rng = np.random.default_rng([seed, query.number, 3])
-        axis = rng.normal(size=3)
-        turn = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis))
-        wrong = make_transform(turn.as_matrix(), np.zeros(3))
-
-        def change(one: Observation, wrong: NDArray[np.float64] = wrong) -> Observation:
-            up, pose = one.up_in_camera, one.odom_from_camera
-            return replace(one, up_in_camera=None if up is None else wrong[:3, :3].T @ up,
-                           odom_from_camera=None if pose is None else pose @ wrong)
-
-        found.append(_of_all_frames(query, change))
-    return tuple(found)
-
-
-def scaled_odometry(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
-    """Return queries whose odometry counts distances and turns too long by a factor."""
-    found = []
-    for query in queries:
-        frames = sorted((*query.neighbours, query.observation), key=lambda one: one.stamp_ns)
-        poses = [np.eye(4)]
-        for before, after in pairwise(frames):
-            assert before.odom_from_camera is not None
-            assert after.odom_from_camera is not None
-            step = invert_transform(before.odom_from_camera) @ after.odom_from_camera
-            turn = Rotation.from_rotvec(factor * Rotation.from_matrix(step[:3, :3]).as_rotvec())
-            poses.append(poses[-1] @ make_transform(turn.as_matrix(), factor * step[:3, 3]))
-        scaled = {one.stamp_ns: replace(one, odom_from_camera=pose)
-                  for one, pose in zip(frames, poses, strict=True)}
-        found.append(replace(query, observation=scaled[query.observation.stamp_ns],
-                             neighbours=tuple(scaled[one.stamp_ns] for one in query.neighbours)))
-    return tuple(found)
-
-
-def _of_all_frames(query: Query, change: Callable[[Observation], Observation]) -> Query:
-    return replace(query, observation=change(query.observation),
-                   neighbours=tuple(map(change, query.neighbours)))
-
-
 def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
               rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """Return odom_from_camera (4, 4) of each frame, with a random error of each step."""
@@ -168,9 +85,9 @@ def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
     return poses
 
 
-def _turned(direction: NDArray[np.float64], angle: float, rng: np.random.Generator
+def turned(direction: NDArray[np.float64], angle: float, rng: np.random.Generator
             ) -> NDArray[np.float64]:
-    """Return a direction rotated by an angle [rad] about a random perpendicular axis."""
+    """Return a direction (3,) rotated by an angle [rad] about a random perpendicular axis."""
     axis = np.cross(direction, rng.normal(size=3))
     turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
     return np.asarray(turn.apply(direction))

@@ -18,7 +18,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.evaluation.trials import Query
-from cliploc_ros.simulation.sensors import with_mount_error, with_neighbours
+from cliploc_ros.simulation.sensors import with_neighbours
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,
@@ -30,6 +30,7 @@ from studies.acceptance.places import (
 from studies.acceptance.troubles import of_rows
 from studies.reports import Judged, interval, mean, table
 from studies.worlds.cameras import GROUP_SIZE
+from studies.wrong_sensors import with_mount_error
 
 LOOKS = 20
 _PERIOD_NS = 100_000_000

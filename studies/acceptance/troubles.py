@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
-from cliploc_ros.simulation import sensors
+from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE
 
 _BOX_SIDE_PX = (20.0, 200.0)
@@ -199,11 +199,11 @@ TROUBLES = {
     'every landmark twice, apart by [m]': Trouble(double_landmarks, (0.01, 0.1)),
     'two identical rooms, apart by [m]': Trouble(add_equal_room, (2.0,)),
     'share of the objects moved by .3 to 3 m': Trouble(move_objects, (0.4,)),
-    'mount off by [degrees]': Trouble(_of_sensor(sensors.wrong_mount), (5.0,),
+    'mount off by [degrees]': Trouble(_of_sensor(wrong_sensors.wrong_mount), (5.0,),
                                       (LEVEL, FIVE, ALL)),
-    'vertical off by [degrees]': Trouble(_of_sensor(sensors.tilted_vertical), (10.0,),
+    'vertical off by [degrees]': Trouble(_of_sensor(wrong_sensors.tilted_vertical), (10.0,),
                                          (LEVEL, ALL)),
-    'odometry too long by a factor': Trouble(_of_sensor(sensors.scaled_odometry), (1.2, 0.8),
+    'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
                                              (FIVE, ALL))}
 #: What gets worse and worse, seen in one image.
 CURVES = {

@@ -11,6 +11,7 @@ import pytest
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.simulation import sensors
+from studies import wrong_sensors
 from studies.acceptance import troubles
 from studies.acceptance.__main__ import run
 from studies.acceptance.places import Simulated
@@ -137,13 +138,13 @@ def steps(query):
 
 
 def test_verticals_are_tilted_by_an_angle(queries):
-    for before, after in zip(queries, sensors.tilted_vertical(queries, 10.0), strict=True):
+    for before, after in zip(queries, wrong_sensors.tilted_vertical(queries, 10.0), strict=True):
         up = before.map_from_camera[2, :3]
         assert angle_deg(after.observation.up_in_camera, up) == pytest.approx(10.0)
 
 
 def test_a_wrong_mount_turns_verticals_and_steps_alike(queries):
-    before, after = queries[4], sensors.wrong_mount(queries, 5.0)[4]
+    before, after = queries[4], wrong_sensors.wrong_mount(queries, 5.0)[4]
     up, wrong_up = before.observation.up_in_camera, after.observation.up_in_camera
     assert 0.0 < angle_deg(up, wrong_up) <= 5.0 + 1e-6
     mount = invert_transform(before.observation.odom_from_camera) @ \
@@ -155,7 +156,7 @@ def test_a_wrong_mount_turns_verticals_and_steps_alike(queries):
 
 
 def test_odometry_is_scaled(queries):
-    before, after = queries[4], sensors.scaled_odometry(queries, 1.2)[4]
+    before, after = queries[4], wrong_sensors.scaled_odometry(queries, 1.2)[4]
     assert len(steps(before)) == 4
     for own, long in zip(steps(before), steps(after), strict=True):
         own_m, own_deg = pose_error(np.eye(4), own)
