@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
@@ -220,6 +221,8 @@ class Localizer:
         self._stamp_ns = 0
         #: The newest frame that was localized, with the crops that it took.
         self.observation: Observation | None = None
+        #: Depth is not used any more once it is wrong.
+        self.depth_scale = DepthScale()
 
     def localize(self, observation: Observation, run: int = 0, limit: int = 1,
                  length_s: float = 0.0, crops: Crops | None = None,
@@ -249,6 +252,15 @@ class Localizer:
         OptionsError
             See Relocalizer.relocalize. The localizer drops this frame.
         """
+        if self.depth_scale.is_wrong:
+            observation = replace(observation, depths=None)
+        found = self._localize(observation, run, limit, length_s, crops, recognizer)
+        if found.accepted and found.depth is not None:
+            self.depth_scale.add(found.depth)
+        return found
+
+    def _localize(self, observation: Observation, run: int, limit: int, length_s: float,
+                  crops: Crops | None, recognizer: ImageRecognizer | None) -> Relocalization:
         if observation.odom_from_camera is None:
             alone, found = localize_on_demand(self._relocalizer, (), observation, crops,
                                               recognizer=recognizer)

@@ -76,6 +76,11 @@ class Observation:
     #: (m,): the detections that the rows of similarities (m, L) belong to; None for all, in their
     #: order. The other detections are matched by class alone.
     compared: NDArray[np.int64] | None = None
+    #: (n,): median depth of the inner half of each box, along z of the camera [m]; NaN where there
+    #: is none. None for a camera without depth.
+    depths: NDArray[np.float64] | None = None
+    #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
+    depth_deviations: NDArray[np.float64] | None = None
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

@@ -27,7 +27,7 @@ _TEXT = 'std_msgs/msg/String'
 _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 _CAMERA_INFO, _DETECTIONS = '/camera_info', '/detections'
 # What was known besides the messages, at the stamp of each image.
-_CAMERA, _UP = '/camera_in_odom', '/up_in_camera'
+_CAMERA, _UP, _DEPTH = '/camera_in_odom', '/up_in_camera', '/depth'
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,13 @@ class CaseFrame:
     detections: bytes
     up_in_camera: NDArray[np.float64] | None = None  #: (3,): the vertical, where it was known
     odom_from_camera: NDArray[np.float64] | None = None  #: (4, 4): where odometry placed the frame
+    depth_type: str = ''  #: sensor_msgs/msg/Image or CompressedImage; empty without depth
+    depth: bytes = b''
 
     def message(self, name: str) -> Any:
-        """Return one of the three messages; DatasetError: its bytes are no such message."""
+        """Return one of the messages; DatasetError: its bytes are no such message."""
         msgtype = {'image': self.image_type, 'camera_info': CAMERA_INFO,
-                   'detections': DETECTIONS}[name]
+                   'detections': DETECTIONS, 'depth': self.depth_type}[name]
         return deserialize(getattr(self, name), msgtype, name)
 
 
@@ -70,6 +72,8 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
                                (_DETECTIONS, DETECTIONS), (_CAMERA, POSE), (_UP, _VECTOR),
                                (VERDICT, _TEXT)):
             writer.add_topic(topic, msgtype)
+        if depth_type := next((one.depth_type for one in case.frames if one.depth), ''):
+            writer.add_topic(_DEPTH, depth_type)
         for frame in case.frames:
             stamp = frame.stamp_ns
             # the image last: it completes a frame for a node that replays the recording
@@ -83,6 +87,8 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
                 writer.write(_UP, stamp, types[_VECTOR](
                     header=frame.message('camera_info').header,
                     vector=types['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)))
+            if frame.depth:
+                writer.write(_DEPTH, stamp, frame.depth)
         writer.write(VERDICT, case.frames[-1].stamp_ns,
                      types[_TEXT](data=json.dumps(dict(case.report))))
 
@@ -103,7 +109,8 @@ def read_case(path: Path) -> Case:
         image_type = reader.topic(topics[0]).msgtype
         images = _by_stamp(reader, topics[0])
         others = {name: _by_stamp(reader, name)
-                  for name in (_CAMERA_INFO, _DETECTIONS, _CAMERA, _UP)}
+                  for name in (_CAMERA_INFO, _DETECTIONS, _CAMERA, _UP, _DEPTH)}
+        depth_type = reader.topics[_DEPTH].msgtype if _DEPTH in reader.topics else ''
         text = reader.deserialize(next(reader.messages([VERDICT]))).data
     try:
         report = json.loads(text)
@@ -120,6 +127,8 @@ def read_case(path: Path) -> Case:
         if (data := others[_UP].get(stamp)) is not None:
             vector = deserialize(data, _VECTOR, _UP).vector
             frame = replace(frame, up_in_camera=np.array([vector.x, vector.y, vector.z]))
+        if (data := others[_DEPTH].get(stamp)) is not None:
+            frame = replace(frame, depth_type=depth_type, depth=data)
         if (data := others[_CAMERA].get(stamp)) is not None:
             frame = replace(frame, odom_from_camera=map_from_camera_of(
                 deserialize(data, POSE, _CAMERA)))

@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
 
@@ -20,7 +21,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.cases import Case
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.datasets.depth import depths_from_msg
+from cliploc_ros.errors import DatasetError, ImageError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
@@ -83,6 +85,11 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
         observation = Observation(camera, detections, stamp_ns=frame.stamp_ns,
                                   up_in_camera=frame.up_in_camera,
                                   odom_from_camera=frame.odom_from_camera)
+        if frame.depth:
+            with suppress(ImageError):  # the node goes on without depth
+                observation = replace(observation, depths=depths_from_msg(
+                    frame.message('depth'), frame.message('image').header.frame_id, camera,
+                    detections.bboxes_xyxy))
         recognizer = None if keyframes is None else ImageRecognizer(
             keyframes, query_features(image), camera)
         if observer is not None:

@@ -45,7 +45,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._frames = FrameSource(self, parameters.image_transport,
                                    math.inf if continuous else LINGER_S,
                                    self._newest.offer if continuous else lambda frame: None,
-                                   parameters.detections_type)
+                                   parameters.detections_type, parameters.depth,
+                                   parameters.depth_tolerance_s)
         self._handoff = HandOff(self, self._robot.odometry)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
@@ -118,6 +119,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
+            if parameters.depth != 'none':
+                health.values['depth scale'] = f'{localizer.depth_scale.ratio:.2f}'
             health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,
                               'device': localizer.device}
 

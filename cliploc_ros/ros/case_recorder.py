@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import detections_from_msg
@@ -53,7 +53,8 @@ class CaseRecorder:
             return
         with self._lock:
             self._seen.append(_Seen(frame, answer))
-            while sum(len(one.frame.image.data) for one in self._seen) > _MAX_BYTES \
+            while sum(len(one.frame.image.data) + (len(one.frame.depth.data) if one.frame.depth
+                      else 0) for one in self._seen) > _MAX_BYTES \
                     and len(self._seen) > 1:
                 self._seen.popleft()
 
@@ -127,18 +128,23 @@ def _case_frame(seen: _Seen) -> 'CaseFrame':
 
     frame, state = seen.frame, seen.answer.state
     place = None if state is None else state.place
-    kind = 'Image' if isinstance(frame.image, Image) else 'CompressedImage'
     detections = frame.detections
     if any(one.bbox.center.theta != 0.0 for one in detections.detections):
         # only rclpy's reader understands turned boxes
         detections = detections_to_msg(detections_from_msg(detections), detections.header)
     return CaseFrame(
-        stamp_ns(frame.image.header.stamp), f'sensor_msgs/msg/{kind}',
+        stamp_ns(frame.image.header.stamp), _type_of(frame.image),
         image=bytes(serialize_message(frame.image)),
         camera_info=bytes(serialize_message(frame.camera_info)),
         detections=bytes(serialize_message(detections)),
         up_in_camera=None if state is None else state.up_in_camera,
-        odom_from_camera=None if place is None else place.odom_from_camera)
+        odom_from_camera=None if place is None else place.odom_from_camera,
+        depth_type=_type_of(frame.depth) if frame.depth else '',
+        depth=bytes(serialize_message(frame.depth)) if frame.depth else b'')
+
+
+def _type_of(image: Image | CompressedImage) -> str:
+    return f'sensor_msgs/msg/{type(image).__name__}'
 
 
 def _made_folder(name: str) -> Path:
@@ -155,7 +161,7 @@ def _made_folder(name: str) -> Path:
 def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
     """Raise unless the case fits into what the recordings of the folder may take."""
     size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
-               for frame in case.frames)
+               + len(frame.depth) for frame in case.frames)
     # The size of all files; some may be moved away meanwhile.
     used = 0
     for parent, _, names in folder.walk():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.keyframes.layer import (
@@ -41,7 +42,8 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import MapError
+from cliploc_ros.datasets.depth import depths_from_msg
+from cliploc_ros.errors import ImageError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import (
     camera_from_msg,
@@ -159,6 +161,7 @@ class FrameLocalizer:
         self._observer = observer
         self._options = options
         self._localizer = Localizer(relocalizer)
+        self._notes: set[str] = set()
         relocalizer.warm_up()
 
     @property
@@ -170,6 +173,11 @@ class FrameLocalizer:
     def keyframes(self) -> Keyframes | None:
         """Return the layer of keyframes; None without one."""
         return self._keyframes
+
+    @property
+    def depth_scale(self) -> DepthScale:
+        """Return what accepted poses say of the scale of depth."""
+        return self._localizer.depth_scale
 
     @property
     def description(self) -> str:
@@ -215,13 +223,14 @@ class FrameLocalizer:
             frame.detections, parse_class_map(parameters.class_map)).usable(
                 width, height, parameters.max_detections)
         place = state.place
+        options = parameters.options()
+        localizer = self._localizer_for(options)
         observation = Observation(
             camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
             up_in_camera=state.up_in_camera,
+            depths=self._depths(frame, camera, detections.bboxes_xyxy),
             odom_from_camera=None if place is None else place.odom_from_camera,
             odom_way_m=0.0 if place is None else place.way_m)
-        options = parameters.options()
-        localizer = self._localizer_for(options)
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, camera, deadline, times)
@@ -241,6 +250,27 @@ class FrameLocalizer:
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
                          for_filter)
+
+    def _depths(self, frame: Frame, camera: Camera, bboxes_xyxy: NDArray[np.float64]
+                ) -> NDArray[np.float64] | None:
+        """Return the depth of each box (n,); None without depth, or where it cannot be used."""
+        if frame.depth is None:
+            return None
+        if self.depth_scale.is_wrong:
+            self._note(f'depth is {self.depth_scale.ratio:.2f} times what boxes and map say, and '
+                       'is used no more: check its unit, calibration and registration')
+            return None
+        try:
+            return depths_from_msg(frame.depth, frame.image.header.frame_id, camera, bboxes_xyxy)
+        except ImageError as error:
+            self._note(f'localizing without depth: {error}')
+            return None
+
+    def _note(self, text: str) -> None:
+        """Log a warning once."""
+        if text not in self._notes:
+            self._notes.add(text)
+            logger.warning('%s', text)
 
     def _crops(self, image: NDArray[np.uint8], observation: Observation,
                options: RelocalizerOptions, times: StageTimes, deadline: float

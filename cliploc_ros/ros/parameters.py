@@ -127,6 +127,13 @@ class RelocalizerParameters(CommonParameters):
     detections_type: str = parameter('vision_msgs',
         'Package of the type of detections: vision_msgs/Detection2DArray or '
         'yolo_msgs/DetectionArray (yolo_ros).', choices=DETECTION_TYPES, read_only=True)
+    depth: str = parameter('none',
+        "Use depth of an RGB-D camera, registered to the image: 'raw' on the topic depth, or "
+        "'compressed' on depth/compressedDepth.", choices=('none', 'raw', 'compressed'),
+        read_only=True)
+    depth_tolerance_s: float = parameter(0.02,
+        'Use depth whose stamp is at most this far from that of the image.', unit='s', low=0.0,
+        high=1.0, read_only=True)
     class_map: str = parameter('',
         "The map's names for another detector's classes, such as 'tvmonitor=tv, "
         "pottedplant=potted plant'.")

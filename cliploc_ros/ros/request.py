@@ -290,9 +290,13 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
     if found.recognized is not None:
         keyframes += f', {found.recognized.inliers} points of keyframes agree'
+    depth = ''
+    if found.depth is not None:
+        depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
+            else ', depth contradicts the boxes'
     return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}; '
+            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}; '
             f'{in_words(stages_ms)}]')
 
 

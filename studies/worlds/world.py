@@ -12,6 +12,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.simulation.sensors import simulate_depths
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.appearance import Encoder
 from studies.worlds.cameras import (
@@ -27,6 +28,8 @@ from studies.worlds.things import Objects, make_objects
 
 _FRAME_S = 1.0
 _SCORE = 0.8
+# Deviation of the scale of depth from world to world: a guess.
+_DEPTH_SCALE = 0.02
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,11 @@ class _Scene(NamedTuple):
     encoder: Encoder
     vectors: NDArray[np.float64]
     biases: NDArray[np.float64]
+    depth_scale: float | None = None  #: Measured over true depth; None without depth
 
 
-def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None) -> World:
+def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None,
+               has_depth: bool = False) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -67,9 +72,14 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         Places from which the robot looks, five images each.
     sigma_m : float, optional
         Standard deviation of the map's positions on each axis [m]; drawn by default.
+    has_depth : bool
+        Whether the camera measures depth; all else stays the same.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, sigma_m, rng)
+    if has_depth:
+        of_depth, = rng.spawn(1)
+        scene = scene._replace(depth_scale=float(of_depth.normal(1.0, _DEPTH_SCALE)))
     camera = make_camera(rng)
     poses = make_groups(place, scene.objects, groups, rng).reshape(-1, 4, 4)
     return _seen(kind, scene, camera, poses, rng)
@@ -122,6 +132,11 @@ def _look(scene: _Scene, camera: Camera, pose: NDArray[np.float64], number: int,
     biases[known] = scene.biases[boxes.shown[known]]
     similarities = scene.encoder.similarities(crops, biases, boxes.bboxes_xyxy,
                                               scene.vectors[scene.found.described], rng)
+    depths = None
+    if scene.depth_scale is not None:
+        centers = np.where(known[:, None], scene.objects.centers[boxes.shown], np.nan)
+        depths = simulate_depths(centers, scene.shapes[boxes.shown], pose, rng.spawn(1)[0],
+                                 scene.depth_scale)
     return Observation(
         camera, Detections(boxes.bboxes_xyxy, boxes.class_ids, np.full(len(known), _SCORE)),
-        similarities, round(number * _FRAME_S * NS_PER_S))
+        similarities, round(number * _FRAME_S * NS_PER_S), depths=depths)

@@ -214,12 +214,12 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
 class _Fit(NamedTuple):
     """A fit, linearized in steps of the reference: F frames, m matches of n objects."""
 
-    jacobian: NDArray[np.float64]  #: (m, 4, 6)
-    #: (m, 4), (m, 4)
+    #: (m, r, 6): of the four edges of each match and, where any has depth, of that
+    jacobian: NDArray[np.float64]
+    #: (m, r), (m, r)
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
-    #: (m,): share of each match's deviation that its edges have, apart from the landmark's
-    #: position
+    #: (m, r): share of each deviation apart from that of the landmark's position
     own: NDArray[np.float64]
     #: (m,): of each match
     objects: NDArray[np.int64]
@@ -261,7 +261,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     information = of_objects.sum(axis=0) + verticals + prior
     # The part of the edges' errors in M, for each object (n, 6, 6).
     # an edge is as far off as its weight says, in the same direction in all frames
-    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, None, None] * fit.jacobian,
+    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, :, None] * fit.jacobian,
                   fit.objects, len(fit.sigmas))
     edge_noise = np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
     noise_of_objects = edge_noise + _position_noise(fit, of_objects)
@@ -299,7 +299,7 @@ def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
 def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[np.float64],
                translation: NDArray[np.float64]) -> _Fit:
     count, frames = len(inliers.pairs), len(inliers.cameras)
-    jacobian, residuals = np.empty((count, 4, 6)), np.empty((count, 4))
+    jacobian, residuals = np.empty((count, 5, 6)), np.empty((count, 5))
     verticals, cameras = np.zeros((frames, 6, 6)), np.tile(np.eye(4), (frames, 1, 1))
     center = -rotation.T @ translation
     for frame, (first, last) in enumerate(pairwise(inliers.starts)):
@@ -309,19 +309,24 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
         cameras[frame, :3, :3] = own_rotation.T
         cameras[frame, :3, 3] = -own_rotation.T @ own_translation
         pairs = inliers.pairs[first:last]
-        own, rows = np.empty(4 * len(pairs) + 3), 4 * len(pairs)
+        own, rows = np.empty(5 * len(pairs) + 3), 5 * len(pairs)
         residuals_of(pairs, vertical, own_rotation, own_translation, own)
         steps = jacobian_of(pairs, vertical, own_rotation, own_translation)
         # a turn of the reference about itself moves this camera
         steps[:, 3:] -= steps[:, :3] @ _cross(cameras[frame, :3, 3] - center)
-        jacobian[first:last], residuals[first:last] = (steps[:rows].reshape(-1, 4, 6),
-                                                       own[:rows].reshape(-1, 4))
+        jacobian[first:last], residuals[first:last] = (steps[:rows].reshape(-1, 5, 6),
+                                                       own[:rows].reshape(-1, 5))
         weights = 1.0 / (1.0 + own[rows:] ** 2)
         verticals[frame] = steps[rows:].T @ (steps[rows:] * weights[:, None])
     numbers, objects = np.unique(inliers.landmarks, return_inverse=True)
     pairs = inliers.pairs
-    edges = RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION
-    return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2), edges / pairs[:, 13], objects,
+    edges = (RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION) / pairs[:, 13]
+    depths = np.sqrt(1.0 - (sigmas[inliers.landmarks] / np.maximum(pairs[:, 15], 1e-9)) ** 2,
+                     out=np.zeros(count), where=pairs[:, 15] > 0.0)
+    kinds = 5 if depths.any() else 4
+    jacobian, residuals = np.ascontiguousarray(jacobian[:, :kinds]), residuals[:, :kinds].copy()
+    return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2),
+                np.column_stack([edges, edges, edges, edges, depths])[:, :kinds], objects,
                 np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], numbers,
                 verticals, cameras)
 
@@ -347,7 +352,8 @@ def _mean_square(fit: _Fit) -> float:
     """
     views = len(fit.objects) / max(1, len(fit.sigmas))
     squares = np.minimum(np.abs(fit.residuals), _MOST_RESIDUAL) ** 2
-    freedom = max(0, 4 * len(fit.sigmas) - 6)
+    measured = np.bincount(fit.objects, fit.jacobian[:, 4:].any(axis=(1, 2))) > 0.0
+    freedom = max(0, 4 * len(fit.sigmas) + int(measured.sum()) - 6)
     return max(1.0, float((squares.sum() / max(views, 1.0) + _PRIOR_RESIDUALS * _PRIOR_SQUARE)
                           / (freedom + _PRIOR_RESIDUALS)))
 

@@ -36,6 +36,8 @@ _CHECK_PERIOD_S = 0.5
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
+# Four seconds of 30 Hz VGA depth.
+_MAX_DEPTH_BYTES = 72 * 2**20
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
 
@@ -170,6 +172,8 @@ class Frame:
     #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
+    #: Depth of about the same time; None where there is none
+    depth: Image | CompressedImage | None = None
 
 
 class FrameSource:
@@ -188,14 +192,24 @@ class FrameSource:
         Called with each complete frame in the executor's thread.
     detections : str
         Package of the type of the detections, see DETECTION_TYPES.
+    depth : str
+        'raw' or 'compressed'; 'none': frames have no depth.
+    depth_tolerance_s : float
+        Depth of a frame is at most this far from its image [s].
     """
 
     def __init__(self, node: Node, transport: str, linger_s: float,
-                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs') -> None:
+                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs',
+                 depth: str = 'none', depth_tolerance_s: float = 0.0) -> None:
         self._node = node
         self._image_type = Image if transport == 'raw' else CompressedImage
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
+        if depth != 'none':
+            self._topics['depth'] = 'depth' if depth == 'raw' else 'depth/compressedDepth'
+        self._depth_type = Image if depth == 'raw' else CompressedImage
+        self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
+        self._depths: deque[Image | CompressedImage] = deque()
         self._package = detections
         self._detections = detection_type('vision_msgs')
         self._linger_s = linger_s
@@ -243,6 +257,7 @@ class FrameSource:
         """Drop the messages received so far."""
         with self._changed:
             self._pairing.clear()
+            self._depths.clear()
             self._newest = None
 
     def next_frame(self, after: float, deadline: float) -> Frame:
@@ -275,7 +290,7 @@ class FrameSource:
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
         return [self._silence(name) for name in self._topics
-                if self._node.count_publishers(self._resolved(name)) == 0]
+                if name != 'depth' and self._node.count_publishers(self._resolved(name)) == 0]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
@@ -305,18 +320,21 @@ class FrameSource:
             return
         self._unsubscribe()  # what a failed attempt left behind
         self._subscribed_at = time.monotonic()
-        for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
-                                            ('camera_info', CameraInfo, qos.CAMERA_INFO),
-                                            ('detections', self._detections.message_type,
-                                             qos.DETECTIONS_IN)):
+        of_topics = {'image': (self._image_type, qos.IMAGE),
+                     'camera_info': (CameraInfo, qos.CAMERA_INFO),
+                     'detections': (self._detections.message_type, qos.DETECTIONS_IN),
+                     'depth': (self._depth_type, qos.IMAGE)}
+        for name, topic in self._topics.items():
+            message_type, profile = of_topics[name]
             self._subscriptions.append(AdaptiveSubscription(
-                self._node, message_type, self._topics[name], self._receiver(name), profile))
+                self._node, message_type, topic, self._receiver(name), profile))
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
             subscription.destroy()
         self._subscriptions.clear()
         self._pairing.clear()
+        self._depths.clear()
         self._newest = None
 
     def _rest(self) -> None:
@@ -327,8 +345,31 @@ class FrameSource:
 
     def _receiver(self, name: str) -> Callable[[Any], None]:
         def receive(msg: Any) -> None:
-            self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
+            if name == 'depth':
+                self._take_depth(msg)
+            else:
+                self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
         return receive
+
+    def _take_depth(self, msg: Image | CompressedImage) -> None:
+        """Keep a depth image until its frame is complete, and the newest ones of all."""
+        with self._changed:
+            if not self._subscriptions:
+                return
+            self._heard_at['depth'] = time.monotonic()
+            self._depths.append(msg)
+            while len(self._depths) > 1 and sum(
+                    len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
+                self._depths.popleft()
+
+    def _depth_at(self, image_ns: int) -> Image | CompressedImage | None:
+        """Return the depth image nearest to a time; older ones are of no more use."""
+        def apart(msg: Image | CompressedImage) -> int:
+            return abs(stamp_ns(msg.header.stamp) - image_ns)
+        nearest = min(self._depths, key=apart, default=None)
+        if nearest is None or apart(nearest) > self._depth_tolerance_ns:
+            return None
+        return nearest
 
     def _take(self, name: str, msg: Any) -> None:
         """Take one message, and pass on the frame that it completes."""
@@ -345,7 +386,8 @@ class FrameSource:
             image, received_at = complete['image']
             detections, detected_at = complete['detections']
             frame = Frame(image, complete['camera_info'][0], detections, received_at,
-                          max(received_at, detected_at))
+                          max(received_at, detected_at),
+                          self._depth_at(stamp_ns(image.header.stamp)))
             self._newest = frame
             self._changed.notify_all()
         self._on_frame(frame)
@@ -353,7 +395,7 @@ class FrameSource:
     def _why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
         missing = [self._silence(name) for name in self._topics
-                   if self._heard_at.get(name, -math.inf) < since]
+                   if name != 'depth' and self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
         if self._pairing.outrun:
