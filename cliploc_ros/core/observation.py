@@ -66,6 +66,7 @@ class Observation:
     #: of each of the map's L landmarks, in the map's order. None where only classes are known.
     similarities: Similarities | None = None
     stamp_ns: int = 0  #: Time of the image [ns]
+    camera_name: str = ''  #: Which of several cameras took it
     #: (3,): the vertical, a unit vector in the camera's optical coordinate frame; None if unknown
     up_in_camera: NDArray[np.float64] | None = None
     #: (4, 4): the camera in the coordinate frame of odometry, which links this frame to others;

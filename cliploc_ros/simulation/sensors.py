@@ -19,6 +19,7 @@ from cliploc_ros.core.geometry.depth import (
     half_chord,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query
 
@@ -43,8 +44,19 @@ def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 
     for query in queries:
         rng = np.random.default_rng([seed, query.number])
         up = turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
-        found.append(replace(query, observation=replace(query.observation, up_in_camera=up)))
+        found.append(replace(
+            query, observation=replace(query.observation, up_in_camera=up), neighbours=tuple(
+                _same_vertical(one, query.observation, up) for one in query.neighbours)))
     return tuple(found)
+
+
+def _same_vertical(one: Observation, other: Observation, up_in_other: NDArray[np.float64]
+                   ) -> Observation:
+    """Return what another camera of the robot sees, with the same vertical."""
+    if one.odom_from_camera is None or other.odom_from_camera is None:
+        return one
+    turn = one.odom_from_camera[:3, :3].T @ other.odom_from_camera[:3, :3]
+    return replace(one, up_in_camera=turn @ up_in_other)
 
 
 def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: float = 0.0,

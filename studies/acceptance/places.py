@@ -54,6 +54,8 @@ class Place(NamedTuple):
         """Return the queries with what is known in a mode."""
         is_fused = mode in (FIVE, ALL)
         queries: Sequence[Query] = self.frames
+        if is_fused and any(one.neighbours for one in queries):
+            return []  # of several cameras, one instant
         if mode in (VERTICAL, LEVEL, ALL):
             queries = with_vertical(queries, vertical_deg, seed)
         if is_fused:
@@ -106,6 +108,7 @@ class Simulated(NamedTuple):
     kind: str
     seed: int
     has_depth: bool = False
+    cameras: int = 1
 
     @property
     def name(self) -> str:
@@ -114,7 +117,7 @@ class Simulated(NamedTuple):
 
     def load(self) -> Place:
         """Return the place."""
-        world = make_world(self.kind, self.seed, has_depth=self.has_depth)
+        world = make_world(self.kind, self.seed, has_depth=self.has_depth, cameras=self.cameras)
         return Place(world.landmark_map, world.queries, world.groups,
                      [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
 
@@ -143,6 +146,8 @@ def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(
                         help='one for all query files, or one for each')
     parser.add_argument('--depth', action='store_true',
                         help='of each box: that of the files, or else simulated')
+    parser.add_argument('--cameras', type=positive_int, default=1, metavar='N',
+                        help='of the robot in worlds, in modes of one image (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='all')
     parser.add_argument('--worlds', type=int, metavar='N',
                         help=f'simulated worlds of each kind ({worlds})')
@@ -174,8 +179,8 @@ def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
     places: list[Recording | Simulated] = [
         *(Recording(path, map_path, options.frames == 'all', has_depth=options.depth)
           for path, map_path in zip(options.queries, maps, strict=True)),
-        *(Simulated(kind, options.first_seed + number, options.depth) for kind in options.kinds
-          for number in range(worlds))]
+        *(Simulated(kind, options.first_seed + number, options.depth, options.cameras)
+          for kind in options.kinds for number in range(worlds))]
     if not places:
         raise OptionsError('nothing to test: give --queries and --map, or --worlds')
     return places

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """One simulated world: a map with errors, and what a robot sees there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
@@ -28,6 +30,8 @@ from studies.worlds.things import Objects, make_objects
 
 _FRAME_S = 1.0
 _SCORE = 0.8
+# Cameras of one robot lie on a circle of this radius; their mounts are off on each axis.
+_RADIUS_M, _MOUNT_M, _MOUNT_DEG = 0.15, 0.01, 0.5
 # Deviation of the scale of depth from world to world: a guess.
 _DEPTH_SCALE = 0.02
 
@@ -61,7 +65,7 @@ class _Scene(NamedTuple):
 
 
 def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None,
-               has_depth: bool = False) -> World:
+               has_depth: bool = False, cameras: int = 1) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -74,6 +78,8 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         Standard deviation of the map's positions on each axis [m]; drawn by default.
     has_depth : bool
         Whether the camera measures depth; all else stays the same.
+    cameras : int
+        The robot has more cameras, in equal angles. They are neighbours of the first one's image.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, sigma_m, rng)
@@ -82,7 +88,9 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         scene = scene._replace(depth_scale=float(of_depth.normal(1.0, _DEPTH_SCALE)))
     camera = make_camera(rng)
     poses = make_groups(place, scene.objects, groups, rng).reshape(-1, 4, 4)
-    return _seen(kind, scene, camera, poses, rng)
+    world = _seen(kind, scene, camera, poses, rng)
+    return world if cameras == 1 else replace(world, queries=tuple(
+        _with_cameras(scene, camera, query, cameras, rng.spawn(1)[0]) for query in world.queries))
 
 
 def make_walk(kind: str, seed: int, images: int) -> World:
@@ -120,6 +128,23 @@ def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
     return World(kind, scene.found.landmark_map, tuple(
         Query(number, _look(scene, camera, pose, number, rng), pose)
         for number, pose in enumerate(poses)))
+
+
+def _with_cameras(scene: _Scene, camera: Camera, query: Query, count: int,
+                  rng: np.random.Generator) -> Query:
+    """Return a query with what the robot's other cameras see, whose mounts are a bit wrong."""
+    others = []
+    for row in range(1, count):
+        turn = Rotation.from_euler('y', 360.0 * row / count, degrees=True)
+        mount = make_transform(turn.as_matrix(), turn.apply([0.0, 0.0, _RADIUS_M])
+                               - [0.0, 0.0, _RADIUS_M])
+        error = make_transform(Rotation.from_rotvec(
+            np.radians(_MOUNT_DEG) * rng.normal(size=3)).as_matrix(),
+            _MOUNT_M * rng.normal(size=3))
+        seen = _look(scene, camera, query.map_from_camera @ mount @ error, query.number, rng)
+        others.append(replace(seen, camera_name=f'camera {row}', odom_from_camera=mount))
+    return replace(query, neighbours=tuple(others), observation=replace(
+        query.observation, camera_name='camera 0', odom_from_camera=np.eye(4)))
 
 
 def _look(scene: _Scene, camera: Camera, pose: NDArray[np.float64], number: int,

@@ -81,7 +81,7 @@ def ask_until(ask, depth, text):
 
 def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, depth_camera,
                                                       room_map, tmp_path, capsys):
-    own_relocalizer(depth='raw', algorithm='auto', record_folder=tmp_path)
+    own_relocalizer(depth_transport='raw', algorithm='auto', record_folder=tmp_path)
     frame = make_frame()
     answer = ask_until(depth_camera, message(frame, depth_image()), ', depth of 12 objects')
     stored = tester.call(Trigger, '/relocalizer/record', Trigger.Request())
@@ -95,7 +95,7 @@ def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, d
 
 
 def test_compressed_depth(own_relocalizer, depth_camera):
-    own_relocalizer(depth='compressed', algorithm='auto')
+    own_relocalizer(depth_transport='compressed', algorithm='auto')
     ask_until(depth_camera, compressed(make_frame(), depth_image()), ', depth of 12 objects')
 
 
@@ -108,7 +108,7 @@ def test_compressed_depth(own_relocalizer, depth_camera):
 ])
 def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
                                                           said):
-    process = own_relocalizer(depth='raw', algorithm='auto')
+    process = own_relocalizer(depth_transport='raw', algorithm='auto')
     for _ in range(30):
         answer = depth_camera(message(make_frame(), **given))
         assert answer.success, answer.message
@@ -122,7 +122,7 @@ def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth
     None, message(make_frame(), depth_image(), late_s=0.5),
     message(make_frame(), np.zeros((480, 640)))], ids=['silent', 'late', 'empty'])
 def test_a_request_never_waits_for_depth(own_relocalizer, depth_camera, depth):
-    process = own_relocalizer(depth='raw', algorithm='auto')
+    process = own_relocalizer(depth_transport='raw', algorithm='auto')
     answer = depth_camera(depth)
     assert answer.success, answer.message
     assert 'depth' not in answer.message

@@ -192,7 +192,8 @@ def pose_of(joined: JoinedFrames, compared: Comparison
     found = None
     if by_objects is not None:
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
-                                   by_objects.matches, joined.landmark_map.shared_sigmas)
+                                   by_objects.matches, joined.landmark_map.shared_sigmas,
+                                   joined.options.mount_deviation)
         if by_objects.finalist.information is not None:
             others = [one for one in compared.contenders if one.recognized is None]
             others.sort(key=lambda one: one is not by_objects)

@@ -73,6 +73,8 @@ class DepthScale:
 
 def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
     """Return the check of a pose that depth helped to find; None if no match of it has depth."""
+    if not rig.scene.depths.any():
+        return None
     found = verify_rig(rig, pose.rotation, pose.translation)
     inliers = one_to_one(rig, found, pose.rotation, pose.translation)
     known = inliers.pairs[:, 15] > 0.0

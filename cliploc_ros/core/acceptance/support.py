@@ -160,6 +160,8 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
 def _depth_odds(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
                 landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the log odds of each match (m,) by its depth; 0 where none was measured."""
+    if not scene.depths.any():
+        return np.zeros(len(detections))
     camera_from_map = invert_transform(map_from_camera)
     return depth_odds(depth_errors(
         scene.depths[detections], scene.centers[landmarks], scene.shapes[landmarks], sigmas,

@@ -122,7 +122,8 @@ def robust_cost(residuals):
     """Return the sum of Cauchy's losses."""
     total = 0.0
     for residual in residuals:
-        total += np.log1p((residual / _CAUCHY) ** 2)
+        if residual != 0.0:
+            total += np.log1p((residual / _CAUCHY) ** 2)
     return total
 
 
@@ -226,20 +227,19 @@ def _differentiate_vertical(vertical, rotation, jacobian):
 @compiled
 def _normal_equations(jacobian, residuals):
     """Return information and gradient with Cauchy's weights."""
-    information, gradient = np.empty((6, 6)), np.empty(6)
-    weights = np.empty(len(residuals))
+    information, gradient = np.zeros((6, 6)), np.zeros(6)
     for row in range(len(residuals)):
-        weights[row] = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
+        if residuals[row] == 0.0 and not jacobian[row].any():
+            continue  # an unknown depth or vertical
+        weight = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
+        for i in range(6):
+            weighted = jacobian[row, i] * weight
+            gradient[i] -= weighted * residuals[row]
+            for j in range(i, 6):
+                information[i, j] += weighted * jacobian[row, j]
     for i in range(6):
-        total = 0.0
-        for row in range(len(residuals)):
-            total -= jacobian[row, i] * weights[row] * residuals[row]
-        gradient[i] = total
-        for j in range(i, 6):
-            total = 0.0
-            for row in range(len(residuals)):
-                total += jacobian[row, i] * weights[row] * jacobian[row, j]
-            information[i, j] = information[j, i] = total
+        for j in range(i):
+            information[i, j] = information[j, i]
     return information, gradient
 
 

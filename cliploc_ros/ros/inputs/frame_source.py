@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -174,6 +174,9 @@ class Frame:
     detected_at: float
     #: Depth of about the same time; None where there is none
     depth: Image | CompressedImage | None = None
+    camera: str = ''  #: Name of its camera; empty for the only one
+    beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
+    left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
 
 
 class FrameSource:
@@ -196,17 +199,25 @@ class FrameSource:
         'raw' or 'compressed'; 'none': frames have no depth.
     depth_tolerance_s : float
         Depth of a frame is at most this far from its image [s].
+    camera : str
+        Name of the camera, and the namespace of its topics.
+    changed : Condition, optional
+        Notified of each frame; several sources may share it.
     """
 
     def __init__(self, node: Node, transport: str, linger_s: float,
                  on_frame: Callable[[Frame], None], detections: str = 'vision_msgs',
-                 depth: str = 'none', depth_tolerance_s: float = 0.0) -> None:
+                 depth: str = 'none', depth_tolerance_s: float = 0.0, camera: str = '',
+                 changed: threading.Condition | None = None) -> None:
         self._node = node
         self._image_type = Image if transport == 'raw' else CompressedImage
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
         if depth != 'none':
             self._topics['depth'] = 'depth' if depth == 'raw' else 'depth/compressedDepth'
+        if camera:
+            self._topics = {name: f'{camera}/{topic}' for name, topic in self._topics.items()}
+        self._camera = camera
         self._depth_type = Image if depth == 'raw' else CompressedImage
         self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
@@ -217,7 +228,7 @@ class FrameSource:
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
                                      'image', 'detections')
-        self._changed = threading.Condition()
+        self.changed = changed or threading.Condition()
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
         self._subscribed_at = 0.0
@@ -239,7 +250,7 @@ class FrameSource:
 
         OptionsError: the type of the detections is not installed.
         """
-        with self._changed:
+        with self.changed:
             self._detections = detection_type(self._package)
             self._closed = ''
             if self._linger_s == math.inf:
@@ -248,14 +259,14 @@ class FrameSource:
 
     def close(self, reason: str) -> None:
         """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
-        with self._changed:
+        with self.changed:
             self._closed = reason
             self._unsubscribe()
-            self._changed.notify_all()
+            self.changed.notify_all()
 
     def forget(self) -> None:
         """Drop the messages received so far."""
-        with self._changed:
+        with self.changed:
             self._pairing.clear()
             self._depths.clear()
             self._newest = None
@@ -272,20 +283,28 @@ class FrameSource:
         StoppedError
             The source was closed; the message gives the reason.
         """
-        with self._changed:
-            if not self._closed:
-                self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
-                self._subscribe()
-            self._changed.wait_for(lambda: self._closed or self._newest_since(after) is not None,
-                                   max(0.0, deadline - time.monotonic()))
-            if self._closed:
-                raise StoppedError(self._closed)
-            self._wanted_until = time.monotonic() + self._linger_s
-            frame = self._newest_since(after)
-            if frame is None:
-                raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
-                                   f'{self._why_none(after)}')
-            return frame
+        return next_of_any([self], after, deadline)
+
+    def want(self, deadline: float) -> None:
+        """Subscribe until a deadline (monotonic clock) [s] and a moment longer.
+
+        The caller holds the condition. StoppedError: the source was closed.
+        """
+        if self._closed:
+            raise StoppedError(self._closed)
+        self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
+        self._subscribe()
+
+    def want_no_more(self) -> None:
+        """Unsubscribe in a moment. StoppedError: the source was closed."""
+        if self._closed:
+            raise StoppedError(self._closed)
+        self._wanted_until = time.monotonic() + self._linger_s
+
+    @property
+    def is_closed(self) -> bool:
+        """Return whether nobody may wait for a frame."""
+        return bool(self._closed)
 
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
@@ -295,7 +314,7 @@ class FrameSource:
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
-        with self._changed:
+        with self.changed:
             for name in self._topics:
                 silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = self._node.count_publishers(self._resolved(name)) == 0
@@ -311,7 +330,8 @@ class FrameSource:
                 'images dropped unpaired': self._pairing.dropped['image'],
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
-    def _newest_since(self, moment: float) -> Frame | None:
+    def newest_since(self, moment: float) -> Frame | None:
+        """Return the newest frame if its image arrived after a moment of the monotonic clock."""
         newest = self._newest
         return newest if newest is not None and newest.received_at >= moment else None
 
@@ -339,7 +359,7 @@ class FrameSource:
 
     def _rest(self) -> None:
         """Unsubscribe once no frame has been wanted for a while."""
-        with self._changed:
+        with self.changed:
             if self._subscriptions and time.monotonic() > self._wanted_until:
                 self._unsubscribe()
 
@@ -353,7 +373,7 @@ class FrameSource:
 
     def _take_depth(self, msg: Image | CompressedImage) -> None:
         """Keep a depth image until its frame is complete, and the newest ones of all."""
-        with self._changed:
+        with self.changed:
             if not self._subscriptions:
                 return
             self._heard_at['depth'] = time.monotonic()
@@ -375,7 +395,7 @@ class FrameSource:
         """Take one message, and pass on the frame that it completes."""
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
-        with self._changed:
+        with self.changed:
             if not self._subscriptions:
                 return
             self._heard_at[name] = time.monotonic()
@@ -387,12 +407,12 @@ class FrameSource:
             detections, detected_at = complete['detections']
             frame = Frame(image, complete['camera_info'][0], detections, received_at,
                           max(received_at, detected_at),
-                          self._depth_at(stamp_ns(image.header.stamp)))
+                          self._depth_at(stamp_ns(image.header.stamp)), self._camera)
             self._newest = frame
-            self._changed.notify_all()
+            self.changed.notify_all()
         self._on_frame(frame)
 
-    def _why_none(self, since: float) -> str:
+    def why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
         missing = [self._silence(name) for name in self._topics
                    if name != 'depth' and self._heard_at.get(name, -math.inf) < since]
@@ -426,6 +446,28 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self._topics[name]))
+
+
+def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float) -> Frame:
+    """Return the first complete frame of some sources whose image arrived after a moment.
+
+    See FrameSource.next_frame. The sources share their condition.
+    """
+    def newest() -> Frame | None:
+        return next((frame for one in sources if (frame := one.newest_since(after))), None)
+    changed = sources[0].changed
+    with changed:
+        for one in sources:
+            one.want(deadline)
+        changed.wait_for(lambda: sources[0].is_closed or newest() is not None,
+                         max(0.0, deadline - time.monotonic()))
+        for one in sources:
+            one.want_no_more()
+        frame = newest()
+        if frame is None:
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
+                               f'{"; ".join(one.why_none(after) for one in sources)}')
+        return frame
 
 
 class TimedImage(NamedTuple):
