@@ -6,6 +6,7 @@ No field of a message is taken for valid.
 """
 
 import math
+import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -23,6 +24,8 @@ _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
 # A small file may declare any size: an image takes 200 MB at most.
 _MAX_PIXELS = 2**26
+_DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
+_DEPTH_HEADER = struct.Struct('<iff')  # of compressedDepth: format, and two parameters of floats
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # The markers of JPEG that are followed by the size of the image.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -110,6 +113,56 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
         at += 2 + int.from_bytes(data[at + 2:at + 4])
     raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
                      'it is no JPEG or PNG, or it is cut off')
+
+
+def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:
+    """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
+
+    Its encoding is 16UC1, mono16 or 32FC1; 0 or NaN stands for no depth. ImageError: a field is
+    invalid.
+    """
+    if isinstance(msg, CompressedImageMessage):
+        return _decode_depth_png(msg)
+    dtype = _depth_type(msg.encoding).newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
+    check_size(msg.width, msg.height)
+    used = msg.width * dtype.itemsize
+    if msg.step < used or len(msg.data) < msg.step * msg.height:
+        raise ImageError(f'depth image of {msg.width}x{msg.height} px with step {msg.step} has '
+                         f'only {len(msg.data)} bytes')
+    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
+    pixels = np.ascontiguousarray(rows.reshape(msg.height, msg.step)[:, :used]).view(dtype)
+    return pixels.astype(dtype.newbyteorder('='))
+
+
+def _depth_type(encoding: str) -> np.dtype[Any]:
+    if encoding not in _DEPTH_TYPES:
+        raise ImageError(f"depth encoding '{encoding}' is none of {', '.join(_DEPTH_TYPES)}")
+    return np.dtype(_DEPTH_TYPES[encoding])
+
+
+def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
+    encoding, _, transport = (part.strip() for part in msg.format.partition(';'))
+    if not transport.startswith('compressedDepth') or transport.endswith('rvl'):
+        raise ImageError(f"depth format '{msg.format}' is not 'ENCODING; compressedDepth png': "
+                         'record the compressedDepth topic, as PNG')
+    is_inverse = _depth_type(encoding) == np.float32
+    data = bytes(msg.data)
+    check_size(*declared_size(data[_DEPTH_HEADER.size:], msg.format))
+    try:
+        values = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_DEPTH_HEADER.size),
+                              cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ImageError(f"depth image ('{msg.format}') does not decode: {error.err}") from error
+    if values is None or values.dtype != np.uint16 or values.ndim != 2:
+        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is no PNG of 16 bits "
+                         'with one channel')
+    if not is_inverse:
+        return values
+    _, a, b = _DEPTH_HEADER.unpack_from(data)
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        depths = np.float32(a) / (values.astype(np.float32) - np.float32(b))
+    depths[values == 0] = np.nan
+    return depths
 
 
 def check_size(width: int, height: int) -> None:

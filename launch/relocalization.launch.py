@@ -23,6 +23,7 @@ NAMES = {
     'image': 'the raw topic of the camera driver; image/compressed follows it',
     'camera_info': 'the topic of the camera driver',
     'detections': 'from the detector to the relocalizer',
+    'depth': 'of an RGB-D camera, with depth_transport; depth/compressedDepth follows it',
     'odom': 'tells whether the robot moves; without it the robot is assumed to stand',
     'imu': 'the vertical, with gravity:=imu',
     'initialpose': 'what AMCL subscribes to',
@@ -50,6 +51,7 @@ RELOCALIZER_PARAMETERS = {
     'clip_model': 'open_clip architecture',
     'clip_pretrained': 'tag or file',
     'image_transport': 'raw or compressed',
+    'depth_transport': 'none, raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',
     'use_sim_time': 'true: use the time of /clock',
 }
@@ -100,12 +102,13 @@ def _node(name: str, parameters: set[str], given: set[str], **keywords) -> Node:
     changes = {one: ParameterValue(LaunchConfiguration(one),
                                    value_type=_type_of(one))
                for one in sorted(parameters)}
-    tf, image = LaunchConfiguration('tf'), LaunchConfiguration('image')
+    tf, image, depth = map(LaunchConfiguration, ('tf', 'image', 'depth'))
     return Node(
         package='cliploc_ros', executable=name, name=name, output='screen',
         namespace=LaunchConfiguration('namespace'),
         parameters=[*files, *([changes] if changes else [])],
         remappings=[*((topic, LaunchConfiguration(topic)) for topic in NAMES),
                     ('image/compressed', [image, '/compressed']),
+                    ('depth/compressedDepth', [depth, '/compressedDepth']),
                     ('/tf', tf), ('/tf_static', [tf, '_static'])],
         ros_arguments=['--log-level', LaunchConfiguration('log_level')], **keywords)

@@ -76,7 +76,7 @@ def test_every_topic_and_service_can_be_remapped(constants):
     names = {entry.text for entry in ElementTree.parse(POLICY).iter()
              if entry.tag in ('topic', 'service')}
     relative = {name[1:] for name in names if not OWN.match(name)}
-    assert set(constants['NAMES']) | {'image/compressed'} == relative
+    assert set(constants['NAMES']) | {'image/compressed', 'depth/compressedDepth'} == relative
 
 
 def test_no_argument_is_taken_for_one_of_nav2(arguments, of_wake_up):

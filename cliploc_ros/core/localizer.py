@@ -27,7 +27,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
     invert_transform,
@@ -198,14 +200,20 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
                               compared=compared)
 
 
-class KeptFrame(NamedTuple):
-    """A searched frame, and the odom_from_camera (4, 4) of the first frame that it replaced.
+class KeptInstant(NamedTuple):
+    """The searched frames of one instant, and the odom_from_camera (4, 4) of its last camera.
 
-    A camera that creeps moves away from this anchor in the end.
+    That is of the first instant that this one replaced: a camera that creeps moves away from this
+    anchor in the end.
     """
 
-    searched: SearchedFrame
+    searched: tuple[SearchedFrame, ...]
     anchor: NDArray[np.float64]
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the time of the instant [ns]."""
+        return self.searched[-1].observation.stamp_ns
 
 
 class Localizer:
@@ -213,55 +221,79 @@ class Localizer:
 
     def __init__(self, relocalizer: Relocalizer) -> None:
         self._relocalizer = relocalizer
-        self._frames: list[KeptFrame] = []
+        self._instants: list[KeptInstant] = []
         self._looks = Looks()
         self._known: Known | None = None
         self._run = -1
         self._stamp_ns = 0
         #: The newest frame that was localized, with the crops that it took.
         self.observation: Observation | None = None
+        #: Depth is not used any more once it is wrong.
+        self.depth_scale = DepthScale()
 
-    def localize(self, observation: Observation, run: int = 0, limit: int = 1,
+    def localize(self, observation: Observation, run: int | None = 0, limit: int = 1,
                  length_s: float = 0.0, crops: Crops | None = None,
-                 recognizer: ImageRecognizer | None = None) -> Relocalization:
-        """Localize with a frame and, where odometry places it, with those before it.
+                 recognizer: ImageRecognizer | None = None, others: Sequence[Observation] = ()
+                 ) -> Relocalization:
+        """Localize with the frames of an instant and, where odometry places it, those before it.
 
-        Odometry links all frames of one run. A new run or a stamp before the last one forgets
-        frames and looks. Looks persist until a pose is accepted, whatever `length_s`.
+        Odometry links all instants of one run. A new run or a stamp before the last one forgets
+        instants and looks. Looks persist until a pose is accepted, whatever `length_s`.
 
         Parameters
         ----------
         observation : Observation
-            Without odom_from_camera it is localized alone, and the localizer does not change.
-        run : int
-            Number of the run of odometry.
+            Of the camera to localize. Without odom_from_camera it is localized alone, and the
+            localizer does not change.
+        run : int or None
+            Number of the run of odometry; None: this instant is linked to no other.
         limit : int
-            The most frames to fuse, this one included.
+            The most instants to fuse, this one included; fewer where they have more frames than
+            can be fused.
         length_s : float
-            Older frames are dropped [s].
+            Older instants are dropped [s].
         crops : Crops, optional
             Of this frame, compared until the pose is accepted.
         recognizer : ImageRecognizer, optional
             Of the keyframes, for the image of this frame.
+        others : sequence of Observation, optional
+            What other cameras see at this instant: with its stamp, a camera_name each, and
+            odom_from_camera in the same coordinate frame, such as the robot's.
 
         Raises
         ------
         OptionsError
-            See Relocalizer.relocalize. The localizer drops this frame.
+            See Relocalizer.relocalize. The localizer drops this instant.
         """
-        if observation.odom_from_camera is None:
-            alone, found = localize_on_demand(self._relocalizer, (), observation, crops,
+        if self.depth_scale.is_wrong:
+            observation = replace(observation, depths=None)
+            others = [replace(one, depths=None) for one in others]
+        found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
+        if found.accepted and found.depth is not None:
+            self.depth_scale.add(found.depth)
+        return found
+
+    def _localize(self, observation: Observation, run: int | None, limit: int, length_s: float,
+                  crops: Crops | None, recognizer: ImageRecognizer | None,
+                  others: Sequence[Observation]) -> Relocalization:
+        budget = self._relocalizer.begin(len(others) + 1)
+        beside = [self._relocalizer.search(one, budget.search_end(number, len(others) + 1))
+                  for number, one in enumerate(others, start=1)]
+        if observation.odom_from_camera is None or run is None:
+            alone, found = localize_on_demand(self._relocalizer, beside, observation, crops,
                                               recognizer=recognizer)
             self.observation = alone.observation
             return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
-            self._frames, self._looks, self._known = [], Looks(), None
+            self._instants, self._looks, self._known = [], Looks(), None
         self._run, self._stamp_ns = run, observation.stamp_ns
-        earlier, anchor = frames_to_fuse(self._frames, observation, limit, length_s)
+        earlier, anchor = instants_to_fuse(self._instants, observation, limit, length_s)
+        while earlier and sum(len(one.searched) for one in earlier) + len(beside) >= MAX_FRAMES:
+            del earlier[0]
         newest, found = localize_on_demand(
-            self._relocalizer, [one.searched for one in earlier], observation, crops,
-            self._looks, recognizer)
-        self._frames = [*earlier, KeptFrame(newest, anchor)]
+            self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
+            observation, crops, self._looks, recognizer)
+        self._instants = [*earlier, KeptInstant((*beside, newest), anchor)]
         self.observation = newest.observation
         if found.map_from_camera is not None:
             self._looks = self._looks.with_look(Look(
@@ -284,23 +316,23 @@ class Localizer:
         return given
 
 
-def frames_to_fuse(frames: Sequence[KeptFrame], observation: Observation, limit: int,
-                   length_s: float) -> tuple[list[KeptFrame], NDArray[np.float64]]:
-    """Return the frames to fuse a new one with, oldest first, and the anchor of the new one.
+def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, limit: int,
+                     length_s: float) -> tuple[list[KeptInstant], NDArray[np.float64]]:
+    """Return the instants to fuse a new one with, oldest first, and the anchor of the new one.
 
-    Of too many frames those remain that are furthest apart, so a camera that turns is localized
+    Of too many instants those remain that are furthest apart, so a camera that turns is localized
     by all that it saw on its way.
     """
     first_ns = observation.stamp_ns - round(length_s * NS_PER_S)
-    # a frame without detections has nothing to fuse
-    earlier = [one for one in frames if len(one.searched.observation.detections)
-               and first_ns <= one.searched.observation.stamp_ns < observation.stamp_ns]
+    # an instant without detections has nothing to fuse
+    earlier = [one for one in instants if first_ns <= one.stamp_ns < observation.stamp_ns
+               and any(len(frame.observation.detections) for frame in one.searched)]
     anchor = observation.odom_from_camera
     assert anchor is not None
     if earlier and max(_steps(earlier[-1].anchor, anchor)) <= 1.0:
         anchor = earlier.pop().anchor
     while len(earlier) >= limit:
-        # the frame nearest to those before and after it goes, neither end if possible
+        # the instant nearest to those before and after it goes, neither end if possible
         anchors = [*(one.anchor for one in earlier), anchor]
         ways = [sum(_steps(anchors[row - 1], anchors[row])
                     + _steps(anchors[row], anchors[row + 1]))

@@ -66,6 +66,7 @@ class Observation:
     #: of each of the map's L landmarks, in the map's order. None where only classes are known.
     similarities: Similarities | None = None
     stamp_ns: int = 0  #: Time of the image [ns]
+    camera_name: str = ''  #: Which of several cameras took it
     #: (3,): the vertical, a unit vector in the camera's optical coordinate frame; None if unknown
     up_in_camera: NDArray[np.float64] | None = None
     #: (4, 4): the camera in the coordinate frame of odometry, which links this frame to others;
@@ -76,6 +77,11 @@ class Observation:
     #: (m,): the detections that the rows of similarities (m, L) belong to; None for all, in their
     #: order. The other detections are matched by class alone.
     compared: NDArray[np.int64] | None = None
+    #: (n,): median depth of the inner half of each box, along z of the camera [m]; NaN where there
+    #: is none. None for a camera without depth.
+    depths: NDArray[np.float64] | None = None
+    #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
+    depth_deviations: NDArray[np.float64] | None = None
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

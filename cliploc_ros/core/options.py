@@ -59,6 +59,9 @@ class RelocalizerOptions:
     #: Refine the best hypotheses on all their inliers, then choose the likeliest one. The paper
     #: does not refine, and chooses the one with the greatest score.
     refine: bool = True
+    #: Standard deviations of the mounts of several cameras, against each other, on each axis
+    #: [m] [deg]
+    mount_deviation: tuple[float, float] = (0.01, 0.5)
     min_inliers: int = 3  #: A pose with fewer matched objects is refused
     #: A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
     #: cliploc_ros.core.acceptance.confidence

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind
 from cliploc_ros.core.fit.finalists import Match
@@ -54,6 +55,8 @@ class Relocalization:
     refusal_kind: RefusalKind | None = None
     #: What keyframes say, whatever the best pose comes from; None without keyframes
     recognition: Recognition | None = None
+    #: Whether the depths of the objects can be right; None without depth
+    depth: DepthCheck | None = None
 
     @property
     def recognized(self) -> RecognizedPlace | None:

@@ -15,8 +15,15 @@ from cliploc_ros.core.acceptance.comparison import (
     compare,
     evidence_of,
     pose_of,
+    search_contenders,
 )
-from cliploc_ros.core.acceptance.contenders import join_frames
+from cliploc_ros.core.acceptance.contenders import (
+    Contender,
+    JoinedFrames,
+    join_frames,
+    without_depth,
+)
+from cliploc_ros.core.acceptance.depth_check import check_depth
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.fit.finalists import find_with_rivals
@@ -143,9 +150,12 @@ class Relocalizer:
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self._map, self._options, frames)
-        finalists, is_upright = find_with_rivals(frames, joined.rig, self._options.refine,
-                                                 budget.refinement_end)
-        compared = compare(joined, finalists, is_upright, recognizer)
+        met = self._meet(joined, budget)
+        depth = check_depth(joined.rig, met[0].finalist) if met else None
+        if depth is not None and not depth.is_passed:
+            joined = without_depth(joined)
+            met = self._meet(joined, budget)
+        compared = compare(joined, met, recognizer)
         if not compared.contenders:
             return _nothing_found(frames, budget)
         pose, covariance = pose_of(joined, compared)
@@ -159,7 +169,12 @@ class Relocalizer:
             evidence=evidence, covariance=covariance, tried=_tried(frames),
             best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
-            source=compared.source, recognition=compared.recognition)
+            source=compared.source, recognition=compared.recognition, depth=depth)
+
+    def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
+        """Return the best poses that the search met, see search_contenders."""
+        return search_contenders(joined, *find_with_rivals(
+            joined.frames, joined.rig, self._options.refine, budget.refinement_end))
 
 
 def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.fit.refinement import jacobian_of, one_to_one, refine_rig, residuals_of
 from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth import depth_errors
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
@@ -51,7 +52,8 @@ def call_every_kernel() -> None:
     found = verify_rig(rig, np.eye(3), np.zeros(3))
     inliers = one_to_one(rig, found, np.eye(3), np.zeros(3)).pairs
     residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3),
-                 np.empty(4 * len(inliers) + 3))
+                 np.empty(5 * len(inliers) + 3))
+    depth_errors(scene.depths, centers, shapes, np.zeros(3), np.eye(3), np.zeros(3))
     jacobian_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3))
     refine_rig(rig, np.eye(3), np.zeros(3))
     same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))

@@ -8,9 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,19 +19,10 @@ from cliploc_ros.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.datasets.poses import Poses, check_clock
-from cliploc_ros.errors import CliplocError, DatasetError, ImageError
-from cliploc_ros.messages import (
-    CompressedImageMessage,
-    ImageMessage,
-    camera_from_msg,
-    check_size,
-    declared_size,
-    image_from_msg,
-)
+from cliploc_ros.errors import CliplocError, DatasetError
+from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg, image_from_msg
 from cliploc_ros.units import NS_PER_S
 
-_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
-_HEADER = struct.Struct('<iff')
 _IMAGE = 'sensor_msgs/msg/Image'
 _IMAGES = (_IMAGE, 'sensor_msgs/msg/CompressedImage')
 _CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
@@ -42,56 +31,6 @@ _MAX_DEPTH_DELAY_NS = 20_000_000
 # Images that wait for their depth. A depth image is recorded at most this many images later.
 _MAX_WAITING = 15
 _Selected = tuple[int, int, 'NDArray[np.float64] | None', bytes, 'bytes | None']
-
-
-def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:
-    """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
-
-    Its encoding is 16UC1, mono16 or 32FC1; 0 or NaN stands for no depth. ImageError: a field is
-    invalid.
-    """
-    if isinstance(msg, CompressedImageMessage):
-        return _decode_depth_png(msg)
-    dtype = _depth_type(msg.encoding).newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
-    check_size(msg.width, msg.height)
-    used = msg.width * dtype.itemsize
-    if msg.step < used or len(msg.data) < msg.step * msg.height:
-        raise ImageError(f'depth image of {msg.width}x{msg.height} px with step {msg.step} has '
-                         f'only {len(msg.data)} bytes')
-    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
-    pixels = np.ascontiguousarray(rows.reshape(msg.height, msg.step)[:, :used]).view(dtype)
-    return pixels.astype(dtype.newbyteorder('='))
-
-
-def _depth_type(encoding: str) -> np.dtype[Any]:
-    if encoding not in _TYPES:
-        raise ImageError(f"depth encoding '{encoding}' is none of {', '.join(_TYPES)}")
-    return np.dtype(_TYPES[encoding])
-
-
-def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
-    encoding, _, transport = (part.strip() for part in msg.format.partition(';'))
-    if not transport.startswith('compressedDepth') or transport.endswith('rvl'):
-        raise ImageError(f"depth format '{msg.format}' is not 'ENCODING; compressedDepth png': "
-                         'record the compressedDepth topic, as PNG')
-    is_inverse = _depth_type(encoding) == np.float32
-    data = bytes(msg.data)
-    check_size(*declared_size(data[_HEADER.size:], msg.format))
-    try:
-        values = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_HEADER.size),
-                              cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ImageError(f"depth image ('{msg.format}') does not decode: {error.err}") from error
-    if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is no PNG of 16 bits "
-                         'with one channel')
-    if not is_inverse:
-        return values
-    _, a, b = _HEADER.unpack_from(data)
-    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-        depths = np.float32(a) / (values.astype(np.float32) - np.float32(b))
-    depths[values == 0] = np.nan
-    return depths
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 """A request as a recording: what the relocalizer saw, what it knew, and what it answered."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ _TEXT = 'std_msgs/msg/String'
 _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 _CAMERA_INFO, _DETECTIONS = '/camera_info', '/detections'
 # What was known besides the messages, at the stamp of each image.
-_CAMERA, _UP = '/camera_in_odom', '/up_in_camera'
+_CAMERA, _UP, _DEPTH = '/camera_in_odom', '/up_in_camera', '/depth'
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,32 @@ class CaseFrame:
     detections: bytes
     up_in_camera: NDArray[np.float64] | None = None  #: (3,): the vertical, where it was known
     odom_from_camera: NDArray[np.float64] | None = None  #: (4, 4): where odometry placed the frame
+    depth_type: str = ''  #: sensor_msgs/msg/Image or CompressedImage; empty without depth
+    depth: bytes = b''
+    camera: str = ''  #: Name of one of several cameras
+    is_beside: bool = False  #: Whether the pose is that of another camera of its instant
 
     def message(self, name: str) -> Any:
-        """Return one of the three messages; DatasetError: its bytes are no such message."""
+        """Return one of the messages; DatasetError: its bytes are no such message."""
         msgtype = {'image': self.image_type, 'camera_info': CAMERA_INFO,
-                   'detections': DETECTIONS}[name]
+                   'detections': DETECTIONS, 'depth': self.depth_type}[name]
         return deserialize(getattr(self, name), msgtype, name)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A request: its frames, the oldest first, and the answer with the parameters behind it."""
+    """A request: its frames, the oldest first, and the answer with the parameters behind it.
+
+    Of several cameras, the frames of an instant follow each other, that of the pose last.
+    """
 
     frames: tuple[CaseFrame, ...]
     report: Mapping[str, Any]
+
+    def instants(self) -> list[tuple[CaseFrame, ...]]:
+        """Return the frames of each instant."""
+        ends = [row for row, frame in enumerate(self.frames, start=1) if not frame.is_beside]
+        return [self.frames[first:end] for first, end in pairwise([0, *ends])]
 
 
 def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
@@ -62,29 +75,45 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
 
     DatasetError: it cannot be written; nothing remains of it.
     """
-    image_type = case.frames[-1].image_type
-    image = '/image' if image_type == IMAGE else '/image/compressed'
     types = typestore().types
     with BagWriter(path, storage) as writer:
-        for topic, msgtype in ((image, image_type), (_CAMERA_INFO, CAMERA_INFO),
-                               (_DETECTIONS, DETECTIONS), (_CAMERA, POSE), (_UP, _VECTOR),
-                               (VERDICT, _TEXT)):
-            writer.add_topic(topic, msgtype)
+        for frame in {one.camera: one for one in case.frames}.values():
+            prefix = _prefix(frame.camera)
+            for topic, msgtype in ((_image_topic(frame.image_type), frame.image_type),
+                                   (_CAMERA_INFO, CAMERA_INFO), (_DETECTIONS, DETECTIONS),
+                                   (_CAMERA, POSE), (_UP, _VECTOR)):
+                writer.add_topic(prefix + topic, msgtype)
+            if depth_type := next((one.depth_type for one in case.frames
+                                   if one.depth and one.camera == frame.camera), ''):
+                writer.add_topic(prefix + _DEPTH, depth_type)
+        writer.add_topic(VERDICT, _TEXT)
         for frame in case.frames:
-            stamp = frame.stamp_ns
+            stamp, prefix = frame.stamp_ns, _prefix(frame.camera)
             # the image last: it completes a frame for a node that replays the recording
-            writer.write(_CAMERA_INFO, stamp, frame.camera_info)
-            writer.write(_DETECTIONS, stamp, frame.detections)
-            writer.write(image, stamp, frame.image)
+            writer.write(prefix + _CAMERA_INFO, stamp, frame.camera_info)
+            writer.write(prefix + _DETECTIONS, stamp, frame.detections)
+            writer.write(prefix + _image_topic(frame.image_type), stamp, frame.image)
             if frame.odom_from_camera is not None:
-                writer.write(_CAMERA, stamp, pose_message(stamp, 'odom', frame.odom_from_camera))
+                writer.write(prefix + _CAMERA, stamp,
+                             pose_message(stamp, 'odom', frame.odom_from_camera))
             if frame.up_in_camera is not None:
                 x, y, z = map(float, frame.up_in_camera)
-                writer.write(_UP, stamp, types[_VECTOR](
+                writer.write(prefix + _UP, stamp, types[_VECTOR](
                     header=frame.message('camera_info').header,
                     vector=types['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)))
+            if frame.depth:
+                writer.write(prefix + _DEPTH, stamp, frame.depth)
+        order = [[one.camera, one.stamp_ns, one.is_beside] for one in case.frames]
         writer.write(VERDICT, case.frames[-1].stamp_ns,
-                     types[_TEXT](data=json.dumps(dict(case.report))))
+                     types[_TEXT](data=json.dumps({'frames': order, **case.report})))
+
+
+def _prefix(camera: str) -> str:
+    return f'/{camera}' if camera else ''
+
+
+def _image_topic(image_type: str) -> str:
+    return '/image' if image_type == IMAGE else '/image/compressed'
 
 
 def is_case(path: Path) -> bool:
@@ -97,36 +126,49 @@ def is_case(path: Path) -> bool:
 def read_case(path: Path) -> Case:
     """Read a case; DatasetError: the message names what is missing or broken."""
     with BagReader(path) as reader:
-        topics = [name for name in ('/image', '/image/compressed') if name in reader.topics]
-        if not topics:
-            raise DatasetError(f'{path}: has neither /image nor /image/compressed')
-        image_type = reader.topic(topics[0]).msgtype
-        images = _by_stamp(reader, topics[0])
-        others = {name: _by_stamp(reader, name)
-                  for name in (_CAMERA_INFO, _DETECTIONS, _CAMERA, _UP)}
-        text = reader.deserialize(next(reader.messages([VERDICT]))).data
-    try:
-        report = json.loads(text)
-    except ValueError as error:
-        raise DatasetError(f'{path}: {VERDICT} is no JSON: {error}') from error
-    if not isinstance(report, dict):
-        raise DatasetError(f'{path}: {VERDICT} must be a mapping')
-    frames = []
-    for stamp, image in sorted(images.items()):
-        if not (stamp in others[_CAMERA_INFO] and stamp in others[_DETECTIONS]):
+        try:
+            verdict = next(reader.messages([VERDICT]), None)
+            report = {} if verdict is None else json.loads(reader.deserialize(verdict).data)
+        except ValueError as error:
+            raise DatasetError(f'{path}: {VERDICT} is no JSON: {error}') from error
+        if not isinstance(report, dict):
+            raise DatasetError(f'{path}: {VERDICT} must be a mapping')
+        order = report.get('frames')
+        cameras = [''] if order is None else list(dict.fromkeys(name for name, _, _ in order))
+        found = {(name, frame.stamp_ns): frame for name in cameras
+                 for frame in _frames_of(reader, path, name)}
+    if order is None:  # recorded by a release without several cameras
+        return Case(tuple(found[key] for key in sorted(found)), report)
+    return Case(tuple(replace(found[name, stamp], is_beside=is_beside)
+                      for name, stamp, is_beside in order), report)
+
+
+def _frames_of(reader: BagReader, path: Path, camera: str) -> Iterator[CaseFrame]:
+    """Yield the frames of a camera."""
+    prefix = _prefix(camera)
+    topics = [topic for name in ('/image', '/image/compressed')
+              if (topic := prefix + name) in reader.topics]
+    if not topics:
+        raise DatasetError(f'{path}: has neither {prefix}/image nor {prefix}/image/compressed')
+    image_type = reader.topic(topics[0]).msgtype
+    depth_type = reader.topics[prefix + _DEPTH].msgtype if prefix + _DEPTH in reader.topics else ''
+    images = _by_stamp(reader, topics[0])
+    if not images:
+        raise DatasetError(f'{path}: {topics[0]} has no messages')
+    infos, detections, poses, verticals, depths = (_by_stamp(reader, prefix + name) for name in (
+        _CAMERA_INFO, _DETECTIONS, _CAMERA, _UP, _DEPTH))
+    for stamp, image in images.items():
+        if not (stamp in infos and stamp in detections):
             raise DatasetError(f'{path}: the image of {stamp} ns has no camera_info or detections')
-        frame = CaseFrame(
-            stamp, image_type, image, others[_CAMERA_INFO][stamp], others[_DETECTIONS][stamp])
-        if (data := others[_UP].get(stamp)) is not None:
+        frame = CaseFrame(stamp, image_type, image, infos[stamp], detections[stamp],
+                          depth_type=depth_type, depth=depths.get(stamp, b''), camera=camera)
+        if (data := verticals.get(stamp)) is not None:
             vector = deserialize(data, _VECTOR, _UP).vector
             frame = replace(frame, up_in_camera=np.array([vector.x, vector.y, vector.z]))
-        if (data := others[_CAMERA].get(stamp)) is not None:
+        if (data := poses.get(stamp)) is not None:
             frame = replace(frame, odom_from_camera=map_from_camera_of(
                 deserialize(data, POSE, _CAMERA)))
-        frames.append(frame)
-    if not frames:
-        raise DatasetError(f'{path}: {topics[0]} has no messages')
-    return Case(tuple(frames), report)
+        yield frame
 
 
 def _by_stamp(reader: BagReader, name: str) -> dict[int, bytes]:

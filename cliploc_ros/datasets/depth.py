@@ -7,13 +7,15 @@ So a box gets one robust value, from its inner half, and the spread of the value
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import DatasetError, ImageError
+from cliploc_ros.messages import depth_counts_from_msg
 
 #: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
@@ -28,6 +30,8 @@ _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 _STEP = 2
 #: Rooms and halls: the typical depth of a recording lies between these [m].
 PLAUSIBLE_DEPTH_M = (0.15, 40.0)
+# Rounding of a depth image that is a whole fraction of the colour image.
+_SAME_ASPECT = 0.02
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,36 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
     if is_integer:
         valid &= counts != np.uint16(65535)
     depths[~valid] = np.nan
+    return depths
+
+
+def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDArray[np.float64]
+                    ) -> NDArray[np.float64]:
+    """Return the depths (n,) of boxes (n, 4) by a message of registered depth, NaN where none [m].
+
+    ImageError: the message is invalid, or it is not of the colour camera; says what to do.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/Image or CompressedImage
+    image_frame : str
+        The coordinate frame of the colour image.
+    camera : Camera
+        Of the colour image.
+    """
+    if msg.header.frame_id != image_frame:
+        raise ImageError(f"depth is in the coordinate frame '{msg.header.frame_id}', the image in "
+                         f"'{image_frame}': publish depth registered to the image")
+    depths_m = depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
+    height, width = depths_m.shape
+    if abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
+        raise ImageError(f'depth has {width}x{height} px, the image {camera.width}x'
+                         f'{camera.height}: publish depth registered to the image')
+    depths = depths_of_boxes(DepthImage(depths_m), camera, bboxes_xyxy)[0].astype(np.float64)
+    known, (least, greatest) = depths[np.isfinite(depths)], PLAUSIBLE_DEPTH_M
+    if len(known) and not least < np.median(known) < greatest:
+        raise ImageError(f'depth of the boxes is {np.median(known):.3g} m: 16UC1 is in '
+                         'millimetres, 32FC1 in metres')
     return depths
 
 

@@ -23,9 +23,6 @@ from cliploc_ros.mapping.posed_detections import PosedDetections
 _SCHEMA = Schema('observation file', {
     **FRAME_FIELDS,
     'image_size': Field('integers', (2,)),
-    # NaN where unknown
-    'depths': Field('floats', ('n',), (Check('is not positive', lambda depths: depths <= 0.0),),
-                    is_optional=True),
     'depth_spreads': Field('floats', ('n',), is_optional=True),
     'open_edges': Field('booleans', ('n', 4), is_optional=True),
     # large, and few of the rows are in use at once

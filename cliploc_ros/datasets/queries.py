@@ -39,6 +39,9 @@ FRAME_FIELDS = {
     'timestamps': Field('numbers', ('F',), (FINITE,)),
     'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, Check(
         'is no rigid transform', lambda poses: ~are_rigid(poses)))),
+    # NaN where unknown [m]
+    'depths': Field('floats', ('n',), (Check('is not positive', lambda depths: depths <= 0.0),),
+                    is_optional=True),
     # exact, which a float64 of seconds is not [ns]
     'stamps_ns': Field('integers', ('F',), is_optional=True),
     # time that the networks took [ms], NaN where unknown
@@ -102,6 +105,8 @@ class QueryFrame:
     #: Processing time of the image [ms]; NaN if not recorded
     detector_ms: float = math.nan
     clip_ms: float = math.nan
+    #: (n,): depth of what each box shows [m], NaN where unknown; None without a depth camera
+    depths: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -167,6 +172,7 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
             true_landmark=arrays['true_landmark'][rows].astype(np.int64),
             map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
             group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
+            depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None,
             **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
     return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
 
@@ -202,6 +208,9 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
             **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
         }
+        if any(one.depths is not None for one in frames):
+            arrays['depths'] = np.concatenate([
+                np.full(len(one), np.nan) if one.depths is None else one.depths for one in frames])
     except ValueError as error:  # arrays of different widths
         raise DatasetError(f'{path}: cannot be written: {error}') from error
     _SCHEMA.write(path, arrays, compress=True)

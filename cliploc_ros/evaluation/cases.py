@@ -4,8 +4,12 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
@@ -13,14 +17,15 @@ from cliploc_ros.core.keyframes.localization import (
     KeyframeLocalizer,
     query_features,
 )
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer, can_do_without_crops, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.cases import Case
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.datasets.cases import Case, CaseFrame
+from cliploc_ros.datasets.depth import depths_from_msg
+from cliploc_ros.errors import DatasetError, ImageError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
@@ -39,7 +44,8 @@ def options_of(case: Case) -> RelocalizerOptions:
     known = {field.name for field in fields(RelocalizerOptions)}
     try:
         options = {name: value for name, value in given.items() if name in known}  # type: ignore
-        options['height_range_m'] = tuple(options['height_range_m'])
+        options |= {name: tuple(value) for name, value in options.items()
+                    if isinstance(value, list)}
         return replace(RelocalizerOptions(**options), time_budget_s=math.inf)
     except (AttributeError, KeyError, TypeError, OptionsError) as error:
         raise DatasetError(f'the options of this case are broken: {error}') from error
@@ -72,27 +78,44 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
     keyframes = None if layer is None else KeyframeLocalizer(layer)
     class_map = parse_class_map(parameters['class_map'])
     found = None
-    for frame in case.frames:
-        # as the node makes it
-        image = image_from_msg(frame.message('image'))
-        height, width = image.shape[:2]
-        camera = camera_from_msg(frame.message('camera_info'), (width, height),
-                                 parameters['rectified'])
-        detections = detections_from_msg(frame.message('detections'), class_map).usable(
-            width, height, parameters['max_detections'])
-        observation = Observation(camera, detections, stamp_ns=frame.stamp_ns,
-                                  up_in_camera=frame.up_in_camera,
-                                  odom_from_camera=frame.odom_from_camera)
+    for *beside, frame in case.instants():
+        image, observation = _observed(frame, parameters, class_map)
+        others = [_observed(one, parameters, class_map)[1] for one in beside]
+        if can_do_without_crops(options):  # the node compares crops of one camera
+            none = np.empty(0, dtype=np.int64)
+            others = [replace(one, similarities=np.empty((0, len(landmark_map)), dtype=np.float32),
+                              compared=none)
+                      for one in others]
         recognizer = None if keyframes is None else ImageRecognizer(
-            keyframes, query_features(image), camera)
+            keyframes, query_features(image), observation.camera)
         if observer is not None:
             observation = replace(observation, similarities=observer.observe(
-                image, camera, detections, frame.stamp_ns).similarities)
-        crops = recorded_crops(observation, options)
-        if observation.odom_from_camera is None:
-            found = session.localize(observation, crops=crops, recognizer=recognizer)
-        else:
-            found = session.localize(observation, 0, parameters['fuse_frames'],
-                                     parameters['fuse_window_s'], crops, recognizer)
+                image, observation.camera, observation.detections, frame.stamp_ns).similarities)
+        # of several cameras without odometry, the robot itself is what links them
+        run = 0 if case.report.get('linked', frame.odom_from_camera is not None) else None
+        found = session.localize(
+            observation, run, parameters['fuse_frames'], parameters['fuse_window_s'],
+            recorded_crops(observation, options), recognizer,
+            [replace(one, stamp_ns=observation.stamp_ns) for one in others])
     assert found is not None  # a case has a frame
     return found
+
+
+def _observed(frame: CaseFrame, parameters: Mapping[str, Any], class_map: Mapping[str, str]
+              ) -> tuple[NDArray[np.uint8], Observation]:
+    """Return the image of a frame, and what was detected in it, as the node makes them."""
+    image = image_from_msg(frame.message('image'))
+    height, width = image.shape[:2]
+    camera = camera_from_msg(frame.message('camera_info'), (width, height),
+                             parameters['rectified'])
+    detections = detections_from_msg(frame.message('detections'), class_map).usable(
+        width, height, parameters['max_detections'])
+    depths = None
+    if frame.depth:
+        with suppress(ImageError):  # the node goes on without depth
+            depths = depths_from_msg(frame.message('depth'),
+                                     frame.message('image').header.frame_id, camera,
+                                     detections.bboxes_xyxy)
+    return image, Observation(
+        camera, detections, stamp_ns=frame.stamp_ns, camera_name=frame.camera,
+        up_in_camera=frame.up_in_camera, odom_from_camera=frame.odom_from_camera, depths=depths)

@@ -69,6 +69,8 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
             scores=detections.scores[rows], similarities=similarities,
             true_landmark=np.full(len(crops), -1, dtype=np.int64),
             map_from_camera=detections.map_from_camera[frame], group=frame, is_main=True,
+            depths=None if detections.depths is None
+            else detections.depths[rows].astype(np.float64),
             detector_ms=float(recorded.detector_ms[frame]),
             clip_ms=float(recorded.clip_ms[frame])))
     return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),

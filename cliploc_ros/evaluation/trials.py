@@ -112,7 +112,7 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
         Query(number, Observation(
             camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
             np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
-            frame.stamp_ns), frame.map_from_camera)
+            frame.stamp_ns, depths=frame.depths), frame.map_from_camera)
         for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
 
 

@@ -16,6 +16,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
+from cliploc_ros.ros.inputs.rig import Rig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.map_services import MapServices
@@ -42,10 +43,12 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._jumps = TimeJumps(self, self._forget)
         self._pipeline = Pipeline(self, self._robot, self._jumps)
         self._newest = LatestOnly(self.worker, self._localize_and_log)
-        self._frames = FrameSource(self, parameters.image_transport,
-                                   math.inf if continuous else LINGER_S,
-                                   self._newest.offer if continuous else lambda frame: None,
-                                   parameters.detections_type)
+        linger_s = math.inf if continuous else LINGER_S
+        on_frame = self._newest.offer if continuous else lambda frame: None
+        self._frames: FrameSource | Rig = Rig(
+            self, parameters, linger_s, on_frame) if parameters.camera_names else FrameSource(
+                self, parameters.image_transport, linger_s, on_frame, parameters.detections_type,
+                parameters.depth_transport, parameters.depth_tolerance_s)
         self._handoff = HandOff(self, self._robot.odometry)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
@@ -118,6 +121,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
+            if parameters.depth_transport != 'none':
+                health.values['depth scale'] = f'{localizer.depth_scale.ratio:.2f}'
             health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,
                               'device': localizer.device}
 

@@ -12,6 +12,7 @@ from enum import StrEnum
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 
 
@@ -41,6 +42,8 @@ class Answer:
     state: RobotState | None = None
     #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
+    #: The frames of other cameras that were used, with the robot's state at each
+    beside: tuple[tuple[Frame, RobotState], ...] = ()
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
     #: Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one
     map_hash: str = ''

@@ -5,19 +5,21 @@
 import threading
 from collections import deque
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.conversions import detections_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 if TYPE_CHECKING:
@@ -53,7 +55,7 @@ class CaseRecorder:
             return
         with self._lock:
             self._seen.append(_Seen(frame, answer))
-            while sum(len(one.frame.image.data) for one in self._seen) > _MAX_BYTES \
+            while sum(map(_bytes, self._seen)) > _MAX_BYTES \
                     and len(self._seen) > 1:
                 self._seen.popleft()
 
@@ -88,10 +90,10 @@ class CaseRecorder:
         seen, last = self._linked()
         folder = _made_folder(parameters.record_folder)
         found = seen[-1].answer
-        case = Case(tuple(_case_frame(one) for one in seen), {
+        case = Case(tuple(frame for one in seen for frame in _case_frames(one)), {
             'verdict': str(last.verdict), 'message': last.message, 'found': str(found.verdict),
-            'reason': found.detail, 'map_hash': found.map_hash, 'parameters': asdict(parameters),
-            'options': asdict(parameters.options())})
+            'reason': found.detail, 'map_hash': found.map_hash, 'linked': found.is_linked,
+            'parameters': asdict(parameters), 'options': asdict(parameters.options())})
         _check_room(folder, case, parameters.record_limit_mb)
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}'
@@ -116,29 +118,48 @@ class CaseRecorder:
         return seen[oldest:newest + 1], last
 
 
+def _bytes(seen: _Seen) -> int:
+    """Return the memory of its images."""
+    return sum(len(image.data) for one in (seen.frame, *seen.frame.beside)
+               for image in (one.image, one.depth) if image is not None)
+
+
 def _run(seen: _Seen) -> int | None:
     """Return the run of odometry that places a frame; None without one."""
     state = seen.answer.state
     return None if state is None or state.place is None else state.place.run
 
 
-def _case_frame(seen: _Seen) -> 'CaseFrame':
+def _case_frames(seen: _Seen) -> list['CaseFrame']:
+    """Return the frames of an instant, that of the pose last."""
+    return [*(replace(_case_frame(frame, state), is_beside=True)
+              for frame, state in seen.answer.beside), _case_frame(seen.frame, seen.answer.state)]
+
+
+def _case_frame(frame: Frame, state: RobotState | None) -> 'CaseFrame':
     from cliploc_ros.datasets.cases import CaseFrame
 
-    frame, state = seen.frame, seen.answer.state
-    place = None if state is None else state.place
-    kind = 'Image' if isinstance(frame.image, Image) else 'CompressedImage'
-    detections = frame.detections
+    detections, odom_from_camera = frame.detections, None
     if any(one.bbox.center.theta != 0.0 for one in detections.detections):
         # only rclpy's reader understands turned boxes
         detections = detections_to_msg(detections_from_msg(detections), detections.header)
+    if state is not None and state.place is not None:
+        odom_from_camera = state.place.odom_from_camera
+    elif state is not None and frame.camera:
+        odom_from_camera = invert_transform(state.camera_from_base)
     return CaseFrame(
-        stamp_ns(frame.image.header.stamp), f'sensor_msgs/msg/{kind}',
+        stamp_ns(frame.image.header.stamp), _type_of(frame.image),
         image=bytes(serialize_message(frame.image)),
         camera_info=bytes(serialize_message(frame.camera_info)),
         detections=bytes(serialize_message(detections)),
         up_in_camera=None if state is None else state.up_in_camera,
-        odom_from_camera=None if place is None else place.odom_from_camera)
+        odom_from_camera=odom_from_camera, camera=frame.camera,
+        depth_type=_type_of(frame.depth) if frame.depth else '',
+        depth=bytes(serialize_message(frame.depth)) if frame.depth else b'')
+
+
+def _type_of(image: Image | CompressedImage) -> str:
+    return f'sensor_msgs/msg/{type(image).__name__}'
 
 
 def _made_folder(name: str) -> Path:
@@ -155,7 +176,7 @@ def _made_folder(name: str) -> Path:
 def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
     """Raise unless the case fits into what the recordings of the folder may take."""
     size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
-               for frame in case.frames)
+               + len(frame.depth) for frame in case.frames)
     # The size of all files; some may be moved away meanwhile.
     used = 0
     for parent, _, names in folder.walk():

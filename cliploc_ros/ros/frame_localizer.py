@@ -5,6 +5,7 @@
 import logging
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.keyframes.layer import (
     KeyframeLayer,
@@ -41,7 +44,8 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import MapError
+from cliploc_ros.datasets.depth import depths_from_msg
+from cliploc_ros.errors import ImageError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import (
     camera_from_msg,
@@ -132,6 +136,8 @@ class Localized(NamedTuple):
     #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
     #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
+    cameras: int  #: Number of cameras whose frames of this instant were used
+    left_out: tuple[str, ...]  #: Names of those that had none
 
 
 class FrameLocalizer:
@@ -159,6 +165,7 @@ class FrameLocalizer:
         self._observer = observer
         self._options = options
         self._localizer = Localizer(relocalizer)
+        self._notes: set[str] = set()
         relocalizer.warm_up()
 
     @property
@@ -170,6 +177,11 @@ class FrameLocalizer:
     def keyframes(self) -> Keyframes | None:
         """Return the layer of keyframes; None without one."""
         return self._keyframes
+
+    @property
+    def depth_scale(self) -> DepthScale:
+        """Return what accepted poses say of the scale of depth."""
+        return self._localizer.depth_scale
 
     @property
     def description(self) -> str:
@@ -199,38 +211,34 @@ class FrameLocalizer:
                               load_keyframes(parameters, landmark_map))
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
-                 times: StageTimes, deadline: float = math.inf) -> Localized:
+                 times: StageTimes, deadline: float = math.inf,
+                 beside: Sequence[tuple[Frame, RobotState]] = ()) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        `parameters` are as they are now, `state` is that at the stamp of the frame. No crops are
-        compared after `deadline` (monotonic clock) [s].
+        `parameters` are as they are now, `state` is that at the stamp of the frame, `beside` are
+        frames of other cameras at this instant. No crops are compared after `deadline` (monotonic
+        clock) [s].
 
         CliplocError: names what to fix in the frame or in the parameters.
         """
         times.begin('decoding')
-        image = image_from_msg(frame.image)
-        height, width = image.shape[:2]
-        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-        detections = detections_from_msg(
-            frame.detections, parse_class_map(parameters.class_map)).usable(
-                width, height, parameters.max_detections)
-        place = state.place
-        observation = Observation(
-            camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
-            up_in_camera=state.up_in_camera,
-            odom_from_camera=None if place is None else place.odom_from_camera,
-            odom_way_m=0.0 if place is None else place.way_m)
         options = parameters.options()
         localizer = self._localizer_for(options)
+        # without odometry the robot itself is what links its cameras
+        run = None if state.place is None else state.place.run
+        image, observation = self._observed(frame, parameters, state,
+                                            run is not None or not frame.camera)
+        others = [
+            self._known_crops(*self._observed(one, parameters, its, run is not None), options)
+            for one, its in beside if run == (None if its.place is None else its.place.run)]
+        camera, detections = observation.camera, observation.detections
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, camera, deadline, times)
         times.begin('search')
-        if place is None:
-            found = localizer.localize(observation, crops=crops, recognizer=recognizer)
-        else:
-            found = localizer.localize(observation, place.run, parameters.fuse_frames,
-                                       parameters.fuse_window_s, crops, recognizer)
+        found = localizer.localize(
+            observation, run, parameters.fuse_frames, parameters.fuse_window_s, crops, recognizer,
+            [replace(one, stamp_ns=observation.stamp_ns) for one in others])
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
@@ -240,7 +248,63 @@ class FrameLocalizer:
         found, landmark_map, seen = _in_its_map(found, self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
-                         for_filter)
+                         for_filter, 1 + len(others), frame.left_out)
+
+    def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
+                  by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
+        """Return the image of a frame, and what was detected in it, without crops."""
+        image = image_from_msg(frame.image)
+        height, width = image.shape[:2]
+        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
+        detections = detections_from_msg(
+            frame.detections, parse_class_map(parameters.class_map)).usable(
+                width, height, parameters.max_detections)
+        place, odom_from_camera = state.place, None
+        if not by_odometry:
+            odom_from_camera = invert_transform(state.camera_from_base)
+        elif place is not None:
+            odom_from_camera = place.odom_from_camera
+        return image, Observation(
+            camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
+            camera_name=frame.camera, up_in_camera=state.up_in_camera,
+            depths=self._depths(frame, camera, detections.bboxes_xyxy),
+            odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
+
+    def _known_crops(self, image: NDArray[np.uint8], observation: Observation,
+                     options: RelocalizerOptions) -> Observation:
+        """Return what another camera sees, with the crops that cost nothing.
+
+        The paper's algorithms compare all crops, however long that takes.
+        """
+        if self._observer is None:
+            return observation
+        if not can_do_without_crops(options):
+            seen = self._observer.observe(image, observation.camera, observation.detections,
+                                          observation.stamp_ns)
+            return replace(observation, similarities=seen.similarities)
+        crops = self._observer.crops(image, observation.detections.bboxes_xyxy)
+        return replace(observation, similarities=crops.compare(crops.known), compared=crops.known)
+
+    def _depths(self, frame: Frame, camera: Camera, bboxes_xyxy: NDArray[np.float64]
+                ) -> NDArray[np.float64] | None:
+        """Return the depth of each box (n,); None without depth, or where it cannot be used."""
+        if frame.depth is None:
+            return None
+        if self.depth_scale.is_wrong:
+            self._note(f'depth is {self.depth_scale.ratio:.2f} times what boxes and map say, and '
+                       'is used no more: check its unit, calibration and registration')
+            return None
+        try:
+            return depths_from_msg(frame.depth, frame.image.header.frame_id, camera, bboxes_xyxy)
+        except ImageError as error:
+            self._note(f'localizing without depth: {error}')
+            return None
+
+    def _note(self, text: str) -> None:
+        """Log a warning once."""
+        if text not in self._notes:
+            self._notes.add(text)
+            logger.warning('%s', text)
 
     def _crops(self, image: NDArray[np.uint8], observation: Observation,
                options: RelocalizerOptions, times: StageTimes, deadline: float

@@ -3,7 +3,8 @@
 """Every parameter of the two nodes, and the method's options made from them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import batched
 from typing import Any
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
@@ -127,6 +128,21 @@ class RelocalizerParameters(CommonParameters):
     detections_type: str = parameter('vision_msgs',
         'Package of the type of detections: vision_msgs/Detection2DArray or '
         'yolo_msgs/DetectionArray (yolo_ros).', choices=DETECTION_TYPES, read_only=True)
+    cameras: list[str] = parameter([''],
+        'Names of several cameras, the namespaces of their topics image, camera_info, detections '
+        'and depth; empty: one camera.', read_only=True)
+    sync_tolerance_s: float = parameter(0.05,
+        'Images of several cameras within this time are of one instant.', unit='s', low=0.0,
+        high=1.0, read_only=True)
+    mount_deviation: list[float] = parameter([0.01, 0.5],
+        'Standard deviations of the mounts of several cameras on each axis [m] [deg].')
+    depth_transport: str = parameter('none',
+        "Use depth of an RGB-D camera, registered to the image: 'raw' on the topic depth, or "
+        "'compressed' on depth/compressedDepth.", choices=('none', 'raw', 'compressed'),
+        read_only=True)
+    depth_tolerance_s: float = parameter(0.02,
+        'Use depth whose stamp is at most this far from that of the image.', unit='s', low=0.0,
+        high=1.0, read_only=True)
     class_map: str = parameter('',
         "The map's names for another detector's classes, such as 'tvmonitor=tv, "
         "pottedplant=potted plant'.")
@@ -159,8 +175,8 @@ class RelocalizerParameters(CommonParameters):
         'The image is rectified: use P of camera_info and no distortion.')
     base_frame: str = parameter('', 'Coordinate frame to publish the pose of; empty: the camera.')
     base_from_camera: list[float] = parameter([0.0] * 7,
-        'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w; all zeros: '
-        'ask tf2.', unit='m')
+        'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w, of several '
+        'cameras one behind the other; all zeros: ask tf2.', unit='m', repeats=True)
     max_speed_m_s: float = parameter(0.1,
         'Withhold initialpose while odom shows a faster robot.', unit='m/s', low=0.0, high=100.0)
     max_turn_rad_s: float = parameter(0.2,
@@ -182,14 +198,36 @@ class RelocalizerParameters(CommonParameters):
         "Wait this long for a transform at the image's stamp. A request waits for the camera's "
         'mount on base_frame until timeout_s.', unit='s', low=0.0, high=60.0)
 
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Return the names of several cameras; none where there is one."""
+        return tuple(name for name in self.cameras if name)
+
+    def of_camera(self, name: str) -> 'RelocalizerParameters':
+        """Return the parameters with the mount of one of several cameras."""
+        if len(self.base_from_camera) == 7 or not name:
+            return self
+        first = 7 * self.camera_names.index(name)
+        return replace(self, base_from_camera=self.base_from_camera[first:first + 7])
+
     def check(self) -> None:
         """Raise OptionsError where values do not fit together; the message names the parameter."""
-        mount = self.base_from_camera
-        if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
-            raise OptionsError(
-                f'base_from_camera: the quaternion {mount[3:]} is not of unit length')
+        if len(self.base_from_camera) not in (7, 7 * len(self.camera_names)):
+            raise OptionsError('base_from_camera: needs 7 numbers, or 7 for each of the cameras')
+        for mount in batched(self.base_from_camera, 7):
+            if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
+                raise OptionsError(
+                    f'base_from_camera: the quaternion {[*mount[3:]]} is not of unit length')
         if self.gravity == 'base_frame' and not self.base_frame:
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
+        names = self.camera_names
+        if len(set(names)) < len(names):
+            raise OptionsError(f'cameras: a name is given twice: {", ".join(names)}')
+        if names and not self.base_frame:
+            raise OptionsError('cameras: needs base_frame')
+        if len(self.mount_deviation) != 2 or not all(
+                0.0 <= one < math.inf for one in self.mount_deviation):
+            raise OptionsError('mount_deviation: needs two numbers of 0 or more')
         if self.publish_tf and not self.base_frame:
             raise OptionsError('publish_tf: needs the parameter base_frame')
         parse_class_map(self.class_map)
@@ -200,14 +238,16 @@ class RelocalizerParameters(CommonParameters):
 
         OptionsError: names the parameter and its allowed values.
         """
-        names = RelocalizerOptions.__dataclass_fields__.keys() - {'time_budget_s',
-                                                                  'height_range_m'}
+        names = RelocalizerOptions.__dataclass_fields__.keys() - {
+            'time_budget_s', 'height_range_m', 'mount_deviation'}
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
         low, high = self.height_range_m
+        metres, degrees = self.mount_deviation
         # A search of the paper's algorithms that is cut short is refused, so they get more time;
         # the rest of the request waits for frames, runs the networks and hands over.
         return RelocalizerOptions(
-            **given, height_range_m=(low, high) if low != high else (-math.inf, math.inf),
+            **given, mount_deviation=(metres, degrees),
+            height_range_m=(low, high) if low != high else (-math.inf, math.inf),
             time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
             else _SEARCH_SHARE * self.timeout_s)
 

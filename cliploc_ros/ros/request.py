@@ -24,6 +24,7 @@ from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.rig import Rig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
@@ -33,6 +34,7 @@ from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
 from cliploc_ros.ros.outputs.visualization import Visualization
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
+_LOG_PERIOD_S = 5.0
 # Every frame that odometry does not link is another chance of a false accept.
 _MAX_UNLINKED = 3
 # An earlier request ends at its own deadline, shortly before those that wait for it.
@@ -119,8 +121,9 @@ class Pipeline:
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, parameters, deadline)
-        localized = localizer.localize(frame, parameters, state, times, deadline)
+        state = self._robot.at(image, parameters.of_camera(frame.camera), deadline)
+        beside = self._beside(frame, parameters, deadline)
+        localized = localizer.localize(frame, parameters, state, times, deadline, beside)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         self._node.check_active()
@@ -128,8 +131,8 @@ class Pipeline:
         header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
         found = localized.found
         answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
-                        None, frame.received_at, state, localized.is_cut, stages_ms,
-                        localizer.map_hash, found.refusal_kind)
+                        None, frame.received_at, state, localized.is_cut, tuple(beside),
+                        stages_ms, localizer.map_hash, found.refusal_kind)
         if found.accepted:
             answer = self._publish(header, localized, state, replace(
                 answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
@@ -139,6 +142,20 @@ class Pipeline:
                 self._visualization.show_debug_image, image, localized.seen,
                 localized.landmark_map, found, answer.message))
         return answer
+
+    def _beside(self, frame: Frame, parameters: RelocalizerParameters, deadline: float
+                ) -> list[tuple[Frame, RobotState]]:
+        """Return the frames of other cameras whose mounts are known, with the robot's state."""
+        found = []
+        for one in frame.beside:
+            soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
+            try:
+                found.append((one, self._robot.at(one.image.header,
+                                                   parameters.of_camera(one.camera), soon)))
+            except NoTransformError as error:
+                self._node.get_logger().warning(f'localizing without {one.camera}: {error}',
+                                                throttle_duration_sec=_LOG_PERIOD_S)
+        return found
 
     def _use(self, localizer: FrameLocalizer) -> str:
         self.localizer = localizer
@@ -177,7 +194,7 @@ class Requests:
     Otherwise it looks at fresh frames itself.
     """
 
-    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource,
+    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource | Rig,
                  robot: RobotStateSource, pipeline: Pipeline, cases: CaseRecorder,
                  handoff: HandOff) -> None:
         self._node = node
@@ -290,9 +307,16 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
     if found.recognized is not None:
         keyframes += f', {found.recognized.inliers} points of keyframes agree'
+    cameras = f', {localized.cameras} cameras' if localized.cameras > 1 else ''
+    if localized.left_out:
+        cameras += f', none of {", ".join(localized.left_out)}'
+    depth = ''
+    if found.depth is not None:
+        depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
+            else ', depth contradicts the boxes'
     return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{len(found.matches)} inliers, {found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}; '
+            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}; '
             f'{in_words(stages_ms)}]')
 
 

@@ -35,7 +35,7 @@ from studies.acceptance.looks import (
     retries_row,
     retry,
 )
-from studies.acceptance.places import MODES, ONE, add_arguments, chosen_places
+from studies.acceptance.places import MODES, ONE, Simulated, add_arguments, chosen_places
 from studies.acceptance.searches import (
     Outcome,
     Task,
@@ -163,7 +163,8 @@ def _growth(options: argparse.Namespace) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
-    tasks = [(kind, seed) for kind in KINDS for seed in range(options.worlds)]
+    tasks = [Simulated(kind, seed, options.depth) for kind in KINDS
+             for seed in range(options.worlds)]
     searched: list[fit.Searched] = run_all(fit.make_search_world, tasks, 'worlds',
                                            options.workers)
     calibrations = fit.cross_fitted(searched)
@@ -174,7 +175,8 @@ def _fit(options: argparse.Namespace) -> None:
         draw_judged(options.out, 'simulated worlds, each kind left out of the fit', {
             mode: fit.judged([one for one in plain if one.mode == mode], calibrations)
             for mode in MODES})
-    fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS])
+    fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
+                     'depth' if options.depth else '')
     print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
         f'{name}: {value:.3g}' for name, value in fitted.objects._asdict().items()))
 
@@ -218,6 +220,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     fits = add('fit', _fit, 'the fit of the confidence to simulated worlds',
                'draw a reliability diagram')
     fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
+    fits.add_argument('--depth', action='store_true', help='fit the coefficient of depth alone')
     fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
     for own in (judge, stress, robustness, retries, growth):
         own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')

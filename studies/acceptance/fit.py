@@ -39,11 +39,12 @@ _VERTICALS_DEG = (0.5, 1.0, 2.0, 4.0)
 _IN_DOUBT = 0.3
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 _PRECISION = 0.99
-_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained')
+_FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'depth')
+_TERMS = (*_FIELDS, 'none_right', 'map_size', 'vertical')
 # Support must not count against a pose, whatever a small data set says. A larger map has more
 # wrong poses, a vertical leaves fewer.
-_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (None, None),
-          (0, None), (None, 0))
+_SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (0, None),
+          (None, None), (0, None), (None, 0))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
@@ -87,15 +88,15 @@ class Searched(NamedTuple):
     case: Case
 
 
-def make_search_world() -> Callable[[tuple[str, int]], list[Searched]]:
+def make_search_world() -> Callable[[Simulated], list[Searched]]:
     """Return the function that searches a world, for a worker."""
     return search_world
 
 
-def search_world(world: tuple[str, int]) -> list[Searched]:
-    """Return the cases of a world (kind, seed) in all modes."""
-    kind, seed = world
-    place, rng = Simulated(kind, seed).load(), np.random.default_rng([seed, 7])
+def search_world(world: Simulated) -> list[Searched]:
+    """Return the cases of a world in all modes."""
+    kind, seed = world.kind, world.seed
+    place, rng = world.load(), np.random.default_rng([seed, 7])
     vertical_deg = float(rng.choice(_VERTICALS_DEG))
     found = []
     for matching in MATCHINGS:
@@ -118,8 +119,8 @@ def search_world(world: tuple[str, int]) -> list[Searched]:
     return found
 
 
-def fit(cases: Sequence[Case]) -> Calibration:
-    """Return the coefficients of maximum likelihood.
+def fit(cases: Sequence[Case], only: str = '') -> Calibration:
+    """Return the coefficients of maximum likelihood, or only one of those of a support.
 
     First the utilities. Then the level of the confidence: the utility of the case that none is
     right, and slope and knee. What all cases have in common, such as the size of a single map,
@@ -137,13 +138,17 @@ def fit(cases: Sequence[Case]) -> Calibration:
     data = _arrays(cases)
     scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
     bounds = list(_SIGNS)
-    installed = CALIBRATION.objects
-    start = np.append(np.zeros(len(_FIELDS)), [1.0, installed.map_size, installed.vertical])
-    for column in (1, 2):  # size of the map, vertical
-        if np.ptp(data.settings[:, column]) == 0.0:
-            row = len(_FIELDS) + column
-            bounds[row] = (start[row], start[row])
+    installed = np.array([getattr(CALIBRATION.objects, name) for name in _TERMS]) * scale
+    start = np.append(np.zeros(len(_FIELDS)), [1.0, *installed[-2:]])
+    varies = np.append(np.ptp(data.supports[data.given], axis=0),
+                       [1.0, *np.ptp(data.settings[:, 1:], axis=0)]) > 0.0
+    for row, name in enumerate(_TERMS):
+        if not varies[row] or (only and name != only):
+            start[row], bounds[row] = installed[row], (installed[row], installed[row])
     solved = minimize(_loss, start, (data, scale), jac=True, method='L-BFGS-B', bounds=bounds)
+    if only:
+        fitted = float((solved.x / scale)[_TERMS.index(only)])
+        return CALIBRATION._replace(objects=CALIBRATION.objects._replace(**{only: fitted}))
     return _levelled(cases, CALIBRATION._replace(
         objects=Objects(*map(float, [*solved.x / scale, 0.0, 0.0]))))
 
@@ -151,7 +156,7 @@ def fit(cases: Sequence[Case]) -> Calibration:
 class _Arrays(NamedTuple):
     """Cases as arrays: n of them, of up to h hypotheses each."""
 
-    supports: NDArray[np.float64]  # (n, h, 6)
+    supports: NDArray[np.float64]  # (n, h, 7)
     given: NDArray[np.bool_]  # (n, h): which hypotheses exist
     right: NDArray[np.bool_]  # (n, h)
     handicaps: NDArray[np.float64]  # (n, h)
@@ -174,7 +179,7 @@ def _arrays(cases: Sequence[Case]) -> _Arrays:
 
 def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
-    """Return the negative log likelihood and its derivatives (9,) by the coefficients."""
+    """Return the negative log likelihood and its derivatives (10,) by the coefficients."""
     supports, settings = data.supports / scale[:-3], data.settings / scale[-3:]
     utility = np.where(data.given, supports @ coefficients[:-3] - data.handicaps, -1e9)
     utility = np.column_stack([utility, settings @ coefficients[-3:]])

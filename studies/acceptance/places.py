@@ -8,13 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.datasets.queries import load_queries
+from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, make_queries
-from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
+from cliploc_ros.simulation.sensors import simulate_depths, with_neighbours, with_vertical
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
@@ -52,6 +54,8 @@ class Place(NamedTuple):
         """Return the queries with what is known in a mode."""
         is_fused = mode in (FIVE, ALL)
         queries: Sequence[Query] = self.frames
+        if is_fused and any(one.neighbours for one in queries):
+            return []  # of several cameras, one instant
         if mode in (VERTICAL, LEVEL, ALL):
             queries = with_vertical(queries, vertical_deg, seed)
         if is_fused:
@@ -76,6 +80,7 @@ class Recording(NamedTuple):
     landmark_map: Path
     every_frame: bool = True
     seed: int = 0
+    has_depth: bool = False  #: Depth is that of the file, or simulated with the map's ellipsoids
 
     @property
     def name(self) -> str:
@@ -86,7 +91,13 @@ class Recording(NamedTuple):
         """Return the place."""
         landmark_map = LandmarkMap.from_file(self.landmark_map)
         found = load_queries(self.queries, landmark_map.landmark_ids)
-        return Place(landmark_map, make_queries(found, landmark_map, every_frame=True),
+        queries = make_queries(found, landmark_map, every_frame=True)
+        if not self.has_depth:
+            queries = tuple(replace(one, observation=replace(one.observation, depths=None))
+                            for one in queries)
+        elif all(one.depths is None for one in found.frames):
+            queries = _with_simulated_depth(queries, found, landmark_map)
+        return Place(landmark_map, queries,
                      [one.group for one in found.frames], [one.is_main for one in found.frames],
                      self.every_frame)
 
@@ -96,6 +107,8 @@ class Simulated(NamedTuple):
 
     kind: str
     seed: int
+    has_depth: bool = False
+    cameras: int = 1
 
     @property
     def name(self) -> str:
@@ -104,9 +117,24 @@ class Simulated(NamedTuple):
 
     def load(self) -> Place:
         """Return the place."""
-        world = make_world(self.kind, self.seed)
+        world = make_world(self.kind, self.seed, has_depth=self.has_depth, cameras=self.cameras)
         return Place(world.landmark_map, world.queries, world.groups,
                      [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
+
+
+def _with_simulated_depth(queries: Sequence[Query], recorded: Queries, landmark_map: LandmarkMap
+                          ) -> tuple[Query, ...]:
+    """Return queries with depth of the landmarks that their boxes show."""
+    rows = np.array([landmark_map.landmark_ids.index(one) if one in landmark_map.landmark_ids
+                     else -1 for one in recorded.landmark_ids] + [-1])
+    found = []
+    for query, frame in zip(queries, recorded.frames, strict=True):
+        shown = rows[frame.true_landmark]
+        centers = np.where(shown[:, None] >= 0, landmark_map.centers[shown], np.nan)
+        depths = simulate_depths(centers, landmark_map.shapes[shown], query.map_from_camera,
+                                 np.random.default_rng([SEED, query.number, 4]))
+        found.append(replace(query, observation=replace(query.observation, depths=depths)))
+    return tuple(found)
 
 
 def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(KINDS),
@@ -116,6 +144,10 @@ def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(
                         help='recordings, in place of the worlds unless --worlds is given, too')
     parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
                         help='one for all query files, or one for each')
+    parser.add_argument('--depth', action='store_true',
+                        help='of each box: that of the files, or else simulated')
+    parser.add_argument('--cameras', type=positive_int, default=1, metavar='N',
+                        help='of the robot in worlds, in modes of one image (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='all')
     parser.add_argument('--worlds', type=int, metavar='N',
                         help=f'simulated worlds of each kind ({worlds})')
@@ -145,10 +177,10 @@ def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
     if len(maps) != len(options.queries):
         raise OptionsError('give one map, or as many maps as query files in the same order')
     places: list[Recording | Simulated] = [
-        *(Recording(path, map_path, options.frames == 'all')
+        *(Recording(path, map_path, options.frames == 'all', has_depth=options.depth)
           for path, map_path in zip(options.queries, maps, strict=True)),
-        *(Simulated(kind, options.first_seed + number) for kind in options.kinds
-          for number in range(worlds))]
+        *(Simulated(kind, options.first_seed + number, options.depth, options.cameras)
+          for kind in options.kinds for number in range(worlds))]
     if not places:
         raise OptionsError('nothing to test: give --queries and --map, or --worlds')
     return places

@@ -2,16 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """One simulated world: a map with errors, and what a robot sees there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.simulation.sensors import simulate_depths
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.appearance import Encoder
 from studies.worlds.cameras import (
@@ -27,6 +30,10 @@ from studies.worlds.things import Objects, make_objects
 
 _FRAME_S = 1.0
 _SCORE = 0.8
+# Cameras of one robot lie on a circle of this radius; their mounts are off on each axis.
+_RADIUS_M, _MOUNT_M, _MOUNT_DEG = 0.15, 0.01, 0.5
+# Deviation of the scale of depth from world to world: a guess.
+_DEPTH_SCALE = 0.02
 
 
 @dataclass(frozen=True)
@@ -54,9 +61,11 @@ class _Scene(NamedTuple):
     encoder: Encoder
     vectors: NDArray[np.float64]
     biases: NDArray[np.float64]
+    depth_scale: float | None = None  #: Measured over true depth; None without depth
 
 
-def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None) -> World:
+def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None,
+               has_depth: bool = False, cameras: int = 1) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -67,12 +76,21 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         Places from which the robot looks, five images each.
     sigma_m : float, optional
         Standard deviation of the map's positions on each axis [m]; drawn by default.
+    has_depth : bool
+        Whether the camera measures depth; all else stays the same.
+    cameras : int
+        The robot has more cameras, in equal angles. They are neighbours of the first one's image.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, sigma_m, rng)
+    if has_depth:
+        of_depth, = rng.spawn(1)
+        scene = scene._replace(depth_scale=float(of_depth.normal(1.0, _DEPTH_SCALE)))
     camera = make_camera(rng)
     poses = make_groups(place, scene.objects, groups, rng).reshape(-1, 4, 4)
-    return _seen(kind, scene, camera, poses, rng)
+    world = _seen(kind, scene, camera, poses, rng)
+    return world if cameras == 1 else replace(world, queries=tuple(
+        _with_cameras(scene, camera, query, cameras, rng.spawn(1)[0]) for query in world.queries))
 
 
 def make_walk(kind: str, seed: int, images: int) -> World:
@@ -112,6 +130,23 @@ def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
         for number, pose in enumerate(poses)))
 
 
+def _with_cameras(scene: _Scene, camera: Camera, query: Query, count: int,
+                  rng: np.random.Generator) -> Query:
+    """Return a query with what the robot's other cameras see, whose mounts are a bit wrong."""
+    others = []
+    for row in range(1, count):
+        turn = Rotation.from_euler('y', 360.0 * row / count, degrees=True)
+        mount = make_transform(turn.as_matrix(), turn.apply([0.0, 0.0, _RADIUS_M])
+                               - [0.0, 0.0, _RADIUS_M])
+        error = make_transform(Rotation.from_rotvec(
+            np.radians(_MOUNT_DEG) * rng.normal(size=3)).as_matrix(),
+            _MOUNT_M * rng.normal(size=3))
+        seen = _look(scene, camera, query.map_from_camera @ mount @ error, query.number, rng)
+        others.append(replace(seen, camera_name=f'camera {row}', odom_from_camera=mount))
+    return replace(query, neighbours=tuple(others), observation=replace(
+        query.observation, camera_name='camera 0', odom_from_camera=np.eye(4)))
+
+
 def _look(scene: _Scene, camera: Camera, pose: NDArray[np.float64], number: int,
           rng: np.random.Generator) -> Observation:
     boxes = detect(scene.detector, scene.objects, scene.shapes, camera, pose, rng)
@@ -122,6 +157,11 @@ def _look(scene: _Scene, camera: Camera, pose: NDArray[np.float64], number: int,
     biases[known] = scene.biases[boxes.shown[known]]
     similarities = scene.encoder.similarities(crops, biases, boxes.bboxes_xyxy,
                                               scene.vectors[scene.found.described], rng)
+    depths = None
+    if scene.depth_scale is not None:
+        centers = np.where(known[:, None], scene.objects.centers[boxes.shown], np.nan)
+        depths = simulate_depths(centers, scene.shapes[boxes.shown], pose, rng.spawn(1)[0],
+                                 scene.depth_scale)
     return Observation(
         camera, Detections(boxes.bboxes_xyxy, boxes.class_ids, np.full(len(known), _SCORE)),
-        similarities, round(number * _FRAME_S * NS_PER_S))
+        similarities, round(number * _FRAME_S * NS_PER_S), depths=depths)

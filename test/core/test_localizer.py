@@ -13,7 +13,7 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.localizer import KeptFrame, Localizer, frames_to_fuse
+from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -44,9 +44,9 @@ class Window:
 
     def join(self, seconds, degrees=0.0, metres=0.0, detections=ONE, limit=5, length_s=5.0):
         new = frame(seconds, degrees, metres, detections)
-        earlier, anchor = frames_to_fuse(self.frames, new, limit, length_s)
-        self.frames = [*earlier, KeptFrame(RELOCALIZER.search(new), anchor)]
-        return [one.searched.observation.stamp_ns / 1e9 for one in self.frames]
+        earlier, anchor = instants_to_fuse(self.frames, new, limit, length_s)
+        self.frames = [*earlier, KeptInstant((RELOCALIZER.search(new),), anchor)]
+        return [one.stamp_ns / 1e9 for one in self.frames]
 
 
 @pytest.fixture

@@ -128,7 +128,8 @@ def test_nothing_to_go_by_changes_nothing(room):
 def test_derivatives_are_those_of_differences(room, rng):
     scene = see(room)
     pairs = np.concatenate([scene.box_ellipses, room.centers, room.shapes,
-                            np.full((len(room), 1), 0.02)], axis=1)
+                            np.tile([0.02, 4.0, 0.1], (len(room), 1))], axis=1)
+    pairs[::3, 15] = 0.0  # without depth
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]

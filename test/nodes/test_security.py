@@ -44,15 +44,16 @@ def check(tester, node, *absent):
 
 
 def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
-    process = own_relocalizer(mode='continuous', gravity='imu')
+    process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
     tester.ask()  # odometry is listened to during a request
-    check(tester, 'relocalizer', '/image/compressed', '/clock')
+    check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
     process.stop()
     tester.wait(lambda: 'relocalizer' not in tester.get_node_names(), 'the first one to be gone')
-    own_relocalizer(image_transport='compressed', use_sim_time='true')
+    own_relocalizer(image_transport='compressed', use_sim_time='true',
+                    depth_transport='compressed')
     tester.ask()
-    check(tester, 'relocalizer', '/image', '/imu')
+    check(tester, 'relocalizer', '/image', '/depth', '/imu')
 
 
 @pytest.mark.parametrize(('parameters', 'absent'), [

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.options import RelocalizerOptions
 from studies.acceptance import fit
@@ -74,7 +75,7 @@ def test_several_images_find_more_right_poses():
 
 
 def test_a_fit_judges_each_kind_by_the_others(record_property):
-    searched = [one for kind in ('room', 'shop') for one in fit.search_world((kind, 5))]
+    searched = [one for kind in ('room', 'shop') for one in fit.search_world(Simulated(kind, 5))]
     here = [one for one in searched if not one.case.is_elsewhere]
     assert {one.mode for one in here} == set(MODES)
     for one in searched:
@@ -87,3 +88,15 @@ def test_a_fit_judges_each_kind_by_the_others(record_property):
     assert np.array_equal(likely, fit.outcomes(rooms, calibrations['room'])[0])
     elsewhere = fit.judged([one for one in searched if one.case.is_elsewhere], calibrations)[0]
     assert likely[right].mean() > elsewhere.mean()
+
+
+def test_depth_is_fitted_alone_and_changes_nothing_else():
+    plain, measured = (Simulated('room', 5, has_depth).load() for has_depth in (False, True))
+    for one, other in zip(plain.frames, measured.frames, strict=True):
+        assert one.observation.depths is None
+        np.testing.assert_array_equal(one.observation.detections.bboxes_xyxy,
+                                      other.observation.detections.bboxes_xyxy)
+    assert np.isfinite(np.concatenate([one.observation.depths for one in measured.frames])).any()
+    fitted = fit.fit([one.case for one in fit.search_world(Simulated('room', 5, True))], 'depth')
+    assert fitted.objects.depth != CALIBRATION.objects.depth
+    assert fitted.objects._replace(depth=CALIBRATION.objects.depth) == CALIBRATION.objects

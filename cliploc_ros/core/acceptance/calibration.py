@@ -19,6 +19,7 @@ class Objects(NamedTuple):
     rarity: float
     unlabelled: float
     unexplained: float
+    depth: float
     none_right: float
     map_size: float
     vertical: float

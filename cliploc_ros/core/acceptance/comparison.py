@@ -117,20 +117,28 @@ class Comparison(NamedTuple):
                      if near and one.recognized is not None), None)
 
 
-def compare(joined: JoinedFrames, finalists: Sequence[Finalist], is_upright: NDArray[np.bool_],
-            recognizer: ImageRecognizer | None = None) -> Comparison:
-    """Return the contenders compared; none where neither source has any.
+def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
+                      is_upright: NDArray[np.bool_]) -> list[Contender]:
+    """Return the poses that the search met as contenders, one of each place, best first.
 
     Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement the
-    greatest score is first, as in the paper. The recognizer is of the keyframes, for the last
-    image.
+    greatest score is first, as in the paper.
     """
     contenders = contenders_of(joined, finalists, is_upright.tolist())
-    if joined.options.refine:
-        order = sorted(range(len(contenders)), key=lambda row: -contenders[row].odds)
-        contenders = [contenders[row] for known in (True, False) for row in first_of_each_place(
-            [row for row in order if contenders[row].is_upright == known], finalists,
-            MAX_DISTINCT)]
+    if not joined.options.refine:
+        return contenders
+    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].odds)
+    return [contenders[row] for known in (True, False) for row in first_of_each_place(
+        [row for row in order if contenders[row].is_upright == known], finalists, MAX_DISTINCT)]
+
+
+def compare(joined: JoinedFrames, contenders: list[Contender],
+            recognizer: ImageRecognizer | None = None) -> Comparison:
+    """Return the contenders of the search compared with the places that keyframes recognize.
+
+    There are none where neither source has any. The recognizer is of the keyframes, for the last
+    image.
+    """
     seen = None
     if recognizer is not None:
         seen = recognizer.recognize([one.pose for one in contenders[:_MOST_GUESSES]],
@@ -184,7 +192,8 @@ def pose_of(joined: JoinedFrames, compared: Comparison
     found = None
     if by_objects is not None:
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
-                                   by_objects.matches, joined.landmark_map.shared_sigmas)
+                                   by_objects.matches, joined.landmark_map.shared_sigmas,
+                                   joined.options.mount_deviation)
         if by_objects.finalist.information is not None:
             others = [one for one in compared.contenders if one.recognized is None]
             others.sort(key=lambda one: one is not by_objects)

@@ -80,7 +80,7 @@ def utilities(supports: Sequence[Support], calibration: Calibration = CALIBRATIO
     return np.array([
         terms.score * one.score + terms.misfit * one.misfit + terms.likeness * one.likeness
         + terms.rarity * one.rarity + terms.unlabelled * one.unlabelled
-        + terms.unexplained * one.unexplained for one in supports])
+        + terms.unexplained * one.unexplained + terms.depth * one.depth for one in supports])
 
 
 def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> float:

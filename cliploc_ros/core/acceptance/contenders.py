@@ -59,6 +59,13 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
     return JoinedFrames(landmark_map, options, frames, rig, cameras)
 
 
+def without_depth(joined: JoinedFrames) -> JoinedFrames:
+    """Return frames as of cameras without depth."""
+    return join_frames(joined.landmark_map, joined.options, [one._replace(
+        scene=one.scene._replace(depths=np.zeros_like(one.scene.depths)))
+        for one in joined.frames])
+
+
 class Contender(NamedTuple):
     """A pose that may be right, and what supports it."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
@@ -46,6 +47,8 @@ class Support:
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
     #: Number of other detected objects of the map's classes, which no landmark explains
     unexplained: float = 0.0
+    #: Log odds of their depths, against those of objects that are somewhere else
+    depth: float = 0.0
 
 
 class ComparedFrame(NamedTuple):
@@ -84,13 +87,13 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     for frame, found in zip(frames, matches, strict=True):
         known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
         unexplained += len(known - {match.detection for match in found})
-    return Support(len(rows), *map(float, [*total, unexplained / views_of_each]))
+    return Support(len(rows), *map(float, [*total[:-1], unexplained / views_of_each, total[-1]]))
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                    map_from_camera: NDArray[np.float64], matches: Sequence[Match]
                    ) -> NDArray[np.float64]:
-    """Return the terms of each match (m, 5) in a support."""
+    """Return the terms of each match (m, 6) in a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
@@ -108,7 +111,9 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     return np.column_stack([
         [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
-                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared])
+                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared,
+        _depth_odds(frame.scene, map_from_camera, detections, landmarks,
+                    landmark_map.position_sigmas[landmarks])])
 
 
 def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
@@ -150,3 +155,15 @@ def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDA
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
     return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
+
+
+def _depth_odds(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
+                landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the log odds of each match (m,) by its depth; 0 where none was measured."""
+    if not scene.depths.any():
+        return np.zeros(len(detections))
+    camera_from_map = invert_transform(map_from_camera)
+    return depth_odds(depth_errors(
+        scene.depths[detections], scene.centers[landmarks], scene.shapes[landmarks], sigmas,
+        np.ascontiguousarray(camera_from_map[:3, :3]),
+        np.ascontiguousarray(camera_from_map[:3, 3])))

@@ -12,7 +12,8 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
 * the position of the map near the camera, the same for all landmarks: as if all cameras were
   displaced and turned together about the last one;
 * the vertical, the same in all frames: one sensor on one mount;
-* odometry, a random walk: the error of a step displaces all frames beyond it.
+* odometry, a random walk: the error of a step displaces all frames beyond it;
+* the mounts of several cameras, between whose frames of one instant there is no such step.
 
 Cauchy's weight w of an edge stands for a variance of 1 / w. Besides, each object may be wrong:
 moved, or matched by mistake. Then the pose without this object is the right one, and how far it is
@@ -214,12 +215,12 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
 class _Fit(NamedTuple):
     """A fit, linearized in steps of the reference: F frames, m matches of n objects."""
 
-    jacobian: NDArray[np.float64]  #: (m, 4, 6)
-    #: (m, 4), (m, 4)
+    #: (m, r, 6): of the four edges of each match and, where any has depth, of that
+    jacobian: NDArray[np.float64]
+    #: (m, r), (m, r)
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
-    #: (m,): share of each match's deviation that its edges have, apart from the landmark's
-    #: position
+    #: (m, r): share of each deviation apart from that of the landmark's position
     own: NDArray[np.float64]
     #: (m,): of each match
     objects: NDArray[np.int64]
@@ -237,20 +238,25 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       stamps_ns: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
-                       wrong_share: float = _WRONG_SHARE) -> NDArray[np.float64]:
+                       instants: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
+                       wrong_share: float = _WRONG_SHARE,
+                       mount_deviation: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose that was refined on its inliers.
 
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
         Of camera_from_map, with information, see refine_rig.
-    stamps_ns : ndarray (F,)
-        Time of each frame, in which odometry joins them.
+    instants : ndarray (F,)
+        Number of the instant of each frame, in which odometry joins them: greater for later ones,
+        equal for several cameras.
     shared : ndarray (L, 2), optional
         By how much each landmark and its neighbours are displaced and turned together [m] [rad].
     wrong_share : float
         Probability that an object is not where its match says.
+    mount_deviation : tuple of float
+        Standard deviations of a camera's mount on each axis [m] [deg], against that of the last
+        frame's camera.
     """
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
@@ -261,14 +267,15 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     information = of_objects.sum(axis=0) + verticals + prior
     # The part of the edges' errors in M, for each object (n, 6, 6).
     # an edge is as far off as its weight says, in the same direction in all frames
-    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, None, None] * fit.jacobian,
+    pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, :, None] * fit.jacobian,
                   fit.objects, len(fit.sigmas))
     edge_noise = np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
     noise_of_objects = edge_noise + _position_noise(fit, of_objects)
     of_frames = _sums(of_matches, fit.frames, len(fit.cameras)) + fit.verticals
     known = max(1, int(fit.verticals.any(axis=(1, 2)).sum()))
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
-             + _odometry_noise(fit.cameras, of_frames, stamps_ns))
+             + _odometry_noise(fit.cameras, of_frames, instants)
+             + _mount_noise(fit.cameras, of_frames, instants, mount_deviation))
     matched = _sandwich(information, noise)
     of_map = 0.0 if shared is None else _sandwich(
         information, _shared_noise(of_objects, shared[fit.numbers]))
@@ -299,7 +306,7 @@ def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
 def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[np.float64],
                translation: NDArray[np.float64]) -> _Fit:
     count, frames = len(inliers.pairs), len(inliers.cameras)
-    jacobian, residuals = np.empty((count, 4, 6)), np.empty((count, 4))
+    jacobian, residuals = np.empty((count, 5, 6)), np.empty((count, 5))
     verticals, cameras = np.zeros((frames, 6, 6)), np.tile(np.eye(4), (frames, 1, 1))
     center = -rotation.T @ translation
     for frame, (first, last) in enumerate(pairwise(inliers.starts)):
@@ -309,19 +316,24 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
         cameras[frame, :3, :3] = own_rotation.T
         cameras[frame, :3, 3] = -own_rotation.T @ own_translation
         pairs = inliers.pairs[first:last]
-        own, rows = np.empty(4 * len(pairs) + 3), 4 * len(pairs)
+        own, rows = np.empty(5 * len(pairs) + 3), 5 * len(pairs)
         residuals_of(pairs, vertical, own_rotation, own_translation, own)
         steps = jacobian_of(pairs, vertical, own_rotation, own_translation)
         # a turn of the reference about itself moves this camera
         steps[:, 3:] -= steps[:, :3] @ _cross(cameras[frame, :3, 3] - center)
-        jacobian[first:last], residuals[first:last] = (steps[:rows].reshape(-1, 4, 6),
-                                                       own[:rows].reshape(-1, 4))
+        jacobian[first:last], residuals[first:last] = (steps[:rows].reshape(-1, 5, 6),
+                                                       own[:rows].reshape(-1, 5))
         weights = 1.0 / (1.0 + own[rows:] ** 2)
         verticals[frame] = steps[rows:].T @ (steps[rows:] * weights[:, None])
     numbers, objects = np.unique(inliers.landmarks, return_inverse=True)
     pairs = inliers.pairs
-    edges = RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION
-    return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2), edges / pairs[:, 13], objects,
+    edges = (RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION) / pairs[:, 13]
+    depths = np.sqrt(1.0 - (sigmas[inliers.landmarks] / np.maximum(pairs[:, 15], 1e-9)) ** 2,
+                     out=np.zeros(count), where=pairs[:, 15] > 0.0)
+    kinds = 5 if depths.any() else 4
+    jacobian, residuals = np.ascontiguousarray(jacobian[:, :kinds]), residuals[:, :kinds].copy()
+    return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2),
+                np.column_stack([edges, edges, edges, edges, depths])[:, :kinds], objects,
                 np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], numbers,
                 verticals, cameras)
 
@@ -347,7 +359,8 @@ def _mean_square(fit: _Fit) -> float:
     """
     views = len(fit.objects) / max(1, len(fit.sigmas))
     squares = np.minimum(np.abs(fit.residuals), _MOST_RESIDUAL) ** 2
-    freedom = max(0, 4 * len(fit.sigmas) - 6)
+    measured = np.bincount(fit.objects, fit.jacobian[:, 4:].any(axis=(1, 2))) > 0.0
+    freedom = max(0, 4 * len(fit.sigmas) + int(measured.sum()) - 6)
     return max(1.0, float((squares.sum() / max(views, 1.0) + _PRIOR_RESIDUALS * _PRIOR_SQUARE)
                           / (freedom + _PRIOR_RESIDUALS)))
 
@@ -366,18 +379,39 @@ def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
-                    stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+                    instants: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the part of the errors of odometry in M (6, 6)."""
     noise = np.zeros((6, 6))
-    order = np.argsort(stamps_ns, kind='stable')
-    last = int(np.argmax(order == len(order) - 1))
-    for step, (before, after) in enumerate(pairwise(order)):
+    numbers, instants = np.unique(instants, return_inverse=True)
+    # the way between two instants is that of the last camera of each
+    ends = [int(np.nonzero(instants == number)[0][-1]) for number in range(len(numbers))]
+    for step, (before, after) in enumerate(pairwise(ends)):
         deviations = odometry_deviations(invert_transform(cameras[before]) @ cameras[after])
-        beyond = order[:step + 1] if step < last else order[step + 1:]
-        near = after if step < last else before
-        moved = information[beyond].sum(axis=0)
-        # frames beyond the step turn about its near end
-        moved[:, 3:] += moved[:, :3] @ _cross(cameras[near, :3, 3] - cameras[-1, :3, 3])
-        moved *= deviations
-        noise += moved @ moved.T
+        is_before = step < instants[-1]
+        beyond = instants <= step if is_before else instants > step
+        noise += _squared(_about(information[beyond].sum(axis=0), cameras,
+                                 after if is_before else before) * deviations)
     return noise
+
+
+def _mount_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
+                 instants: NDArray[np.int64], mount_deviation: tuple[float, float]
+                 ) -> NDArray[np.float64]:
+    """Return the part of the errors of the mounts of several cameras in M (6, 6)."""
+    deviations = np.repeat([mount_deviation[0], np.radians(mount_deviation[1])], 3)
+    # the mount of the last camera of an instant is that of the pose
+    others = [row for row in range(len(cameras) - 1) if instants[row] in instants[row + 1:]]
+    return np.asarray(sum((_squared(_about(information[row], cameras, row) * deviations)
+                           for row in others), np.zeros((6, 6))))
+
+
+def _about(information: NDArray[np.float64], cameras: NDArray[np.float64], row: int
+           ) -> NDArray[np.float64]:
+    """Return what turns about a camera, not about the last one, do to the gradient (6, 6)."""
+    moved = information.copy()
+    moved[:, 3:] += moved[:, :3] @ _cross(cameras[row, :3, 3] - cameras[-1, :3, 3])
+    return moved
+
+
+def _squared(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(matrix @ matrix.T)

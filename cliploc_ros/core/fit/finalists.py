@@ -3,6 +3,7 @@
 """The best hypotheses of a search: refined, distinct, each with its inliers and covariance."""
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import batched, pairwise
@@ -181,24 +182,39 @@ def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                   matches: Sequence[Sequence[Match]],
-                  shared: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+                  shared: NDArray[np.float64] | None = None,
+                  mount_deviation: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
     """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
     ----------
-    shared : ndarray (L, 2), optional
+    shared, mount_deviation
         See refined_covariance.
     """
     if pose.information is not None:
         if not pose.information.any():
             return POSE_UNKNOWN
-        stamps_ns = np.array([frame.observation.stamp_ns for frame in frames])
-        return refined_covariance(rig, pose.rotation, pose.translation, stamps_ns, shared)
+        return refined_covariance(rig, pose.rotation, pose.translation, _instants(frames), shared,
+                                  mount_deviation=mount_deviation)
     cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
     covariance = (_sample_covariance(frames, cameras, pose,
                                      _scatter(frames, cameras, pose, matches))
                   + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
     return covariance
+
+
+def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
+    """Return the number of each frame's instant (F,): several cameras may see the same one.
+
+    Frames of one camera at one stamp follow each other.
+    """
+    seen: Counter[tuple[int, str]] = Counter()
+    keys = []
+    for one in (frame.observation for frame in frames):
+        keys.append((one.stamp_ns, seen[one.stamp_ns, one.camera_name]))
+        seen[one.stamp_ns, one.camera_name] += 1
+    order = sorted(set(keys))
+    return np.array([order.index(key) for key in keys])
 
 
 def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,

@@ -5,7 +5,8 @@
 The minimal pose fits three box centres; refinement fits the edges of all inliers, which outlines
 should touch. Each match has four residuals, in deviations: a share of the box's size, because the
 errors of detector and shape grow with the object, and the landmark's position_sigma as the camera
-sees it. Cauchy's weights limit outliers (Triggs et al., "Bundle Adjustment", 1999).
+sees it. A fifth one is the depth of its centre, where depth was measured. Cauchy's weights limit
+outliers (Triggs et al., "Bundle Adjustment", 1999).
 
 Of the residuals tried on the 258 recorded frames, edges solved most frames with the least error:
 better than Wasserstein's distance of ellipses, the level sets of Zins et al. ("Level Set-Based
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.verification import camera_pose, verify_rig
+from cliploc_ros.core.geometry.depth import centre_depth, depth_of
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
 from cliploc_ros.core.kernels.compiled import compiled
 
@@ -56,15 +58,15 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
 
     Parameters
     ----------
-    pairs : ndarray (m, 14)
-        Box ellipse (4,), centre (3,) and shape (6,) of the landmark, and edge_deviation of each
-        match.
+    pairs : ndarray (m, 16)
+        Box ellipse (4,), centre (3,) and shape (6,) of the landmark, edge_deviation and
+        centre_depth (2,) of each match.
     vertical : ndarray (7,)
         See VERTICAL_UNKNOWN.
     rotation, translation : ndarray (3, 3), (3,)
         Of camera_from_map.
-    residuals : ndarray (4 * m + 3,)
-        Of left, right, top and bottom edge of each match, and of the vertical.
+    residuals : ndarray (5 * m + 3,)
+        Of left, right, top and bottom edge and of the depth of each match, and of the vertical.
     """
     for row in range(len(pairs)):
         box = pairs[row]
@@ -74,11 +76,15 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
             return False
         deviation = box[13]
         half_x, half_y = sqrt(exx), sqrt(eyy)
-        residuals[4 * row] = ((cx - half_x) - (box[0] - box[2])) / deviation
-        residuals[4 * row + 1] = ((cx + half_x) - (box[0] + box[2])) / deviation
-        residuals[4 * row + 2] = ((cy - half_y) - (box[1] - box[3])) / deviation
-        residuals[4 * row + 3] = ((cy + half_y) - (box[1] + box[3])) / deviation
-    first = 4 * len(pairs)
+        residuals[5 * row] = ((cx - half_x) - (box[0] - box[2])) / deviation
+        residuals[5 * row + 1] = ((cx + half_x) - (box[0] + box[2])) / deviation
+        residuals[5 * row + 2] = ((cy - half_y) - (box[1] - box[3])) / deviation
+        residuals[5 * row + 3] = ((cy + half_y) - (box[1] + box[3])) / deviation
+        residuals[5 * row + 4] = 0.0
+        if box[15] > 0.0:
+            depth = depth_of(rotation, translation, box[4:7])
+            residuals[5 * row + 4] = (depth - box[14]) / box[15]
+    first = 5 * len(pairs)
     for axis in range(3):
         residuals[first + axis] = 0.0
         if vertical[6] > 0.0:
@@ -106,8 +112,7 @@ def edge_deviation(box, center, sigma, rotation, translation):
     """
     # the sum of the semi-axes is the mean of the sides
     own = RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION
-    depth = (rotation[2, 0] * center[0] + rotation[2, 1] * center[1] + rotation[2, 2] * center[2]
-             + translation[2])
+    depth = depth_of(rotation, translation, center)
     seen = sigma / depth if depth > 0.0 else 0.0
     return sqrt(own * own + seen * seen)
 
@@ -117,7 +122,8 @@ def robust_cost(residuals):
     """Return the sum of Cauchy's losses."""
     total = 0.0
     for residual in residuals:
-        total += np.log1p((residual / _CAUCHY) ** 2)
+        if residual != 0.0:
+            total += np.log1p((residual / _CAUCHY) ** 2)
     return total
 
 
@@ -133,13 +139,16 @@ def linearize(pairs, vertical, rotation, translation, residuals):
 
 @compiled
 def jacobian_of(pairs, vertical, rotation, translation):
-    """Return the derivatives (4 * m + 3, 6) of the residuals, see residuals_of and linearize."""
-    jacobian = np.zeros((4 * len(pairs) + 3, 6))
+    """Return the derivatives (5 * m + 3, 6) of the residuals, see residuals_of and linearize."""
+    jacobian = np.zeros((5 * len(pairs) + 3, 6))
     for row in range(len(pairs)):
         _differentiate(pairs[row, 4:7], pairs[row, 7:13], rotation, translation, pairs[row, 13],
-                       jacobian[4 * row:4 * row + 4])
+                       jacobian[5 * row:5 * row + 4])
+        if pairs[row, 15] > 0.0:
+            _differentiate_depth(pairs[row, 4:7], rotation, translation, pairs[row, 15],
+                                 jacobian[5 * row + 4])
     if vertical[6] > 0.0:
-        _differentiate_vertical(vertical, rotation, jacobian[4 * len(pairs):])
+        _differentiate_vertical(vertical, rotation, jacobian[5 * len(pairs):])
     return jacobian
 
 
@@ -189,6 +198,19 @@ def _edges(d_middle, d_diagonal, middle, half, deviation):
 
 
 @compiled
+def _differentiate_depth(center, rotation, translation, deviation, jacobian):
+    """Write the derivatives (6,) of a depth's residual: axis @ (center - camera)."""
+    for axis in range(3):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        ray_j, ray_k = center[j], center[k]
+        for row in range(3):
+            ray_j += rotation[row, j] * translation[row]
+            ray_k += rotation[row, k] * translation[row]
+        jacobian[axis] = -rotation[2, axis] / deviation
+        jacobian[3 + axis] = (rotation[2, j] * ray_k - rotation[2, k] * ray_j) / deviation
+
+
+@compiled
 def _differentiate_vertical(vertical, rotation, jacobian):
     """Write the derivatives (3, 6) of the vertical's residuals: a rotation by a adds -a x up."""
     up = np.empty(3)
@@ -205,20 +227,19 @@ def _differentiate_vertical(vertical, rotation, jacobian):
 @compiled
 def _normal_equations(jacobian, residuals):
     """Return information and gradient with Cauchy's weights."""
-    information, gradient = np.empty((6, 6)), np.empty(6)
-    weights = np.empty(len(residuals))
+    information, gradient = np.zeros((6, 6)), np.zeros(6)
     for row in range(len(residuals)):
-        weights[row] = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
+        if residuals[row] == 0.0 and not jacobian[row].any():
+            continue  # an unknown depth or vertical
+        weight = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
+        for i in range(6):
+            weighted = jacobian[row, i] * weight
+            gradient[i] -= weighted * residuals[row]
+            for j in range(i, 6):
+                information[i, j] += weighted * jacobian[row, j]
     for i in range(6):
-        total = 0.0
-        for row in range(len(residuals)):
-            total -= jacobian[row, i] * weights[row] * residuals[row]
-        gradient[i] = total
-        for j in range(i, 6):
-            total = 0.0
-            for row in range(len(residuals)):
-                total += jacobian[row, i] * weights[row] * jacobian[row, j]
-            information[i, j] = information[j, i] = total
+        for j in range(i):
+            information[i, j] = information[j, i]
     return information, gradient
 
 
@@ -237,7 +258,7 @@ class Refined(NamedTuple):
 class Inliers(NamedTuple):
     """The matches of F frames, one detection for each landmark of a frame: m of them."""
 
-    pairs: NDArray[np.float64]  #: (m, 14): see residuals_of
+    pairs: NDArray[np.float64]  #: (m, 16): see residuals_of
     landmarks: NDArray[np.int64]  #: (m,): their rows in the map
     starts: NDArray[np.int64]  #: (F + 1,): where each frame's begin
     #: (F, 3, 4), (F, 7): of the rig
@@ -285,7 +306,7 @@ def refine_rig(rig, rotation, translation):
 def one_to_one(rig, found, rotation, translation):
     """Return the inliers of a verified pose; of several detections of a landmark, the best."""
     scene, frames = rig.scene, rig.starts.boxes
-    pairs, starts = np.empty((len(found.ious), 14)), np.zeros(len(frames), dtype=np.int64)
+    pairs, starts = np.empty((len(found.ious), 16)), np.zeros(len(frames), dtype=np.int64)
     landmarks = np.empty(len(pairs), dtype=np.int64)
     count = 0
     for frame in range(len(frames) - 1):
@@ -303,6 +324,9 @@ def one_to_one(rig, found, rotation, translation):
                 pairs[count, 7 + column] = scene.shapes[landmark, column]
             pairs[count, 13] = edge_deviation(scene.box_ellipses[best], scene.centers[landmark],
                                               rig.sigmas[landmark], own_rotation, own_translation)
+            pairs[count, 14], pairs[count, 15] = centre_depth(
+                scene.depths[best], scene.centers[landmark], scene.shapes[landmark],
+                rig.sigmas[landmark], own_rotation, own_translation)
             landmarks[count] = landmark
             count += 1
         starts[frame + 1] = count
@@ -326,13 +350,13 @@ def _best_detection(found, detection, first, last):
 def residuals_of_rig(inliers, rotation, translation):
     """Return whether all landmarks are in front of their cameras, and all frames' residuals."""
     pairs, _, starts, cameras, verticals = inliers
-    residuals = np.empty(4 * len(pairs) + 3 * len(cameras))
+    residuals = np.empty(5 * len(pairs) + 3 * len(cameras))
     for frame in range(len(cameras)):
         own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)
         first, last = starts[frame], starts[frame + 1]
         if not residuals_of(pairs[first:last], verticals[frame], own_rotation,
                             own_translation,
-                            residuals[4 * first + 3 * frame:4 * last + 3 * frame + 3]):
+                            residuals[5 * first + 3 * frame:5 * last + 3 * frame + 3]):
             return False, residuals
     return True, residuals
 
@@ -347,7 +371,7 @@ def linearize_rig(inliers, rotation, translation, residuals):
         first, last = starts[frame], starts[frame + 1]
         own_information, own_gradient = linearize(
             pairs[first:last], verticals[frame], own_rotation, own_translation,
-            residuals[4 * first + 3 * frame:4 * last + 3 * frame + 3])
+            residuals[5 * first + 3 * frame:5 * last + 3 * frame + 3])
         lever = np.zeros(3)
         for axis in range(3):
             for row in range(3):

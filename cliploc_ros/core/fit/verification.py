@@ -91,6 +91,7 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     joined = first._replace(
         box_ellipses=np.concatenate([one.box_ellipses for one in scenes]),
         bearings=np.concatenate([one.bearings for one in scenes]),
+        depths=np.concatenate([one.depths for one in scenes]),
         potential=Potential(*map(np.concatenate, zip(*(one.potential for one in scenes),
                                                      strict=True))),
         pairs=first.pairs[:0],
@@ -130,7 +131,8 @@ def scene_of(rig, frame):
         groups.members[starts.members[frame]:starts.members[after]],
         groups.levels[starts.levels[frame]:starts.levels[after]],
         groups.spheres[starts.spheres[frame]:starts.spheres[after]])
-    return Scene(boxes, bearings, scene.centers, scene.shapes, own_potential, scene.pairs,
+    depths = scene.depths[starts.boxes[frame]:starts.boxes[after]]
+    return Scene(boxes, bearings, depths, scene.centers, scene.shapes, own_potential, scene.pairs,
                  scene.iou_threshold, scene.sorted_landmarks, own_groups)
 
 

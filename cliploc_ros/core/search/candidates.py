@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.depth import depth_deviations
 from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.map.culling import FEW, SortedLandmarks
 from cliploc_ros.core.map.joined_map import parts_of
@@ -30,6 +31,8 @@ from cliploc_ros.errors import OptionsError
 MAX_CANDIDATES = 1_500
 # Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
 _FARTHEST = 1e6
+# Depths beyond this have another unit.
+_FARTHEST_M = 40.0
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,8 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     Raises
     ------
     OptionsError
-        The matching type needs similarities that are missing, of the wrong shape, or not finite.
+        The matching type needs similarities that are missing, of the wrong shape, or not finite;
+        depths are of the wrong shape.
     """
     bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
     # NaN where the lens model has no inverse; a box turned inside out has no ellipse
@@ -171,7 +175,24 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     # no pair uses the placeholder of a box that is not sound
     return make_scene(np.where(sound[:, None], bboxes, 1.0), landmark_map.centers,
                       landmark_map.shapes, single, candidates.pairs, options.iou_threshold,
-                      sorted_landmarks, by_class), left_out
+                      sorted_landmarks, by_class, _depths(observation, options)), left_out
+
+
+def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64] | None:
+    """Return the depths of a scene (n, 2); the paper's algorithms do not use them."""
+    depths, deviations = observation.depths, observation.depth_deviations
+    if depths is None or options.algorithm != 'auto':
+        return None
+    if deviations is None:
+        deviations = depth_deviations(depths)
+    for name, values in (('depths', depths), ('depth_deviations', deviations)):
+        if values.shape != (len(observation.detections),):
+            raise OptionsError(f'{name} of shape {values.shape}, but there are '
+                               f'{len(observation.detections)} detections')
+    with np.errstate(invalid='ignore'):
+        known = ((depths > 0.0) & (depths < _FARTHEST_M)
+                 & (deviations > 0.0) & (deviations < np.inf))
+    return np.where(known[:, None], np.column_stack([depths, deviations]), 0.0)
 
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None

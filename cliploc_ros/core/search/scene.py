@@ -31,6 +31,8 @@ class Scene(NamedTuple):
     #: = 1
     box_ellipses: NDArray[np.float64]
     bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
+    #: (n, 2): depth of what each box shows and its standard deviation [m]; 0, 0 where unknown
+    depths: NDArray[np.float64]
     #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]
     shapes: NDArray[np.float64]
@@ -48,7 +50,8 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
                shapes: NDArray[np.float64], potential: NDArray[np.bool_] | NDArray[np.int64],
                pairs: NDArray[np.int64], iou_threshold: float,
                sorted_landmarks: SortedLandmarks | None = None,
-               classes: NDArray[np.int64] | None = None) -> Scene:
+               classes: NDArray[np.int64] | None = None,
+               depths: NDArray[np.float64] | None = None) -> Scene:
     """Return the scene of one frame.
 
     Parameters
@@ -67,6 +70,8 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
         The map's. Each detection may also show every landmark of its class.
     classes : ndarray (n,) of int, optional
         Class of each detection, as the sorted landmarks have them; below 0 for none.
+    depths : ndarray (n, 2), optional
+        See Scene.
     """
     middle, half = (bboxes[:, :2] + bboxes[:, 2:]) / 2, (bboxes[:, 2:] - bboxes[:, :2]) / 2
     bearings = np.concatenate([middle, np.ones((len(bboxes), 1))], axis=1)
@@ -79,9 +84,12 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
         sorted_landmarks, classes = no_landmarks(), np.full(len(boxes), -1, dtype=np.int64)
     by_landmark = Potential(shown, np.append(starts, len(single)),
                             np.ascontiguousarray(single[:, 0]))
-    return Scene(boxes, bearings, np.ascontiguousarray(centers), np.ascontiguousarray(shapes),
-                 by_landmark, np.ascontiguousarray(pairs), float(iou_threshold),
-                 sorted_landmarks, make_groups(sorted_landmarks, classes, boxes, iou_threshold))
+    if depths is None:
+        depths = np.zeros((len(boxes), 2))
+    return Scene(boxes, bearings, depths, np.ascontiguousarray(centers),
+                 np.ascontiguousarray(shapes), by_landmark, np.ascontiguousarray(pairs),
+                 float(iou_threshold), sorted_landmarks,
+                 make_groups(sorted_landmarks, classes, boxes, iou_threshold))
 
 
 class Prior(NamedTuple):

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,6 +36,8 @@ _CHECK_PERIOD_S = 0.5
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
+# Four seconds of 30 Hz VGA depth.
+_MAX_DEPTH_BYTES = 72 * 2**20
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
 
@@ -170,6 +172,11 @@ class Frame:
     #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
+    #: Depth of about the same time; None where there is none
+    depth: Image | CompressedImage | None = None
+    camera: str = ''  #: Name of its camera; empty for the only one
+    beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
+    left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
 
 
 class FrameSource:
@@ -188,14 +195,32 @@ class FrameSource:
         Called with each complete frame in the executor's thread.
     detections : str
         Package of the type of the detections, see DETECTION_TYPES.
+    depth : str
+        'raw' or 'compressed'; 'none': frames have no depth.
+    depth_tolerance_s : float
+        Depth of a frame is at most this far from its image [s].
+    camera : str
+        Name of the camera, and the namespace of its topics.
+    changed : Condition, optional
+        Notified of each frame; several sources may share it.
     """
 
     def __init__(self, node: Node, transport: str, linger_s: float,
-                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs') -> None:
+                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs',
+                 depth: str = 'none', depth_tolerance_s: float = 0.0, camera: str = '',
+                 changed: threading.Condition | None = None) -> None:
         self._node = node
         self._image_type = Image if transport == 'raw' else CompressedImage
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
+        if depth != 'none':
+            self._topics['depth'] = 'depth' if depth == 'raw' else 'depth/compressedDepth'
+        if camera:
+            self._topics = {name: f'{camera}/{topic}' for name, topic in self._topics.items()}
+        self._camera = camera
+        self._depth_type = Image if depth == 'raw' else CompressedImage
+        self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
+        self._depths: deque[Image | CompressedImage] = deque()
         self._package = detections
         self._detections = detection_type('vision_msgs')
         self._linger_s = linger_s
@@ -203,7 +228,7 @@ class FrameSource:
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
                                      'image', 'detections')
-        self._changed = threading.Condition()
+        self.changed = changed or threading.Condition()
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
         self._subscribed_at = 0.0
@@ -225,7 +250,7 @@ class FrameSource:
 
         OptionsError: the type of the detections is not installed.
         """
-        with self._changed:
+        with self.changed:
             self._detections = detection_type(self._package)
             self._closed = ''
             if self._linger_s == math.inf:
@@ -234,15 +259,16 @@ class FrameSource:
 
     def close(self, reason: str) -> None:
         """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
-        with self._changed:
+        with self.changed:
             self._closed = reason
             self._unsubscribe()
-            self._changed.notify_all()
+            self.changed.notify_all()
 
     def forget(self) -> None:
         """Drop the messages received so far."""
-        with self._changed:
+        with self.changed:
             self._pairing.clear()
+            self._depths.clear()
             self._newest = None
 
     def next_frame(self, after: float, deadline: float) -> Frame:
@@ -257,30 +283,38 @@ class FrameSource:
         StoppedError
             The source was closed; the message gives the reason.
         """
-        with self._changed:
-            if not self._closed:
-                self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
-                self._subscribe()
-            self._changed.wait_for(lambda: self._closed or self._newest_since(after) is not None,
-                                   max(0.0, deadline - time.monotonic()))
-            if self._closed:
-                raise StoppedError(self._closed)
-            self._wanted_until = time.monotonic() + self._linger_s
-            frame = self._newest_since(after)
-            if frame is None:
-                raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
-                                   f'{self._why_none(after)}')
-            return frame
+        return next_of_any([self], after, deadline)
+
+    def want(self, deadline: float) -> None:
+        """Subscribe until a deadline (monotonic clock) [s] and a moment longer.
+
+        The caller holds the condition. StoppedError: the source was closed.
+        """
+        if self._closed:
+            raise StoppedError(self._closed)
+        self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
+        self._subscribe()
+
+    def want_no_more(self) -> None:
+        """Unsubscribe in a moment. StoppedError: the source was closed."""
+        if self._closed:
+            raise StoppedError(self._closed)
+        self._wanted_until = time.monotonic() + self._linger_s
+
+    @property
+    def is_closed(self) -> bool:
+        """Return whether nobody may wait for a frame."""
+        return bool(self._closed)
 
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
         return [self._silence(name) for name in self._topics
-                if self._node.count_publishers(self._resolved(name)) == 0]
+                if name != 'depth' and self._node.count_publishers(self._resolved(name)) == 0]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
-        with self._changed:
+        with self.changed:
             for name in self._topics:
                 silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = self._node.count_publishers(self._resolved(name)) == 0
@@ -296,7 +330,8 @@ class FrameSource:
                 'images dropped unpaired': self._pairing.dropped['image'],
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
-    def _newest_since(self, moment: float) -> Frame | None:
+    def newest_since(self, moment: float) -> Frame | None:
+        """Return the newest frame if its image arrived after a moment of the monotonic clock."""
         newest = self._newest
         return newest if newest is not None and newest.received_at >= moment else None
 
@@ -305,36 +340,62 @@ class FrameSource:
             return
         self._unsubscribe()  # what a failed attempt left behind
         self._subscribed_at = time.monotonic()
-        for name, message_type, profile in (('image', self._image_type, qos.IMAGE),
-                                            ('camera_info', CameraInfo, qos.CAMERA_INFO),
-                                            ('detections', self._detections.message_type,
-                                             qos.DETECTIONS_IN)):
+        of_topics = {'image': (self._image_type, qos.IMAGE),
+                     'camera_info': (CameraInfo, qos.CAMERA_INFO),
+                     'detections': (self._detections.message_type, qos.DETECTIONS_IN),
+                     'depth': (self._depth_type, qos.IMAGE)}
+        for name, topic in self._topics.items():
+            message_type, profile = of_topics[name]
             self._subscriptions.append(AdaptiveSubscription(
-                self._node, message_type, self._topics[name], self._receiver(name), profile))
+                self._node, message_type, topic, self._receiver(name), profile))
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
             subscription.destroy()
         self._subscriptions.clear()
         self._pairing.clear()
+        self._depths.clear()
         self._newest = None
 
     def _rest(self) -> None:
         """Unsubscribe once no frame has been wanted for a while."""
-        with self._changed:
+        with self.changed:
             if self._subscriptions and time.monotonic() > self._wanted_until:
                 self._unsubscribe()
 
     def _receiver(self, name: str) -> Callable[[Any], None]:
         def receive(msg: Any) -> None:
-            self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
+            if name == 'depth':
+                self._take_depth(msg)
+            else:
+                self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
         return receive
+
+    def _take_depth(self, msg: Image | CompressedImage) -> None:
+        """Keep a depth image until its frame is complete, and the newest ones of all."""
+        with self.changed:
+            if not self._subscriptions:
+                return
+            self._heard_at['depth'] = time.monotonic()
+            self._depths.append(msg)
+            while len(self._depths) > 1 and sum(
+                    len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
+                self._depths.popleft()
+
+    def _depth_at(self, image_ns: int) -> Image | CompressedImage | None:
+        """Return the depth image nearest to a time; older ones are of no more use."""
+        def apart(msg: Image | CompressedImage) -> int:
+            return abs(stamp_ns(msg.header.stamp) - image_ns)
+        nearest = min(self._depths, key=apart, default=None)
+        if nearest is None or apart(nearest) > self._depth_tolerance_ns:
+            return None
+        return nearest
 
     def _take(self, name: str, msg: Any) -> None:
         """Take one message, and pass on the frame that it completes."""
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
-        with self._changed:
+        with self.changed:
             if not self._subscriptions:
                 return
             self._heard_at[name] = time.monotonic()
@@ -345,15 +406,16 @@ class FrameSource:
             image, received_at = complete['image']
             detections, detected_at = complete['detections']
             frame = Frame(image, complete['camera_info'][0], detections, received_at,
-                          max(received_at, detected_at))
+                          max(received_at, detected_at),
+                          self._depth_at(stamp_ns(image.header.stamp)), self._camera)
             self._newest = frame
-            self._changed.notify_all()
+            self.changed.notify_all()
         self._on_frame(frame)
 
-    def _why_none(self, since: float) -> str:
+    def why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
         missing = [self._silence(name) for name in self._topics
-                   if self._heard_at.get(name, -math.inf) < since]
+                   if name != 'depth' and self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
         if self._pairing.outrun:
@@ -384,6 +446,28 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self._topics[name]))
+
+
+def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float) -> Frame:
+    """Return the first complete frame of some sources whose image arrived after a moment.
+
+    See FrameSource.next_frame. The sources share their condition.
+    """
+    def newest() -> Frame | None:
+        return next((frame for one in sources if (frame := one.newest_since(after))), None)
+    changed = sources[0].changed
+    with changed:
+        for one in sources:
+            one.want(deadline)
+        changed.wait_for(lambda: sources[0].is_closed or newest() is not None,
+                         max(0.0, deadline - time.monotonic()))
+        for one in sources:
+            one.want_no_more()
+        frame = newest()
+        if frame is None:
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
+                               f'{"; ".join(one.why_none(after) for one in sources)}')
+        return frame
 
 
 class TimedImage(NamedTuple):

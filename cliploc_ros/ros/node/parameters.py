@@ -48,6 +48,8 @@ class ParameterRow:
     choices: tuple[str, ...] = ()
     #: Read at start-up only. The others change at run time.
     read_only: bool = False
+    #: A list of numbers may be as long as its default, or several times as long.
+    repeats: bool = False
 
     @property
     def allowed(self) -> str:
@@ -93,8 +95,10 @@ class ParameterRow:
             is_numbers = (
                 not isinstance(value, str | bytes) and isinstance(value, Iterable)
                 and all(type(item) in (int, float) and math.isfinite(item) for item in value))
-            if not is_numbers or len(value) != len(self.default):
-                raise OptionsError(f'{self.name}: must be {len(self.default)} finite numbers')
+            length = len(self.default)
+            if not is_numbers or not (len(value) == length or (
+                    self.repeats and value and len(value) % length == 0)):
+                raise OptionsError(f'{self.name}: must be {length} finite numbers')
             value = [float(item) for item in value]
         if type(value) is not type(self.default):
             raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
@@ -109,10 +113,10 @@ class ParameterRow:
 
 
 def parameter(default: Value, description: str, unit: str = '', low: float = -math.inf,
-              high: float = math.inf, choices: tuple[str, ...] = (), read_only: bool = False
-              ) -> Any:
+              high: float = math.inf, choices: tuple[str, ...] = (), read_only: bool = False,
+              repeats: bool = False) -> Any:
     """Return the field of a parameter in a subclass of Parameters; see ParameterRow."""
-    row = ParameterRow('', default, description, unit, low, high, choices, read_only)
+    row = ParameterRow('', default, description, unit, low, high, choices, read_only, repeats)
     if isinstance(default, list):
         return field(default_factory=default.copy, metadata={'row': row})
     return field(default=default, metadata={'row': row})

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Several cameras of one robot: the frames of one instant."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from rclpy.node import Node
+
+from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, next_of_any
+from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.units import NS_PER_S
+
+# The detections of other cameras come at most this much later, or not at all.
+_PATIENCE_S = 0.3
+
+
+class Rig:
+    """A frame source for each camera; used as one.
+
+    A frame is of the first camera, in the order of the parameter, that has one of the newest
+    instant; those of the others are beside it. A camera that is late or silent is left out and
+    named. It never blocks a request.
+
+    Parameters
+    ----------
+    linger_s, on_frame
+        See FrameSource.
+    """
+
+    def __init__(self, node: Node, parameters: RelocalizerParameters, linger_s: float,
+                 on_frame: Callable[[Frame], None]) -> None:
+        self._changed = threading.Condition()
+        self._tolerance_s = parameters.sync_tolerance_s
+        self._on_frame = on_frame
+        self._sources = {name: FrameSource(
+            node, parameters.image_transport, linger_s, self._take, parameters.detections_type,
+            parameters.depth_transport, parameters.depth_tolerance_s, name, self._changed)
+            for name in parameters.camera_names}
+
+    @property
+    def image_topic(self) -> str:
+        """Return the resolved name of the image topic of the first camera."""
+        return next(iter(self._sources.values())).image_topic
+
+    def open(self) -> None:
+        """Allow calls of next_frame; OptionsError: see FrameSource."""
+        for source in self._sources.values():
+            source.open()
+
+    def close(self, reason: str) -> None:
+        """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
+        for source in self._sources.values():
+            source.close(reason)
+
+    def forget(self) -> None:
+        """Drop the messages received so far."""
+        for source in self._sources.values():
+            source.forget()
+
+    def next_frame(self, after: float, deadline: float) -> Frame:
+        """Return the first instant whose images arrived after a moment; see FrameSource."""
+        sources = list(self._sources.values())
+        frame = next_of_any(sources, after, deadline)
+        with self._changed:
+            self._changed.wait_for(
+                lambda: sources[0].is_closed or not self._instant(frame, after).left_out,
+                max(0.0, min(_PATIENCE_S, deadline - time.monotonic())))
+            return self._instant(frame, after)
+
+    def missing(self) -> list[str]:
+        """Return for each input that nothing publishes a line that says what to do."""
+        return [line for source in self._sources.values() for line in source.missing()]
+
+    def examine(self, health: Health, stale_after_s: float) -> None:
+        """Report the inputs of each camera."""
+        for name, source in self._sources.items():
+            own = Health()
+            source.examine(own, stale_after_s)
+            health.problems += own.problems
+            health.values |= {f'{name}: {value}': figure for value, figure in own.values.items()}
+
+    def _take(self, frame: Frame) -> None:
+        """Pass on an instant with its first camera's frame."""
+        with self._changed:
+            instant = self._instant(frame, frame.received_at - self._tolerance_s)
+        if instant.camera == frame.camera:
+            self._on_frame(instant)
+
+    def _instant(self, frame: Frame, after: float) -> Frame:
+        """Return the frames of the newest instant, as the first camera's and those beside it."""
+        found = {name: newest for name, source in self._sources.items()
+                 if (newest := source.newest_since(after)) is not None} or {frame.camera: frame}
+        last_ns = max(_stamp_ns(one) for one in found.values())
+        near = [one for one in found.values()
+                if last_ns - _stamp_ns(one) <= self._tolerance_s * NS_PER_S]
+        left_out = tuple(name for name in self._sources if name not in {
+            one.camera for one in near})
+        return replace(near[0], beside=tuple(near[1:]), left_out=left_out)
+
+
+def _stamp_ns(frame: Frame) -> int:
+    return stamp_ns(frame.image.header.stamp)

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Depth of the boxes: it helps where it is right, and does no harm where it is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.geometry.depth import centre_depth, half_chord
+from cliploc_ros.core.geometry.ellipsoid import shape_matrices
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.simulation.sensors import simulate_depths
+
+ROOM = make_room()
+CAMERA_FROM_MAP = invert_transform(MAP_FROM_CAMERA)
+ROTATION = np.ascontiguousarray(CAMERA_FROM_MAP[:3, :3])
+TRANSLATION = np.ascontiguousarray(CAMERA_FROM_MAP[:3, 3])
+RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class', tilt_deviation_deg=0.0))
+NONE = np.full(len(ROOM), np.nan)
+
+
+def look(rng, rows=None, noise_px=4.0):
+    """Noisy boxes of some objects, and their depths."""
+    seen = see_room(ROOM)
+    seen = replace(seen, bboxes_xyxy=seen.bboxes_xyxy + rng.normal(0.0, noise_px, (len(ROOM), 4)))
+    depths = simulate_depths(ROOM.centers, ROOM.shapes, MAP_FROM_CAMERA, rng)
+    rows = np.arange(len(ROOM)) if rows is None else rows
+    return Observation(CAMERA, seen.select(rows), depths=depths[rows])
+
+
+def error_m(found):
+    return pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0]
+
+
+def test_the_chord_is_that_of_the_ray_through_the_centre():
+    eye = MAP_FROM_CAMERA[:3, 3]
+    for center, shape, axes, quat in zip(ROOM.centers, ROOM.shapes, ROOM.semi_axes,
+                                         ROOM.quats_xyzw, strict=True):
+        inverse = np.linalg.inv(_matrix(shape_matrices(axes[None], quat[None])[0]))
+        ray = center - eye
+        # the surface is where (s - 1)^2 ray^T S^-1 ray = 1
+        depth = (ROTATION @ center + TRANSLATION)[2]
+        expected = depth / np.sqrt(ray @ inverse @ ray)
+        assert half_chord(center, shape, ROTATION, TRANSLATION) == pytest.approx(expected)
+        measured, deviation = centre_depth(np.array([2.0, 0.05]), center, shape, 0.02, ROTATION,
+                                           TRANSLATION)
+        assert measured == pytest.approx(2.0 + 0.6 * expected)
+        assert deviation == pytest.approx(np.sqrt(0.05**2 + (0.4 * expected)**2 + 0.02**2))
+
+
+def _matrix(shape):
+    matrix = np.zeros((3, 3))
+    matrix[np.triu_indices(3)] = shape
+    return matrix + np.triu(matrix, 1).T
+
+
+def test_right_depth_makes_poses_better_and_surer():
+    rng, errors, deviations = np.random.default_rng(0), [], []
+    for _ in range(60):
+        one = look(rng, noise_px=8.0)
+        pair = [RELOCALIZER.relocalize([replace(one, depths=depths)])
+                for depths in (None, one.depths)]
+        if all(found.solved and error_m(found) < 1.0 for found in pair):
+            errors.append([error_m(found) for found in pair])
+            deviations.append([np.sqrt(np.trace(found.covariance[:3, :3])) for found in pair])
+    assert len(errors) >= 50
+    assert np.median(errors, axis=0)[1] < np.median(errors, axis=0)[0]
+    assert np.median(deviations, axis=0)[1] < 0.95 * np.median(deviations, axis=0)[0]
+
+
+def test_depth_is_evidence(rng):
+    rows = np.array([0, 4, 8, 10])
+    found = RELOCALIZER.relocalize([look(rng, rows)])
+    assert found.depth.is_passed
+    assert found.hypotheses[0].support.depth > 1.0
+    assert found.depth.ratio == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize('change', [
+    pytest.param(lambda depths, rng: 1000.0 * depths, id='millimetres'),
+    pytest.param(lambda depths, rng: 1.6 * depths, id='scale'),
+    pytest.param(lambda depths, rng: rng.uniform(0.5, 9.0, len(depths)), id='random'),
+    pytest.param(lambda depths, rng: np.roll(depths, 5), id='of something else'),
+])
+def test_wrong_depth_does_no_harm(change):
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        one = look(rng)
+        alone = RELOCALIZER.relocalize([replace(one, depths=None)])
+        found = RELOCALIZER.relocalize([replace(one, depths=change(one.depths, rng))])
+        assert found.accepted == alone.accepted
+        assert found.depth is None or not found.depth.is_passed
+        np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
+
+
+@pytest.mark.parametrize('depths', [
+    NONE, np.zeros(len(ROOM)), np.full(len(ROOM), -1.0), np.full(len(ROOM), np.inf)])
+def test_no_depth_is_as_no_depth_camera(rng, depths):
+    one = look(rng)
+    alone, found = (RELOCALIZER.relocalize([replace(one, depths=values)])
+                    for values in (None, depths))
+    np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
+    assert (found.confidence, found.depth) == (alone.confidence, None)
+
+
+@pytest.mark.parametrize('given', [{'depths': NONE[1:]},
+                                   {'depths': NONE, 'depth_deviations': NONE[1:]}])
+def test_depths_of_another_number_of_boxes_are_refused(rng, given):
+    with pytest.raises(OptionsError, match='but there are 12 detections'):
+        RELOCALIZER.relocalize([replace(look(rng), **given)])
+
+
+def test_a_camera_may_know_its_deviations(rng):
+    one = replace(look(rng), depth_deviations=np.full(len(ROOM), 1e3))
+    vague, alone = (RELOCALIZER.relocalize([replace(one, depths=depths)])
+                    for depths in (one.depths, None))
+    np.testing.assert_allclose(vague.map_from_camera, alone.map_from_camera, atol=1e-4)
+
+
+def test_depth_of_a_wrong_scale_is_used_no_more(rng):
+    localizer = Localizer(RELOCALIZER)
+    for number in range(5):
+        assert not localizer.depth_scale.is_wrong
+        one = look(rng)
+        localizer.localize(replace(one, depths=1.5 * one.depths, stamp_ns=number))
+    assert localizer.depth_scale.is_wrong
+    assert localizer.depth_scale.ratio == pytest.approx(1.5, abs=0.1)
+    assert localizer.localize(look(rng)).depth is None
+
+
+def test_depth_of_the_right_scale_stays(rng):
+    localizer = Localizer(RELOCALIZER)
+    for _ in range(12):
+        assert localizer.localize(look(rng)).accepted
+    assert localizer.depth_scale.ratio == pytest.approx(1.0, abs=0.05)

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Several cameras of one robot, which look at one instant in different directions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cameras import MAP, MOUNTS, NAMES, look
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.fit.verification import MAX_FRAMES
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+
+OPTIONS = RelocalizerOptions(matching='class', tilt_deviation_deg=0.0)
+STEP = make_transform(Rotation.from_euler('y', 8.0, degrees=True).as_matrix(), [0.3, 0.0, 0.2])
+
+
+def test_together_they_see_enough(rng):
+    relocalizer = Relocalizer(MAP, OPTIONS)
+    accepted = []
+    for _ in range(12):
+        *others, last = look(rng)
+        alone = relocalizer.relocalize([last])
+        found = Localizer(relocalizer).localize(last, run=None, others=others)
+        accepted.append((alone.accepted, found.accepted))
+        if found.accepted:
+            assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.5
+    alone, together = np.sum(accepted, axis=0)
+    assert alone <= 6 < 10 <= together
+
+
+def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
+    """Whatever their names say, equal names are frames of one camera that moved."""
+    relocalizer = Relocalizer(MAP, replace(OPTIONS, mount_deviation=(0.0, 0.0)))
+    frames = look(rng, objects=5)
+    rigid, moving = (relocalizer.relocalize([replace(one, camera_name=name) for one, name in
+                                             zip(frames, names, strict=True)])
+                     for names in (NAMES, 4 * ('',)))
+    assert np.trace(rigid.covariance) < 0.9 * np.trace(moving.covariance)
+
+
+def test_the_covariance_holds_the_errors_of_mounts(rng):
+    deviation = (0.03, 1.5)
+    stated, ignored = (Relocalizer(MAP, replace(OPTIONS, mount_deviation=given))
+                       for given in (deviation, (0.0, 0.0)))
+    squares = []
+    for _ in range(30):
+        wrong = [mount @ make_transform(Rotation.from_rotvec(
+            np.radians(deviation[1]) * rng.normal(size=3)).as_matrix(),
+            deviation[0] * rng.normal(size=3)) for mount in MOUNTS[:-1]]
+        frames = look(rng, objects=6, mounts=[*wrong, MOUNTS[-1]])
+        found = [one.relocalize(frames) for one in (stated, ignored)]
+        if all(pose_error(one.map_from_camera, MOUNTS[-1])[0] < 1.0 for one in found):
+            squares.append([normalized_square(one.map_from_camera, one.covariance, MOUNTS[-1])
+                            for one in found])
+    within = (np.array(squares) < chi2.ppf(0.95, 6)).mean(axis=0)
+    print(f'\n{len(squares)} poses, in the 95 % ellipsoids: stated {within[0]:.2f}, ignored '
+          f'{within[1]:.2f}')
+    assert within[0] >= 0.9
+
+
+def test_instants_are_kept_and_replaced_as_a_whole(rng):
+    localizer = Localizer(Relocalizer(MAP, OPTIONS))
+
+    def localize(number, pose):
+        *others, last = look(rng, pose, stamp_ns=number)
+        found = localizer.localize(last, 0, 5, 60.0, others=others)
+        return found, [len(one.searched) for one in localizer._instants]
+    assert localize(0, np.eye(4))[1] == [4]
+    assert localize(1, np.eye(4))[1] == [4], 'a robot that stands replaces its instant'
+    assert localize(2, STEP)[1] == [4, 4]
+    found, kept = localize(3, STEP @ STEP)
+    assert kept == [4, 4]
+    assert sum(kept) <= MAX_FRAMES
+    assert pose_error(found.map_from_camera, STEP @ STEP @ MOUNTS[-1])[0] < 0.5
+
+
+@pytest.mark.parametrize('missing', [0, 1, 2])
+def test_a_camera_that_is_late_is_left_out(rng, missing):
+    *others, last = look(rng, objects=5)
+    del others[missing]
+    found = Localizer(Relocalizer(MAP, OPTIONS)).localize(last, None, others=others)
+    assert found.accepted
+    assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3

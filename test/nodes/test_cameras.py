@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A relocalizer with four cameras: together they see enough, and none blocks the others."""
+
+import numpy as np
+import pytest
+from cameras import MAP, MOUNTS, NAMES, look
+from processes import wait_for
+from scene import CAMERA, write_map
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from tester import RELIABLE, transform_of
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.ros.conversions import detections_to_msg
+
+BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
+    *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat())]
+
+
+@pytest.fixture(scope='module')
+def surroundings_map(tmp_path_factory):
+    path = tmp_path_factory.mktemp('surroundings') / 'map.yaml'
+    write_map(MAP, path)
+    return path
+
+
+@pytest.fixture
+def four_cameras(start, tester, surroundings_map, tmp_path):
+    """Start a relocalizer; return it, and what asks while some cameras publish."""
+    publishers = {name: {kind: tester.create_publisher(kind, f'{name}/{topic}', RELIABLE)
+                         for kind, topic in ((CameraInfo, 'camera_info'), (Image, 'image'),
+                                             (Detection2DArray, 'detections'))} for name in NAMES}
+    process = start('nodes.relocalizer', parameters={
+        'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
+        'tilt_deviation_deg': 0.0, 'time_budget_ms': 5000.0, 'cameras': list(NAMES),
+        'record_folder': tmp_path / 'cases',
+        'base_from_camera': BASE_FROM_CAMERA})
+    process.wait_for_output('ready after')
+    tester.connect()
+    rng = np.random.default_rng(4)
+
+    def publish(number, working, late_s):
+        for name, seen in zip(NAMES, look(rng), strict=True):
+            if name not in working:
+                continue
+            header = Header(frame_id=f'{name}_optical')
+            nanoseconds = round(number * 1e8) + 10**12 - round(late_s.get(name, 0.0) * 1e9)
+            header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10**9)
+            for msg in (
+                    CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
+                               k=CAMERA.matrix.ravel(), distortion_model='plumb_bob',
+                               d=[0.0] * 5, p=np.c_[CAMERA.matrix, np.zeros(3)].ravel()),
+                    detections_to_msg(seen.detections, header),
+                    Image(header=header, width=CAMERA.width, height=CAMERA.height,
+                          encoding='mono8', step=CAMERA.width,
+                          data=bytes(CAMERA.width * CAMERA.height))):
+                publishers[name][type(msg)].publish(msg)
+
+    def ask(working=NAMES, late_s=None):
+        future, number = tester.ask(), 0
+
+        def work():
+            nonlocal number
+            number += 1
+            publish(number, working, late_s or {})
+            for _ in range(4):
+                tester.spin()
+        wait_for(future.done, 'an answer', work=work)
+        return future.result()
+    yield process, ask
+    for kinds in publishers.values():
+        for publisher in kinds.values():
+            tester.destroy_publisher(publisher)
+
+
+def ask_until(ask, text, *given):
+    """Ask until an answer says something: on a busy machine a camera is late at times."""
+    for _ in range(30):
+        answer = ask(*given)
+        if text in answer.message:
+            return answer
+    raise AssertionError(f'{text!r} in {answer.message}')
+
+
+def test_four_cameras_see_enough_at_once(four_cameras, tester):
+    process, ask = four_cameras
+    while not ask_until(ask, ', 4 cameras;').success:
+        tester.forget()
+    tester.wait(lambda: tester.poses, 'a pose')
+    assert pose_error(transform_of(tester.poses[-1].pose.pose), np.eye(4))[0] < 0.3
+    assert 'Traceback' not in process.output()
+
+
+def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,
+                                                    tmp_path, capsys):
+    _, ask = four_cameras
+    answer = ask_until(ask, ', 4 cameras;')
+    stored = tester.call(Trigger, '/relocalizer/record', Trigger.Request())
+    assert stored.success, stored.message
+    (case,) = tmp_path.glob('cases/case_*')
+    assert evaluate(['--bag', str(case), '--map', str(surroundings_map)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.endswith('the same verdict\n')
+    confidence = answer.message.partition('[confidence ')[2].partition(',')[0]
+    assert f'confidence {confidence}' in printed
+
+
+@pytest.mark.parametrize(('working', 'late_s'), [
+    (NAMES[1:], {}), (NAMES[:-1], {}), (NAMES, {'back': 1.0})],
+    ids=['first silent', 'last silent', 'one late'])
+def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
+    process, ask = four_cameras
+    missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)
+    ask_until(ask, f', 3 cameras, none of {missing};', working, late_s)
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize(('given', 'named'), [
+    ({'cameras': ['left', 'left'], 'base_frame': 'base_link'}, 'cameras: a name is given twice'),
+    ({'cameras': ['left', 'right']}, 'cameras: needs base_frame'),
+    ({'cameras': ['left', 'right'], 'base_frame': 'base_link',
+      'base_from_camera': BASE_FROM_CAMERA[:21]}, 'base_from_camera: needs 7 numbers'),
+    ({'mount_deviation': [-1.0, 0.0]}, 'mount_deviation: needs two numbers of 0 or more'),
+])
+def test_parameters_that_do_not_fit_are_named(own_relocalizer, given, named):
+    own_relocalizer(expect=named, **given)

@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Depth of an RGB-D camera at the relocalizer: right, wrong, late, and none."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from sensor_msgs.msg import CompressedImage, Image
+from std_srvs.srv import Trigger
+from tester import RELIABLE, make_frame
+
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.core.geometry.transforms import invert_transform
+
+ROOM = make_room()
+
+
+def depth_image(unit_m=0.001):
+    """What a depth camera sees of the room: each box at the depth of its object, else a wall."""
+    depths = np.full((CAMERA.height, CAMERA.width), 8.0)
+    camera_from_map = invert_transform(MAP_FROM_CAMERA)
+    centers = ROOM.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+    radii = np.cbrt(ROOM.semi_axes.prod(axis=1))
+    boxes = see_room(ROOM).bboxes_xyxy.astype(int)
+    for row in np.argsort(-centers[:, 2]):
+        left, top, right, bottom = np.maximum(boxes[row], 0)
+        depths[top:bottom, left:right] = centers[row, 2] - 0.6 * radii[row]
+    return depths / unit_m
+
+
+def message(frame, depths, encoding='16UC1', frame_id=None, late_s=0.0):
+    header = frame[0].header
+    pixels = depths.astype(np.uint16 if encoding == '16UC1' else np.float32)
+    msg = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
+                step=pixels.strides[0])
+    msg.header.frame_id = header.frame_id if frame_id is None else frame_id
+    msg.header.stamp.sec = header.stamp.sec
+    msg.header.stamp.nanosec = header.stamp.nanosec + round(late_s * 1e9)
+    msg.data = pixels.tobytes()
+    return msg
+
+
+def compressed(frame, depths):
+    png = cv2.imencode('.png', depths.astype(np.uint16))[1].tobytes()
+    return CompressedImage(header=frame[0].header, format='16UC1; compressedDepth png',
+                           data=struct.pack('<iff', 0, 0.0, 0.0) + png)
+
+
+@pytest.fixture
+def depth_camera(tester):
+    """Publishes depth next to a frame, as a camera would, until the answer comes."""
+    raw = tester.create_publisher(Image, 'depth', RELIABLE)
+    small = tester.create_publisher(CompressedImage, 'depth/compressedDepth', RELIABLE)
+
+    def ask(depth):
+        frame, future = make_frame(), tester.ask()
+
+        def publish_all():
+            if depth is not None:
+                (raw if isinstance(depth, Image) else small).publish(depth)
+            return future.done()
+        tester.feed_until(publish_all, frame)
+        return future.result()
+    yield ask
+    tester.destroy_publisher(raw)
+    tester.destroy_publisher(small)
+
+
+def ask_until(ask, depth, text):
+    """Ask until an answer says something: discovery of a new publisher takes a while."""
+    for _ in range(20):
+        answer = ask(depth)
+        assert answer.success, answer.message
+        if text in answer.message:
+            return answer
+    raise AssertionError(f'{text!r} in {answer.message}')
+
+
+def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, depth_camera,
+                                                      room_map, tmp_path, capsys):
+    own_relocalizer(depth_transport='raw', algorithm='auto', record_folder=tmp_path)
+    frame = make_frame()
+    answer = ask_until(depth_camera, message(frame, depth_image()), ', depth of 12 objects')
+    stored = tester.call(Trigger, '/relocalizer/record', Trigger.Request())
+    assert stored.success, stored.message
+    (case,) = tmp_path.glob('case_*')
+    assert evaluate(['--bag', str(case), '--map', str(room_map)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.endswith('the same verdict\n')
+    confidence = answer.message.partition('[confidence ')[2].partition(',')[0]
+    assert f'confidence {confidence}' in printed
+
+
+def test_compressed_depth(own_relocalizer, depth_camera):
+    own_relocalizer(depth_transport='compressed', algorithm='auto')
+    ask_until(depth_camera, compressed(make_frame(), depth_image()), ', depth of 12 objects')
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    ({'depths': depth_image(1.0), 'encoding': '32FC1', 'frame_id': 'other'},
+     "depth is in the coordinate frame 'other', the image in 'camera_optical_frame'"),
+    ({'depths': depth_image(), 'encoding': '32FC1'}, '16UC1 is in millimetres, 32FC1 in metres'),
+    ({'depths': depth_image()[:, ::2]}, 'depth has 320x480 px, the image 640x480'),
+    ({'depths': 1.7 * depth_image()}, 'times what boxes and map say, and is used no more'),
+])
+def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
+                                                          said):
+    process = own_relocalizer(depth_transport='raw', algorithm='auto')
+    for _ in range(30):
+        answer = depth_camera(message(make_frame(), **given))
+        assert answer.success, answer.message
+        assert ', depth of' not in answer.message
+        if said in process.output():
+            break
+    assert process.output().count(said) == 1
+
+
+@pytest.mark.parametrize('depth', [
+    None, message(make_frame(), depth_image(), late_s=0.5),
+    message(make_frame(), np.zeros((480, 640)))], ids=['silent', 'late', 'empty'])
+def test_a_request_never_waits_for_depth(own_relocalizer, depth_camera, depth):
+    process = own_relocalizer(depth_transport='raw', algorithm='auto')
+    answer = depth_camera(depth)
+    assert answer.success, answer.message
+    assert 'depth' not in answer.message
+    assert 'Traceback' not in process.output()
