@@ -24,6 +24,7 @@ NAMES = {
     'camera_info': 'the topic of the camera driver',
     'detections': 'from the detector to the relocalizer',
     'depth': 'of an RGB-D camera, with depth_transport; depth/compressedDepth follows it',
+    'depth_camera_info': 'of a depth camera that is not registered to the image',
     'odom': 'tells whether the robot moves; without it the robot is assumed to stand',
     'imu': 'the vertical, with gravity:=imu',
     'initialpose': 'what AMCL subscribes to',

@@ -240,14 +240,17 @@ def _odometry(options: argparse.Namespace) -> 'Poses | None':
 
 
 def _depth_format(options: argparse.Namespace) -> 'DepthFormat':
+    import numpy as np
+
+    from cliploc_ros.core.geometry.transforms import make_transform
     from cliploc_ros.datasets.depth import DepthCamera
     from cliploc_ros.datasets.frames import DepthFormat
 
     camera = None
     if options.depth_intrinsics is not None:
-        x, y, z = options.depth_baseline or (0.0, 0.0, 0.0)
+        baseline = np.array(options.depth_baseline or (0.0, 0.0, 0.0))
         fx, fy, cx, cy = options.depth_intrinsics
-        camera = DepthCamera(fx, fy, cx, cy, (x, y, z))
+        camera = DepthCamera(fx, fy, cx, cy, make_transform(np.eye(3), baseline))
     elif options.depth_baseline is not None:
         raise OptionsError('--depth-baseline needs --depth-intrinsics')
     return DepthFormat(options.depth_unit, camera)

@@ -29,6 +29,7 @@ _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 _CAMERA_INFO, _DETECTIONS = '/camera_info', '/detections'
 # What was known besides the messages, at the stamp of each image.
 _CAMERA, _UP, _DEPTH = '/camera_in_odom', '/up_in_camera', '/depth'
+_DEPTH_CAMERA_INFO, _DEPTH_CAMERA = '/depth_camera_info', '/depth_in_camera'
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,16 @@ class CaseFrame:
     odom_from_camera: NDArray[np.float64] | None = None  #: (4, 4): where odometry placed the frame
     depth_type: str = ''  #: sensor_msgs/msg/Image or CompressedImage; empty without depth
     depth: bytes = b''
+    depth_camera_info: bytes = b''  #: Where depth is not registered
+    camera_from_depth: NDArray[np.float64] | None = None  #: (4, 4), where depth is not registered
     camera: str = ''  #: Name of one of several cameras
     is_beside: bool = False  #: Whether the pose is that of another camera of its instant
 
     def message(self, name: str) -> Any:
         """Return one of the messages; DatasetError: its bytes are no such message."""
         msgtype = {'image': self.image_type, 'camera_info': CAMERA_INFO,
-                   'detections': DETECTIONS, 'depth': self.depth_type}[name]
+                   'detections': DETECTIONS, 'depth': self.depth_type,
+                   'depth_camera_info': CAMERA_INFO}[name]
         return deserialize(getattr(self, name), msgtype, name)
 
 
@@ -86,6 +90,8 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
             if depth_type := next((one.depth_type for one in case.frames
                                    if one.depth and one.camera == frame.camera), ''):
                 writer.add_topic(prefix + _DEPTH, depth_type)
+                writer.add_topic(prefix + _DEPTH_CAMERA_INFO, CAMERA_INFO)
+                writer.add_topic(prefix + _DEPTH_CAMERA, POSE)
         writer.add_topic(VERDICT, _TEXT)
         for frame in case.frames:
             stamp, prefix = frame.stamp_ns, _prefix(frame.camera)
@@ -103,6 +109,10 @@ def write_case(path: Path, case: Case, storage: str = 'mcap') -> None:
                     vector=types['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)))
             if frame.depth:
                 writer.write(prefix + _DEPTH, stamp, frame.depth)
+            if frame.camera_from_depth is not None:
+                writer.write(prefix + _DEPTH_CAMERA_INFO, stamp, frame.depth_camera_info)
+                writer.write(prefix + _DEPTH_CAMERA, stamp,
+                             pose_message(stamp, 'camera', frame.camera_from_depth))
         order = [[one.camera, one.stamp_ns, one.is_beside] for one in case.frames]
         writer.write(VERDICT, case.frames[-1].stamp_ns,
                      types[_TEXT](data=json.dumps({'frames': order, **case.report})))
@@ -155,8 +165,9 @@ def _frames_of(reader: BagReader, path: Path, camera: str) -> Iterator[CaseFrame
     images = _by_stamp(reader, topics[0])
     if not images:
         raise DatasetError(f'{path}: {topics[0]} has no messages')
-    infos, detections, poses, verticals, depths = (_by_stamp(reader, prefix + name) for name in (
-        _CAMERA_INFO, _DETECTIONS, _CAMERA, _UP, _DEPTH))
+    infos, detections, poses, verticals, depths, depth_infos, depth_poses = (
+        _by_stamp(reader, prefix + name) for name in (
+            _CAMERA_INFO, _DETECTIONS, _CAMERA, _UP, _DEPTH, _DEPTH_CAMERA_INFO, _DEPTH_CAMERA))
     for stamp, image in images.items():
         if not (stamp in infos and stamp in detections):
             raise DatasetError(f'{path}: the image of {stamp} ns has no camera_info or detections')
@@ -168,6 +179,10 @@ def _frames_of(reader: BagReader, path: Path, camera: str) -> Iterator[CaseFrame
         if (data := poses.get(stamp)) is not None:
             frame = replace(frame, odom_from_camera=map_from_camera_of(
                 deserialize(data, POSE, _CAMERA)))
+        if (data := depth_poses.get(stamp)) is not None:
+            frame = replace(frame, depth_camera_info=depth_infos.get(stamp, b''),
+                            camera_from_depth=map_from_camera_of(
+                                deserialize(data, POSE, _DEPTH_CAMERA)))
         yield frame
 
 

@@ -6,7 +6,7 @@ Depth is never exact: it has holes, its scale errs, and it does not lie quite on
 So a box gets one robust value, from its inner half, and the spread of the values there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError, ImageError
-from cliploc_ros.messages import depth_counts_from_msg
+from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg
 
 #: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
@@ -43,9 +43,8 @@ class DepthCamera:
     fy: float
     cx: float
     cy: float
-    #: x, y, z of the depth camera's origin, seen from the colour camera [m]; the axes of both are
-    #: parallel
-    color_from_depth: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: (4, 4): its pose, seen from the colour camera
+    color_from_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True)
@@ -88,29 +87,45 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
     return depths
 
 
-def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDArray[np.float64]
-                    ) -> NDArray[np.float64]:
-    """Return the depths (n,) of boxes (n, 4) by a message of registered depth, NaN where none [m].
-
-    ImageError: the message is invalid, or it is not of the colour camera; says what to do.
+def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDArray[np.float64],
+                    camera_info: Any = None,
+                    color_from_depth: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return the depths (n,) of boxes (n, 4) by a message of depth, NaN where there is none [m].
 
     Parameters
     ----------
     msg : sensor_msgs/Image or CompressedImage
     image_frame : str
-        The coordinate frame of the colour image.
+        The coordinate frame of the colour image. Depth in another one is not registered.
     camera : Camera
         Of the colour image.
+    camera_info : sensor_msgs/CameraInfo, optional
+        Of a depth camera that is not registered.
+    color_from_depth : ndarray (4, 4), optional
+        Its pose, seen from the colour camera.
+
+    Raises
+    ------
+    CliplocError
+        The message is invalid, or does not belong to the image; says what to do.
     """
-    if msg.header.frame_id != image_frame:
-        raise ImageError(f"depth is in the coordinate frame '{msg.header.frame_id}', the image in "
-                         f"'{image_frame}': publish depth registered to the image")
     depths_m = depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
     height, width = depths_m.shape
-    if abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
+    own = None
+    if msg.header.frame_id != image_frame:
+        if camera_info is None or color_from_depth is None:
+            raise ImageError(
+                f"depth is in the coordinate frame '{msg.header.frame_id}', the image in "
+                f"'{image_frame}', without {'tf' if camera_info else 'depth_camera_info'} between "
+                'them: publish that, or depth registered to the image')
+        seen_by = camera_from_msg(camera_info, (width, height), False)
+        if any(seen_by.distortion):
+            raise ImageError('depth is distorted, by its camera_info: publish it rectified')
+        own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
+    elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
         raise ImageError(f'depth has {width}x{height} px, the image {camera.width}x'
                          f'{camera.height}: publish depth registered to the image')
-    depths = depths_of_boxes(DepthImage(depths_m), camera, bboxes_xyxy)[0].astype(np.float64)
+    depths = depths_of_boxes(DepthImage(depths_m, own), camera, bboxes_xyxy)[0].astype(np.float64)
     known, (least, greatest) = depths[np.isfinite(depths)], PLAUSIBLE_DEPTH_M
     if len(known) and not least < np.median(known) < greatest:
         raise ImageError(f'depth of the boxes is {np.median(known):.3g} m: 16UC1 is in '
@@ -213,7 +228,7 @@ def _points_in_color(depth: DepthImage, camera: Camera, step: int
     if own is None:  # scaled, where the depth image is smaller than the colour image
         return np.stack([u * camera.width / width, v * camera.height / height]), values
     points = np.stack([(u - own.cx) / own.fx * values, (v - own.cy) / own.fy * values, values],
-                      axis=1) + own.color_from_depth
+                      axis=1) @ own.color_from_depth[:3, :3].T + own.color_from_depth[:3, 3]
     points = points[points[:, 2] > 0.0]
     pixels = camera.project_normalized(points[:, :2] / points[:, 2:])
     inside = np.isfinite(pixels).all(axis=1)

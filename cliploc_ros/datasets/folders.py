@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    is_rigid,
+    make_transform,
+)
 from cliploc_ros.datasets.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
 from cliploc_ros.datasets.intrinsics import find_camera, read_camera
@@ -22,7 +26,8 @@ from cliploc_ros.units import NS_PER_S
 # Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These
 # values make the edges of colour and depth agree best (measured for this project on RedKitchen).
 _SEVEN_SCENES_COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-_SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0, (-0.025, 0.0, 0.0))
+_SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0,
+                                  make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
@@ -88,7 +93,7 @@ def _seven_scenes_frames(folder: Path, options: FolderOptions) -> Frames:
     form = DepthFormat(options.depth.unit_m or MILLIMETRE,
                        options.depth.camera or _SEVEN_SCENES_DEPTH)
     assert form.camera is not None
-    depth_from_color = make_transform(np.eye(3), -np.array(form.camera.color_from_depth))
+    depth_from_color = invert_transform(form.camera.color_from_depth)
     for number, path in sorted(images.items()):
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'

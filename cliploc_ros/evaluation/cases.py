@@ -25,7 +25,7 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.cases import Case, CaseFrame
 from cliploc_ros.datasets.depth import depths_from_msg
-from cliploc_ros.errors import DatasetError, ImageError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
@@ -112,10 +112,11 @@ def _observed(frame: CaseFrame, parameters: Mapping[str, Any], class_map: Mappin
         width, height, parameters['max_detections'])
     depths = None
     if frame.depth:
-        with suppress(ImageError):  # the node goes on without depth
-            depths = depths_from_msg(frame.message('depth'),
-                                     frame.message('image').header.frame_id, camera,
-                                     detections.bboxes_xyxy)
+        with suppress(CliplocError):  # the node goes on without depth
+            depths = depths_from_msg(
+                frame.message('depth'), frame.message('image').header.frame_id, camera,
+                detections.bboxes_xyxy, frame.message('depth_camera_info')
+                if frame.depth_camera_info else None, frame.camera_from_depth)
     return image, Observation(
         camera, detections, stamp_ns=frame.stamp_ns, camera_name=frame.camera,
         up_in_camera=frame.up_in_camera, odom_from_camera=frame.odom_from_camera, depths=depths)

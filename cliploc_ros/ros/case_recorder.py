@@ -155,7 +155,10 @@ def _case_frame(frame: Frame, state: RobotState | None) -> 'CaseFrame':
         up_in_camera=None if state is None else state.up_in_camera,
         odom_from_camera=odom_from_camera, camera=frame.camera,
         depth_type=_type_of(frame.depth) if frame.depth else '',
-        depth=bytes(serialize_message(frame.depth)) if frame.depth else b'')
+        depth=bytes(serialize_message(frame.depth)) if frame.depth else b'',
+        depth_camera_info=bytes(serialize_message(frame.depth_camera_info))
+        if frame.depth_camera_info else b'',
+        camera_from_depth=None if state is None else state.camera_from_depth)
 
 
 def _type_of(image: Image | CompressedImage) -> str:

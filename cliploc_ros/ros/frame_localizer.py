@@ -45,7 +45,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.depth import depths_from_msg
-from cliploc_ros.errors import ImageError, MapError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import (
     camera_from_msg,
@@ -267,7 +267,7 @@ class FrameLocalizer:
         return image, Observation(
             camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
             camera_name=frame.camera, up_in_camera=state.up_in_camera,
-            depths=self._depths(frame, camera, detections.bboxes_xyxy),
+            depths=self._depths(frame, camera, detections.bboxes_xyxy, state.camera_from_depth),
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
 
     def _known_crops(self, image: NDArray[np.uint8], observation: Observation,
@@ -285,8 +285,8 @@ class FrameLocalizer:
         crops = self._observer.crops(image, observation.detections.bboxes_xyxy)
         return replace(observation, similarities=crops.compare(crops.known), compared=crops.known)
 
-    def _depths(self, frame: Frame, camera: Camera, bboxes_xyxy: NDArray[np.float64]
-                ) -> NDArray[np.float64] | None:
+    def _depths(self, frame: Frame, camera: Camera, bboxes_xyxy: NDArray[np.float64],
+                camera_from_depth: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         """Return the depth of each box (n,); None without depth, or where it cannot be used."""
         if frame.depth is None:
             return None
@@ -295,8 +295,9 @@ class FrameLocalizer:
                        'is used no more: check its unit, calibration and registration')
             return None
         try:
-            return depths_from_msg(frame.depth, frame.image.header.frame_id, camera, bboxes_xyxy)
-        except ImageError as error:
+            return depths_from_msg(frame.depth, frame.image.header.frame_id, camera, bboxes_xyxy,
+                                   frame.depth_camera_info, camera_from_depth)
+        except CliplocError as error:
             self._note(f'localizing without depth: {error}')
             return None
 

@@ -137,8 +137,8 @@ class RelocalizerParameters(CommonParameters):
     mount_deviation: list[float] = parameter([0.01, 0.5],
         'Standard deviations of the mounts of several cameras on each axis [m] [deg].')
     depth_transport: str = parameter('none',
-        "Use depth of an RGB-D camera, registered to the image: 'raw' on the topic depth, or "
-        "'compressed' on depth/compressedDepth.", choices=('none', 'raw', 'compressed'),
+        "Use depth of an RGB-D camera: 'raw' on the topic depth, or 'compressed' on "
+        "depth/compressedDepth.", choices=('none', 'raw', 'compressed'),
         read_only=True)
     depth_tolerance_s: float = parameter(0.02,
         'Use depth whose stamp is at most this far from that of the image.', unit='s', low=0.0,

@@ -121,7 +121,8 @@ class Pipeline:
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, parameters.of_camera(frame.camera), deadline)
+        state = self._robot.at(image, parameters.of_camera(frame.camera), deadline,
+                               frame.depth_frame)
         beside = self._beside(frame, parameters, deadline)
         localized = localizer.localize(frame, parameters, state, times, deadline, beside)
         stages_ms = times.ms
@@ -150,8 +151,8 @@ class Pipeline:
         for one in frame.beside:
             soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
             try:
-                found.append((one, self._robot.at(one.image.header,
-                                                   parameters.of_camera(one.camera), soon)))
+                found.append((one, self._robot.at(
+                    one.image.header, parameters.of_camera(one.camera), soon, one.depth_frame)))
             except NoTransformError as error:
                 self._node.get_logger().warning(f'localizing without {one.camera}: {error}',
                                                 throttle_duration_sec=_LOG_PERIOD_S)

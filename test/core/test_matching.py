@@ -140,8 +140,8 @@ def time_budget_is_kept(observation, landmark_map, frames):
             took_ms[budget_s].append(budget.elapsed_ms)
     least_ms, took_ms = took_ms.values()
     print(f'\n{len(landmark_map)} landmarks, {frames} frames, 50 ms: took {min(took_ms):.1f} to '
-          f'{max(took_ms):.1f} ms, without a budget {min(least_ms):.1f}, {found.tried} hypotheses, '
-          f'{100 * found.coverage:.3g} % of all samples')
+          f'{max(took_ms):.1f} ms, without a budget {min(least_ms):.1f}, {found.tried} '
+          f'hypotheses, {100 * found.coverage:.3g} % of all samples')
     refined_ms = 1e3 * (budget.refinement_end - budget.start)
     assert min(took_ms) < max(55.0, refined_ms + min(least_ms))
     return found

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.datasets.depth import (
     DepthCamera,
     DepthImage,
@@ -89,13 +90,19 @@ def test_depth_of_boxes_is_robust():
 
 
 def test_depth_that_is_not_registered():
-    own = DepthCamera(585.0, 585.0, 320.0, 240.0, (-0.025, 0.0, 0.0))
+    own = DepthCamera(585.0, 585.0, 320.0, 240.0, make_transform(
+        np.eye(3), np.array([-0.025, 0.0, 0.0])))
     depths = np.full((480, 640), 4.0, dtype=np.float32)
     depths[200:280, 400:480] = 1.0
     # where the colour camera sees it: scaled by .897, shifted by 525 * 25 mm / 1 m = 13 px
     left = 320 + (400 - 320) * 525 / 585 - 13.125
     box = np.array([[left, 204.1, left + 71.8, 275.9]])
     found, spread = depths_of_boxes(DepthImage(depths, own), CAMERA, box)
+    np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
+    # a depth camera on its side, its x axis where the other's y axis is
+    aside = DepthCamera(585.0, 585.0, 240.0, 639.0 - 320.0, own.color_from_depth @ make_transform(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)))
+    found, spread = depths_of_boxes(DepthImage(np.rot90(depths), aside), CAMERA, box)
     np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
     # taken for registered, the box further left shows the wall
     box = box - [20, 0, 20, 0]

@@ -12,7 +12,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
@@ -98,6 +98,32 @@ def test_nothing_seen_is_no_pose_and_no_error(localizer, values):
     nothing = see_room(make_room()).select(np.array([], dtype=np.int64))
     found = localize(localizer, make_frame(detections=nothing), values)
     assert not found.accepted and found.hypotheses == () and found.reason
+
+
+def test_depth_of_another_camera_is_registered(localizer, values, caplog):
+    """Of half the resolution, 20 cm to the left of the colour camera: a wall at 4 m."""
+    height, width = CAMERA.height // 2, CAMERA.width // 2
+    left = make_transform(np.eye(3), np.array([-0.2, 0.0, 0.0]))
+    depth = Image(header=Header(frame_id='depth'), height=height, width=width, encoding='16UC1',
+                  step=2 * width, data=np.full(height * width, 4000, dtype=np.uint16).tobytes())
+    info = CameraInfo(k=(np.diag([0.5, 0.5, 1.0]) @ CAMERA.matrix).ravel())
+
+    def depths(info, camera_from_depth):
+        frame = replace(make_frame(), depth=depth, depth_camera_info=info)
+        state = RobotState(np.eye(4), camera_from_depth=camera_from_depth)
+        return localizer.localize(frame, values, state, timer()).seen.observation.depths
+    found = depths(info, left)
+    known = np.isfinite(found)
+    assert known.sum() >= 9  # the others are small
+    np.testing.assert_allclose(found[known], 4.0)
+    for wrong, pose, said in (
+            (None, left, "image in 'camera', without depth_camera_info"),
+            (info, None, "image in 'camera', without tf"),
+            (CameraInfo(k=info.k, d=[0.1] * 5, distortion_model='plumb_bob'), left, 'distorted'),
+            (CameraInfo(k=info.k, width=9, height=9), left, 'camera_info is for 9x9 px'),
+            (CameraInfo(), left, 'camera_info: K')):
+        assert depths(wrong, pose) is None
+        assert said in caplog.text
 
 
 def test_a_bad_image_is_named(localizer, values):

@@ -38,6 +38,8 @@ _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
 # Four seconds of 30 Hz VGA depth.
 _MAX_DEPTH_BYTES = 72 * 2**20
+# Topics that a frame may lack.
+_OF_DEPTH = ('depth', 'depth_camera_info')
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
 
@@ -174,9 +176,15 @@ class Frame:
     detected_at: float
     #: Depth of about the same time; None where there is none
     depth: Image | CompressedImage | None = None
+    depth_camera_info: CameraInfo | None = None  #: Of a depth camera that is not registered
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
+
+    @property
+    def depth_frame(self) -> str:
+        """Return the coordinate frame of its depth; empty without depth."""
+        return '' if self.depth is None else str(self.depth.header.frame_id)
 
 
 class FrameSource:
@@ -214,13 +222,15 @@ class FrameSource:
         self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
                         'camera_info': 'camera_info', 'detections': 'detections'}
         if depth != 'none':
-            self._topics['depth'] = 'depth' if depth == 'raw' else 'depth/compressedDepth'
+            self._topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
+                             'depth_camera_info': 'depth_camera_info'}
         if camera:
             self._topics = {name: f'{camera}/{topic}' for name, topic in self._topics.items()}
         self._camera = camera
         self._depth_type = Image if depth == 'raw' else CompressedImage
         self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
+        self._depth_camera_info: CameraInfo | None = None
         self._package = detections
         self._detections = detection_type('vision_msgs')
         self._linger_s = linger_s
@@ -309,13 +319,14 @@ class FrameSource:
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
         return [self._silence(name) for name in self._topics
-                if name != 'depth' and self._node.count_publishers(self._resolved(name)) == 0]
+                if name not in _OF_DEPTH
+                and self._node.count_publishers(self._resolved(name)) == 0]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
         with self.changed:
-            for name in self._topics:
+            for name in self._topics.keys() - {'depth_camera_info'}:
                 silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = self._node.count_publishers(self._resolved(name)) == 0
                 if nobody or (self._subscriptions and silent_s > stale_after_s):
@@ -343,7 +354,8 @@ class FrameSource:
         of_topics = {'image': (self._image_type, qos.IMAGE),
                      'camera_info': (CameraInfo, qos.CAMERA_INFO),
                      'detections': (self._detections.message_type, qos.DETECTIONS_IN),
-                     'depth': (self._depth_type, qos.IMAGE)}
+                     'depth': (self._depth_type, qos.IMAGE),
+                     'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
         for name, topic in self._topics.items():
             message_type, profile = of_topics[name]
             self._subscriptions.append(AdaptiveSubscription(
@@ -367,6 +379,8 @@ class FrameSource:
         def receive(msg: Any) -> None:
             if name == 'depth':
                 self._take_depth(msg)
+            elif name == 'depth_camera_info':
+                self._depth_camera_info = msg
             else:
                 self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
         return receive
@@ -407,7 +421,8 @@ class FrameSource:
             detections, detected_at = complete['detections']
             frame = Frame(image, complete['camera_info'][0], detections, received_at,
                           max(received_at, detected_at),
-                          self._depth_at(stamp_ns(image.header.stamp)), self._camera)
+                          self._depth_at(stamp_ns(image.header.stamp)), self._depth_camera_info,
+                          self._camera)
             self._newest = frame
             self.changed.notify_all()
         self._on_frame(frame)
@@ -415,7 +430,7 @@ class FrameSource:
     def why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
         missing = [self._silence(name) for name in self._topics
-                   if name != 'depth' and self._heard_at.get(name, -math.inf) < since]
+                   if name not in _OF_DEPTH and self._heard_at.get(name, -math.inf) < since]
         if missing:
             return '; '.join(missing)
         if self._pairing.outrun:

@@ -4,6 +4,7 @@
 
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,8 @@ class RobotState:
     up_in_camera: NDArray[np.float64] | None = None
     #: None where odometry does not cover the image.
     place: CameraPlace | None = None
+    #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
+    camera_from_depth: NDArray[np.float64] | None = None
 
 
 class RobotStateSource:
@@ -55,7 +58,7 @@ class RobotStateSource:
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
         self._vertical = VerticalSource(node, self.transforms)
-        self._unmounted = ''
+        self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
 
     def open(self) -> None:
         """Subscribe to what the parameters ask for."""
@@ -88,11 +91,12 @@ class RobotStateSource:
         return (self._node.settings.values.fuse_frames > 1
                 and self.odometry.covers_soon(stamp, patience_s))
 
-    def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf
-           ) -> RobotState:
+    def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf,
+           depth_frame: str = '') -> RobotState:
         """Return the robot's state at the stamp of an image.
 
-        Without a vertical, or without odometry, the search does without.
+        Without a vertical, odometry, or the pose of depth in another coordinate frame, the search
+        does without.
 
         While the mount is not known, half of the time until `deadline` (monotonic clock) [s] may
         pass, and half remains for a newer image.
@@ -106,8 +110,12 @@ class RobotStateSource:
                                                        image.frame_id, image.stamp)
         except (NoVerticalError, NoTransformError) as error:
             self._warn(f'localizing without the vertical: {error}')
+        camera_from_depth = None
+        if depth_frame not in ('', image.frame_id):
+            with suppress(NoTransformError):  # what becomes of the depth is said there
+                camera_from_depth = self._lookup(image, depth_frame, parameters)
         return RobotState(camera_from_base, up_in_camera,
-                          self._place(image, parameters, camera_from_base))
+                          self._place(image, parameters, camera_from_base), camera_from_depth)
 
     def _mount(self, image: Header, parameters: RelocalizerParameters, deadline: float
                ) -> NDArray[np.float64]:
@@ -136,13 +144,7 @@ class RobotStateSource:
                 return CameraPlace(body.odom_from_body, body.run, body.way_m)
             camera_from_body = camera_from_base
             if body.body_frame != parameters.base_frame:
-                # do not wait again for a transform that tf2 did not know the last time
-                is_new = self._unmounted != body.body_frame
-                self._unmounted = body.body_frame
-                camera_from_body = self.transforms.lookup(
-                    image.frame_id, body.body_frame, image.stamp,
-                    parameters.tf_timeout_s if is_new else 0.0)
-                self._unmounted = ''
+                camera_from_body = self._lookup(image, body.body_frame, parameters)
         except NoOdometryError as error:
             self._node.get_logger().debug(f'one frame alone: {error}')
             return None
@@ -151,6 +153,15 @@ class RobotStateSource:
             return None
         return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run,
                            body.way_m)
+
+    def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
+                ) -> NDArray[np.float64]:
+        """Return camera_from_frame; do not wait again for one that tf2 did not know."""
+        timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
+        self._unknown.add(frame)
+        found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s)
+        self._unknown.discard(frame)
+        return found
 
     def _warn(self, text: str) -> None:
         self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
