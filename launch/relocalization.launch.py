@@ -4,10 +4,14 @@
 
 # ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
+# Of several cameras, the names of topics follow that of each: front/image_raw and so on.
+# ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
+#     cameras:='[front, left, right]' image:=image_raw base_frame:=base_footprint
 
 from pathlib import Path
 from typing import List  # noqa: UP035  launch knows this form
 
+import yaml
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
@@ -33,10 +37,12 @@ NAMES = {
     'reinitialize_global_localization': "what Nav2's behaviour tree calls; AMCL serves this name, "
                                         'too',
 }
+_OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info')
 # An argument that is not given leaves the choice to the file `parameters`, then to the default.
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'model': 'YOLO weights',
+    'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
     'image_transport': 'raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',
     'use_sim_time': 'true: use the time of /clock',
@@ -46,6 +52,7 @@ RELOCALIZER_PARAMETERS = {
     'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
     'map_files': 'instead of map_file, the maps of several floors: [ground.yaml, first.yaml]',
     'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
+    'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
     'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
     'mode': 'on_request or continuous',
@@ -64,7 +71,7 @@ OTHERS = {
     'log_level': ('info', 'debug, info, warn or error'),
 }
 _TRUTH_VALUES = ('autostart', 'use_sim_time')
-_LISTS = ('map_files',)
+_LISTS = ('map_files', 'cameras')
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -80,9 +87,24 @@ def _nodes(context: LaunchContext) -> list[Node]:
     """Return the nodes with the parameters that are given."""
     check_parameter_file(context.launch_configurations['parameters'])
     given = {name for name, value in context.launch_configurations.items() if value}
-    return [_node('detector', given & DETECTOR_PARAMETERS.keys(), given,
+    cameras = yaml.safe_load(context.launch_configurations['cameras'] or '[]')
+    topics = _topics(cameras)
+    return [_node('detector', given & DETECTOR_PARAMETERS.keys(), given, topics,
                   condition=IfCondition(LaunchConfiguration('detector'))),
-            _node('relocalizer', given & RELOCALIZER_PARAMETERS.keys(), given)]
+            _node('relocalizer', given & RELOCALIZER_PARAMETERS.keys(), given, topics)]
+
+
+def _topics(cameras: list[str]) -> list[tuple[str, list]]:
+    """Return the remappings of all topics, those of each camera in its namespace."""
+    remapped = []
+    for name in NAMES:
+        for prefix in [f'{one}/' for one in cameras] if cameras and name in _OF_CAMERA else ['']:
+            given = [prefix, LaunchConfiguration(name)]
+            remapped.append((prefix + name, given))
+            if name in ('image', 'depth'):
+                transport = '/compressed' if name == 'image' else '/compressedDepth'
+                remapped.append((prefix + name + transport, [*given, transport]))
+    return remapped
 
 
 def check_parameter_file(path: str) -> None:
@@ -98,18 +120,16 @@ def _type_of(parameter: str) -> type:
     return bool if parameter in _TRUTH_VALUES else str
 
 
-def _node(name: str, parameters: set[str], given: set[str], **keywords) -> Node:
+def _node(name: str, parameters: set[str], given: set[str], topics: list[tuple[str, list]],
+          **keywords) -> Node:
     files = [ParameterFile(LaunchConfiguration('parameters'))] if 'parameters' in given else []
     changes = {one: ParameterValue(LaunchConfiguration(one),
                                    value_type=_type_of(one))
                for one in sorted(parameters)}
-    tf, image, depth = map(LaunchConfiguration, ('tf', 'image', 'depth'))
+    tf = LaunchConfiguration('tf')
     return Node(
         package='cliploc_ros', executable=name, name=name, output='screen',
         namespace=LaunchConfiguration('namespace'),
         parameters=[*files, *([changes] if changes else [])],
-        remappings=[*((topic, LaunchConfiguration(topic)) for topic in NAMES),
-                    ('image/compressed', [image, '/compressed']),
-                    ('depth/compressedDepth', [depth, '/compressedDepth']),
-                    ('/tf', tf), ('/tf_static', [tf, '_static'])],
+        remappings=[*topics, ('/tf', tf), ('/tf_static', [tf, '_static'])],
         ros_arguments=['--log-level', LaunchConfiguration('log_level')], **keywords)

@@ -5,6 +5,8 @@
 import math
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
@@ -16,37 +18,47 @@ from cliploc_ros.models.profiles import load_detector, with_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage
+from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage, of_camera
+from cliploc_ros.ros.inputs.rig import NewestInstant
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
-from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
 
 
+class _Camera:
+    """The images of a camera, and what is published of them."""
+
+    def __init__(self, node: ManagedNode[DetectorParameters], name: str, newest: NewestInstant,
+                 on_match: Callable[[], None]) -> None:
+        self.images = ImageSource(node, node.settings.values.image_transport,
+                                  partial(newest.offer, name), name)
+        self.publisher = node.create_publisher(
+            Detection2DArray, of_camera(name, 'detections'), qos.DETECTIONS_OUT,
+            event_callbacks=PublisherEventCallbacks(matched=lambda _: on_match()),
+            qos_overriding_options=qos.overridable())
+        self.published = 0
+        self.rates = Rates()
+
+
 class DetectorNode(ManagedNode[DetectorParameters]):
-    """Publishes what a YOLO network detects in the newest image."""
+    """Publishes what a YOLO network detects in the newest image of each camera."""
 
     def __init__(self) -> None:
         super().__init__('detector', DetectorParameters, RelocalizerParameters)
         self._detector: ObjectDetector | None = None
-        self._newest: LatestOnly[TimedImage] = LatestOnly(self.worker, self._detect)
-        self._images = ImageSource(self, self.settings.values.image_transport, self._newest.offer)
-        self._published = 0
-        self._last_error = ''
-        self._rates = Rates()
         # The node opens in one thread; subscribers match in another.
         self._lock = threading.Lock()
         self._open = False
+        self._newest = NewestInstant(self.worker, self._detect)
+        self._cameras = {name: _Camera(self, name, self._newest, self._update)
+                         for name in self.settings.values.camera_names or ('',)}
+        self._last_error = ''
         # Since when boxes are awaited (monotonic clock) [s], and how long the first ones took.
         self._awaited_since = math.inf
         self._first_boxes_s: float | None = None
-        self._publisher = self.create_publisher(
-            Detection2DArray, 'detections', qos.DETECTIONS_OUT,
-            event_callbacks=PublisherEventCallbacks(matched=lambda _: self._update()),
-            qos_overriding_options=qos.overridable())
 
     def load(self) -> str:
         """Load the network."""
@@ -76,35 +88,39 @@ class DetectorNode(ManagedNode[DetectorParameters]):
 
     def examine(self, health: Health) -> None:
         """Report the input, rates, what was dropped, and the device."""
-        self._images.examine(health, self.settings.values.stale_after_s)
+        for name, camera in self._cameras.items():
+            own = Health()
+            camera.images.examine(own, self.settings.values.stale_after_s)
+            rates = camera.rates.update({'image': camera.images.received,
+                                         'detections': camera.published})
+            own.values |= {f'{topic} rate [Hz]': f'{rate:.1f}' for topic, rate in rates.items()}
+            own.values['listened to'] = camera.images.is_open
+            health.add(own, name)
         if self._last_error:
             health.warn(self._last_error)
-        waiting = self._newest.waiting
-        age_s = time.monotonic() - waiting.received_at if waiting else 0.0
-        rates = self._rates.update({'image': self._images.received,
-                                    'detections': self._published})
-        health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
-        health.values |= {'listened to': self._images.is_open,
-                          'images dropped': self._newest.dropped,
-                          'queue age [s]': f'{age_s:.2f}'}
+        since = self._newest.waiting_since
+        health.values |= {'images dropped': self._newest.dropped, 'queue age [s]':
+                          f'{0.0 if since is None else time.monotonic() - since:.2f}'}
         if self._first_boxes_s is not None:
             health.values['first boxes after [s]'] = f'{self._first_boxes_s:.2f}'
         if self._detector is not None:
             health.values['device'] = self._detector.device
 
     def _update(self) -> None:
-        """Subscribe to images exactly while the node is open and detections have a subscriber."""
+        """Subscribe to the images of each camera whose detections have a subscriber."""
         with self._lock:
-            if self._open and self._publisher.get_subscription_count() > 0:
-                if not self._images.is_open:
-                    self._awaited_since = time.monotonic()
-                self._images.open()
-            else:
-                self._images.close()
+            for camera in self._cameras.values():
+                if self._open and camera.publisher.get_subscription_count() > 0:
+                    if not any(one.images.is_open for one in self._cameras.values()):
+                        self._awaited_since = time.monotonic()
+                    camera.images.open()
+                else:
+                    camera.images.close()
 
-    def _detect(self, image: TimedImage) -> None:
+    def _detect(self, name: str, image: TimedImage) -> None:
         """Detect objects in one image and publish them; in the worker's thread."""
-        if not self.active or self._detector is None or not self._images.is_open:
+        camera = self._cameras[name]
+        if not self.active or self._detector is None or not camera.images.is_open:
             return  # deactivated, or the last subscriber left, while the image waited
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
@@ -120,8 +136,8 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._last_error = ''
         self.stages.add(times.ms)
         if self.active:
-            self._published += 1
-            self._publisher.publish(detections_to_msg(detections, image.msg.header))
+            camera.published += 1
+            camera.publisher.publish(detections_to_msg(detections, image.msg.header))
             if self._awaited_since < math.inf:
                 self._first_boxes_s = time.monotonic() - self._awaited_since
                 self._awaited_since = math.inf

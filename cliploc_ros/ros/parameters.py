@@ -3,6 +3,7 @@
 """Every parameter of the two nodes, and the method's options made from them."""
 
 import math
+import re
 from dataclasses import dataclass, replace
 from itertools import batched
 from typing import Any
@@ -45,9 +46,26 @@ class CommonParameters(Parameters):
         'empty: ~/.cache/cliploc_ros.', read_only=True)
     image_transport: str = parameter('raw',
         "Subscribe to 'image' or to 'image/compressed'.", choices=TRANSPORTS, read_only=True)
+    cameras: list[str] = parameter([''],
+        'Names of several cameras, the namespaces of their topics; empty: one camera.',
+        read_only=True)
     stale_after_s: float = parameter(2.0,
         'The diagnostics warn of an input that is silent for longer.', unit='s', low=0.1,
         high=3600.0)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Return the names of several cameras; none where there is one."""
+        return tuple(name for name in self.cameras if name)
+
+    def check(self) -> None:
+        """Raise OptionsError where values do not fit together; the message names the parameter."""
+        names = self.camera_names
+        if len(set(names)) < len(names):
+            raise OptionsError(f'cameras: a name is given twice: {", ".join(names)}')
+        for name in names:
+            if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*', name):
+                raise OptionsError(f"cameras: '{name}' is no namespace of topics")
 
 
 @dataclass(frozen=True)
@@ -128,9 +146,6 @@ class RelocalizerParameters(CommonParameters):
     detections_type: str = parameter('vision_msgs',
         'Package of the type of detections: vision_msgs/Detection2DArray or '
         'yolo_msgs/DetectionArray (yolo_ros).', choices=DETECTION_TYPES, read_only=True)
-    cameras: list[str] = parameter([''],
-        'Names of several cameras, the namespaces of their topics image, camera_info, detections '
-        'and depth; empty: one camera.', read_only=True)
     sync_tolerance_s: float = parameter(0.05,
         'Images of several cameras within this time are of one instant.', unit='s', low=0.0,
         high=1.0, read_only=True)
@@ -198,11 +213,6 @@ class RelocalizerParameters(CommonParameters):
         "Wait this long for a transform at the image's stamp. A request waits for the camera's "
         'mount on base_frame until timeout_s.', unit='s', low=0.0, high=60.0)
 
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """Return the names of several cameras; none where there is one."""
-        return tuple(name for name in self.cameras if name)
-
     def of_camera(self, name: str) -> 'RelocalizerParameters':
         """Return the parameters with the mount of one of several cameras."""
         if len(self.base_from_camera) == 7 or not name:
@@ -212,6 +222,7 @@ class RelocalizerParameters(CommonParameters):
 
     def check(self) -> None:
         """Raise OptionsError where values do not fit together; the message names the parameter."""
+        super().check()
         if len(self.base_from_camera) not in (7, 7 * len(self.camera_names)):
             raise OptionsError('base_from_camera: needs 7 numbers, or 7 for each of the cameras')
         for mount in batched(self.base_from_camera, 7):
@@ -220,10 +231,7 @@ class RelocalizerParameters(CommonParameters):
                     f'base_from_camera: the quaternion {[*mount[3:]]} is not of unit length')
         if self.gravity == 'base_frame' and not self.base_frame:
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
-        names = self.camera_names
-        if len(set(names)) < len(names):
-            raise OptionsError(f'cameras: a name is given twice: {", ".join(names)}')
-        if names and not self.base_frame:
+        if self.camera_names and not self.base_frame:
             raise OptionsError('cameras: needs base_frame')
         if len(self.mount_deviation) != 2 or not all(
                 0.0 <= one < math.inf for one in self.mount_deviation):

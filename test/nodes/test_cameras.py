@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from cameras import MAP, MOUNTS, NAMES, look
-from processes import wait_for
+from processes import PROJECT, wait_for
 from scene import CAMERA, write_map
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
@@ -129,3 +129,37 @@ def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, wor
 ])
 def test_parameters_that_do_not_fit_are_named(own_relocalizer, given, named):
     own_relocalizer(expect=named, **given)
+
+
+def test_one_detector_serves_all_cameras_in_turn(start, tester):
+    """With one network: images of one instant, more of them than it can look at."""
+    process = start('nodes.detector', parameters={
+        'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'cameras': list(NAMES)})
+    process.wait_for_output('ready after')
+    publishers = {name: tester.create_publisher(Image, f'{name}/image', RELIABLE)
+                  for name in NAMES}
+    heard = {name: [] for name in NAMES[:3]}  # nobody listens to the last one
+    subscriptions = [tester.create_subscription(Detection2DArray, f'{name}/detections',
+                                                heard[name].append, 10) for name in heard]
+    sent = 0
+
+    def work():
+        nonlocal sent
+        sent += 1
+        for name, publisher in publishers.items():
+            image = Image(header=Header(frame_id=name), width=320, height=240, encoding='mono8',
+                          step=320, data=bytes(320 * 240))
+            image.header.stamp.sec = sent
+            publisher.publish(image)
+        tester.spin()
+    try:
+        wait_for(lambda: min(map(len, heard.values())) >= 4, 'detections of all', work=work)
+    finally:
+        for one in subscriptions:
+            tester.destroy_subscription(one)
+        for one in publishers.values():
+            tester.destroy_publisher(one)
+    stamps = [{msg.header.stamp.sec for msg in messages} for messages in heard.values()]
+    assert {msg.header.frame_id for msg in heard['left']} == {'left'}
+    assert len(set.intersection(*stamps)) >= 3, f'of the same instants: {stamps}'
+    assert 'Traceback' not in process.output()

@@ -224,8 +224,7 @@ class FrameSource:
         if depth != 'none':
             self._topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
                              'depth_camera_info': 'depth_camera_info'}
-        if camera:
-            self._topics = {name: f'{camera}/{topic}' for name, topic in self._topics.items()}
+        self._topics = {name: of_camera(camera, topic) for name, topic in self._topics.items()}
         self._camera = camera
         self._depth_type = Image if depth == 'raw' else CompressedImage
         self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
@@ -485,6 +484,11 @@ def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float) -
         return frame
 
 
+def of_camera(camera: str, topic: str) -> str:
+    """Return the topic of one of several cameras; that of the only one has no name."""
+    return f'{camera}/{topic}' if camera else topic
+
+
 class TimedImage(NamedTuple):
     """An image, and when it arrived (monotonic clock) [s]."""
 
@@ -495,14 +499,15 @@ class TimedImage(NamedTuple):
 class ImageSource:
     """Subscribes to images, 'raw' or 'compressed', while it is open.
 
-    `on_image` takes each TimedImage, in the executor's thread.
+    `on_image` takes each TimedImage, in the executor's thread. `camera` is the namespace of the
+    topic.
     """
 
-    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None]
-                 ) -> None:
+    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None],
+                 camera: str = '') -> None:
         self._node = node
         self._type = Image if transport == 'raw' else CompressedImage
-        self._name = 'image' if transport == 'raw' else 'image/compressed'
+        self._name = of_camera(camera, 'image' if transport == 'raw' else 'image/compressed')
         self._on_image = on_image
         self._subscription: AdaptiveSubscription | None = None
         self._heard_at = 0.0

@@ -4,14 +4,16 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
 from rclpy.node import Node
 
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, next_of_any
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, TimedImage, next_of_any
 from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.worker import LatestOnly, Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
@@ -81,8 +83,7 @@ class Rig:
         for name, source in self._sources.items():
             own = Health()
             source.examine(own, stale_after_s)
-            health.problems += own.problems
-            health.values |= {f'{name}: {value}': figure for value, figure in own.values.items()}
+            health.add(own, name)
 
     def _take(self, frame: Frame) -> None:
         """Pass on an instant with its first camera's frame."""
@@ -101,6 +102,63 @@ class Rig:
         left_out = tuple(name for name in self._sources if name not in {
             one.camera for one in near})
         return replace(near[0], beside=tuple(near[1:]), left_out=left_out)
+
+
+class NewestInstant:
+    """Passes images of several cameras to a worker: one of each, as near in time as they come.
+
+    While the worker is busy, the two newest images of each camera wait: the newest may be of an
+    instant that other cameras have not delivered yet.
+
+    Parameters
+    ----------
+    work : callable
+        Takes the name of a camera and an image, in the worker's thread.
+    """
+
+    def __init__(self, worker: Worker, work: Callable[[str, TimedImage], None]) -> None:
+        self._work = work
+        self._lock = threading.Lock()
+        self._waiting: dict[str, deque[TimedImage]] = {}
+        self._signal = LatestOnly(worker, self._take)
+        self.dropped = 0
+
+    @property
+    def waiting_since(self) -> float | None:
+        """Return when the oldest image that waits arrived (monotonic clock) [s]."""
+        with self._lock:
+            return min((one.received_at for images in self._waiting.values() for one in images),
+                       default=None)
+
+    def offer(self, camera: str, image: TimedImage) -> None:
+        """Queue an image of a camera."""
+        with self._lock:
+            images = self._waiting.setdefault(camera, deque())
+            images.append(image)
+            if len(images) > 2:
+                images.popleft()
+                self.dropped += 1
+        self._signal.offer(camera)
+
+    def _take(self, camera: str) -> None:
+        """Work on the newest instant that all cameras with an image have."""
+        with self._lock:
+            waiting = {name: images for name, images in self._waiting.items() if images}
+            newest_ns = min(_image_ns(images[-1]) for images in waiting.values())
+            taken = {}
+            for name, images in waiting.items():
+                taken[name] = min(images, key=lambda one: abs(_image_ns(one) - newest_ns))
+                while images.popleft() is not taken[name]:
+                    self.dropped += 1
+            more = any(waiting.values())
+        for name, image in taken.items():
+            self._work(name, image)
+        if more:
+            self._signal.offer(camera)
+
+
+def _image_ns(image: TimedImage) -> int:
+    return stamp_ns(image.msg.header.stamp)
 
 
 def _stamp_ns(frame: Frame) -> int:

@@ -43,6 +43,12 @@ class Health:
         """Add a problem that the user must fix."""
         self.problems.append((DiagnosticStatus.ERROR, problem))
 
+    def add(self, part: 'Health', name: str) -> None:
+        """Add the problems of a part, and its figures below its name."""
+        self.problems += part.problems
+        self.values |= {f'{name}: {value}' if name else value: figure
+                        for value, figure in part.values.items()}
+
     @property
     def level(self) -> bytes:
         """Return the worst level."""

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images of several cameras, of one instant for a detector that cannot look at all of them."""
+
+import threading
+
+import pytest
+from builtin_interfaces.msg import Time
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from cliploc_ros.ros.inputs.frame_source import TimedImage
+from cliploc_ros.ros.inputs.rig import NewestInstant
+from cliploc_ros.ros.node.worker import Worker
+
+PATIENCE_S = 60.0
+
+
+def image(stamp):
+    return TimedImage(Image(header=Header(stamp=Time(sec=stamp))), float(stamp))
+
+
+def shown_to_a_busy_worker(offers):
+    """What a worker sees of images that come while it is busy with another one."""
+    worker, seen = Worker(print), []
+    entered, gate = threading.Event(), threading.Event()
+
+    def work(camera, one):
+        seen.append((camera, one.msg.header.stamp.sec))
+        entered.set()
+        gate.wait(PATIENCE_S)
+    newest = NewestInstant(worker, work)
+    newest.offer('first', image(0))
+    assert entered.wait(PATIENCE_S)
+    for camera, stamp in offers:
+        newest.offer(camera, image(stamp))
+    since = newest.waiting_since
+    gate.set()
+    for _ in range(3):
+        worker.run(lambda: None)
+    worker.stop()
+    assert newest.waiting_since is None
+    return seen[1:], newest.dropped, since
+
+
+@pytest.mark.parametrize(('offers', 'expected', 'dropped'), [
+    # the newest instant that both have, then what is left
+    ([('a', 1), ('b', 1), ('a', 2)], [('a', 1), ('b', 1), ('a', 2)], 0),
+    ([('a', 1), ('b', 1), ('a', 2), ('b', 2)], [('a', 2), ('b', 2)], 2),
+    ([('a', 1), ('a', 2), ('a', 3)], [('a', 3)], 2),
+    # a camera that is late does not hold the others back
+    ([('a', 8), ('a', 9), ('b', 3)], [('a', 8), ('b', 3), ('a', 9)], 0),
+    ([('b', 5), ('a', 1)], [('b', 5), ('a', 1)], 0),
+])
+def test_images_of_one_instant_come_together(offers, expected, dropped):
+    seen, lost, since = shown_to_a_busy_worker(offers)
+    assert (seen, lost) == (expected, dropped)
+    assert since is not None
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from('abc'), st.integers(0, 9)), max_size=30))
+def test_every_image_is_seen_or_counted(offers):
+    seen, dropped, _ = shown_to_a_busy_worker(offers)
+    assert len(seen) + dropped == len(offers)
+    for camera in 'abc':
+        if mine := [stamp for name, stamp in offers if name == camera]:
+            assert mine[-1] in [stamp for name, stamp in seen if name == camera]
