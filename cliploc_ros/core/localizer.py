@@ -29,6 +29,7 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.acceptance.mount_check import MountCheck
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
@@ -230,6 +231,7 @@ class Localizer:
         self.observation: Observation | None = None
         #: Depth is not used any more once it is wrong.
         self.depth_scale = DepthScale()
+        self.mounts = MountCheck()
 
     def localize(self, observation: Observation, run: int | None = 0, limit: int = 1,
                  length_s: float = 0.0, crops: Crops | None = None,
@@ -271,6 +273,10 @@ class Localizer:
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
+        if others and found.matched:
+            seen, index = [*others, observation], self._relocalizer.landmark_map.classes
+            self.mounts.add(seen, [int(index.are_own(index.classes_of(
+                one.detections.class_ids)).sum()) for one in seen], found.matched[-len(seen):])
         return found
 
     def _localize(self, observation: Observation, run: int | None, limit: int, length_s: float,

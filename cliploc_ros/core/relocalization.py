@@ -39,6 +39,7 @@ class Relocalization:
     #: The best distinct hypotheses, best first; empty when nothing was found
     hypotheses: tuple[Hypothesis, ...] = ()
     matches: tuple[Match, ...] = ()  #: Inliers of the best hypothesis in the newest frame
+    matched: tuple[int, ...] = ()  #: Number of its inliers in each frame; empty without a pose
     #: Evidence for the best hypothesis, which decided; None when nothing was found
     evidence: Evidence | None = None
     #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was

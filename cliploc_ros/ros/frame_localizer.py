@@ -239,6 +239,9 @@ class FrameLocalizer:
         found = localizer.localize(
             observation, run, parameters.fuse_frames, parameters.fuse_window_s, crops, recognizer,
             [replace(one, stamp_ns=observation.stamp_ns) for one in others])
+        for name in localizer.mounts.wrong:
+            self._note(f'what {name} sees does not fit the other cameras: check its mount, '
+                       'camera_info and image')
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())

@@ -88,3 +88,27 @@ def test_a_camera_that_is_late_is_left_out(rng, missing):
     found = Localizer(Relocalizer(MAP, OPTIONS)).localize(last, None, others=others)
     assert found.accepted
     assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3
+
+
+@pytest.mark.parametrize(('turned_deg', 'objects', 'wrong'), [
+    (0.0, 3, []), (2.0, 5, []), (5.0, 5, ['left']), (60.0, 3, ['left']), (180.0, 5, ['left'])])
+def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects, wrong):
+    localizer, mounts = Localizer(Relocalizer(MAP, OPTIONS)), list(MOUNTS)
+    mounts[1] = mounts[1] @ make_transform(
+        Rotation.from_euler('y', turned_deg, degrees=True).as_matrix(), np.zeros(3))
+    for number in range(8):
+        assert not localizer.mounts.wrong or number >= 5
+        *others, last = look(rng, objects=objects, mounts=mounts)
+        found = localizer.localize(last, run=None, others=others)
+        assert found.accepted
+        assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3
+    assert localizer.mounts.wrong == wrong
+
+
+def test_a_covered_camera_has_no_wrong_mount(rng):
+    localizer = Localizer(Relocalizer(MAP, OPTIONS))
+    for _ in range(8):
+        covered, *others, last = look(rng)
+        covered = replace(covered, detections=covered.detections.select(np.empty(0, np.int64)))
+        assert localizer.localize(last, run=None, others=[covered, *others]).accepted
+    assert localizer.mounts.wrong == []

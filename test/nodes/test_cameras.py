@@ -15,7 +15,7 @@ from tester import RELIABLE, transform_of
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
@@ -44,8 +44,8 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
     tester.connect()
     rng = np.random.default_rng(4)
 
-    def publish(number, working, late_s):
-        for name, seen in zip(NAMES, look(rng), strict=True):
+    def publish(number, working, late_s, mounts):
+        for name, seen in zip(NAMES, look(rng, mounts=mounts), strict=True):
             if name not in working:
                 continue
             header = Header(frame_id=f'{name}_optical')
@@ -61,13 +61,13 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
                           data=bytes(CAMERA.width * CAMERA.height))):
                 publishers[name][type(msg)].publish(msg)
 
-    def ask(working=NAMES, late_s=None):
+    def ask(working=NAMES, late_s=None, mounts=MOUNTS):
         future, number = tester.ask(), 0
 
         def work():
             nonlocal number
             number += 1
-            publish(number, working, late_s or {})
+            publish(number, working, late_s or {}, mounts)
             for _ in range(4):
                 tester.spin()
         wait_for(future.done, 'an answer', work=work)
@@ -94,6 +94,18 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[-1].pose.pose), np.eye(4))[0] < 0.3
     assert 'Traceback' not in process.output()
+
+
+def test_a_mount_that_contradicts_the_others_is_named(four_cameras):
+    process, ask = four_cameras
+    turned = make_transform(Rotation.from_euler('y', 60.0, degrees=True).as_matrix(), np.zeros(3))
+    mounts = [MOUNTS[0], MOUNTS[1] @ turned, *MOUNTS[2:]]
+    said = 'what left sees does not fit the other cameras: check its mount'
+    for _ in range(30):
+        ask(mounts=mounts)
+        if said in process.output():
+            break
+    assert process.output().count(said) == 1
 
 
 def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,

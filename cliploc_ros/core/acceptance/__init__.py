@@ -18,6 +18,8 @@ look_alikes, mirror, genuine
     Other reasons to be wrong: a place that looks alike, a mirror image, a picture or a change.
 looks
     The earlier looks of a moving robot.
+mount_check
+    Whether several cameras are mounted as stated.
 verdict
     Accept or refuse, with the reason.
 calibration
