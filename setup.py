@@ -56,7 +56,7 @@ setup(
         # By name: evaluate and build_map put files of their own beside a recording.
         f'{PACKAGE}.demo': [
             'assets/clip.*', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
-            'assets/*/rgb/*.jpg',
+            'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],

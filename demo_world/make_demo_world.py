@@ -4,19 +4,28 @@
 
 No model was trained on this room. The true map comes from the true boxes of a walk around its
 centre. The mapping walk yields the images to build a map from. Then some objects move and the
-light changes, and another walk yields the images of the wake-ups.
+light changes, and other walks yield the images of the wake-ups: of one camera, and of four.
 """
 
 import argparse
+import json
 from pathlib import Path
 
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from demo_world.appearance import CLASSES
 from demo_world.recording import record, write_fitted_map
 from demo_world.renderer import Light, Renderer
-from demo_world.room import make_room, move_objects
-from demo_world.trajectories import CAMERA, mapping_walk, query_walk, true_map_walk
+from demo_world.room import Room, make_room, move_objects
+from demo_world.trajectories import (
+    CAMERA,
+    mapping_walk,
+    query_walk,
+    rig_mounts,
+    rig_walk,
+    true_map_walk,
+)
 
 #: Not among the seeds of the training worlds, which start at 1000.
 SEED = 7
@@ -40,6 +49,20 @@ def make_demo_world(folder: Path, images: int, mapping_images: int, seed: int = 
     with tqdm(total=images, desc='waking up', unit='image') as bar:
         record(folder / 'sequence', later, Renderer(later, CAMERA, _QUERY_LIGHT),
                query_walk(images), seed=seed + 2, rate_hz=2.0, advance=bar.update)
+    make_rig(folder / 'rig', later, seed + 3)
+
+
+def make_rig(folder: Path, room: Room, seed: int) -> None:
+    """Write what the cameras of a rig see (NAME/), and how they are mounted (mounts.json)."""
+    mounts, poses = rig_mounts(), rig_walk()
+    renderer = Renderer(room, CAMERA, _QUERY_LIGHT)
+    with tqdm(total=len(mounts) * len(poses), desc='four cameras', unit='image') as bar:
+        for number, (name, mount) in enumerate(mounts.items()):
+            record(folder / name, room, renderer, poses @ mount, seed=seed + number,
+                   advance=bar.update)
+    (folder / 'mounts.json').write_text(json.dumps({name: [
+        *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat()]
+        for name, mount in mounts.items()}))
 
 
 def main() -> None:

@@ -5,8 +5,10 @@
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
 from demo_world.room import LENGTH_M, WIDTH_M, Room
 
 #: Pixel centres have integer coordinates, as everywhere in the package.
@@ -87,6 +89,26 @@ def mapping_walk(count: int) -> npt.NDArray[np.float64]:
              (2.9, 4.6, 0.75), (2.8, 4.6, 0.75), (2.6, 4.6, 0.75), (1.0, 4.8, 0.9),
              (0.2, 3.4, 1.0), (0.2, 3.1, 1.1), (0.2, 2.9, 1.0), (0.2, 2.7, 1.1)]
     return walk(count, eyes, gazes)
+
+
+#: The cameras of a robot that does not turn: how far each looks to the right of the first [deg].
+RIG_DEG = {'front': 0.0, 'left': -90.0, 'back': 180.0, 'right': 90.0}
+
+
+def rig_mounts() -> dict[str, npt.NDArray[np.float64]]:
+    """Return front_from_camera (4, 4) of each camera of a rig, 15 cm around its middle."""
+    mounts = {}
+    for name, turn_deg in RIG_DEG.items():
+        rotation = Rotation.from_euler('y', turn_deg, degrees=True).as_matrix()
+        mounts[name] = make_transform(rotation, rotation @ [0.0, 0.0, 0.15] - [0.0, 0.0, 0.15])
+    return mounts
+
+
+def rig_walk() -> npt.NDArray[np.float64]:
+    """Return poses (n, 4, 4) of a rig's front camera, which looks in one direction all the way."""
+    eyes = np.array([(1.6, 2.0, 1.2), (2.2, 2.6, 1.2), (2.9, 3.1, 1.2), (3.5, 2.4, 1.2),
+                     (4.1, 1.9, 1.2), (4.4, 2.9, 1.2)])
+    return np.array([look_at(eye, eye + np.array([0.9, 0.4, 0.0])) for eye in eyes])
 
 
 def query_walk(count: int) -> npt.NDArray[np.float64]:

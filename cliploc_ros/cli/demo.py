@@ -48,6 +48,9 @@ def make_parser() -> argparse.ArgumentParser:
         '--map', action='store_true',
         help="build the map from the assets' mapping walk (mapping/), and wake up in it")
     parser.add_argument(
+        '--cameras', type=int, choices=(1, 4), default=1,
+        help='4: a robot that looks in four directions at once and does not turn (default: 1)')
+    parser.add_argument(
         '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
     return parser
 
@@ -59,7 +62,8 @@ def demonstrate(options: argparse.Namespace) -> int:
     from cliploc_ros.demo.run import DemoOptions, run_demo
 
     chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
-                         rate=options.rate, method=options.method, rviz=options.rviz)
+                         rate=options.rate, method=options.method, rviz=options.rviz,
+                         has_rig=options.cameras > 1)
     if options.map:
         from cliploc_ros.demo.map_demo import run_map_demo
 

@@ -273,10 +273,11 @@ class Localizer:
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
-        if others and found.matched:
+        if others and found.frame_matches:
             seen, index = [*others, observation], self._relocalizer.landmark_map.classes
             self.mounts.add(seen, [int(index.are_own(index.classes_of(
-                one.detections.class_ids)).sum()) for one in seen], found.matched[-len(seen):])
+                one.detections.class_ids)).sum()) for one in seen], [
+                    len(one) for one in found.frame_matches[-len(seen):]])
         return found
 
     def _localize(self, observation: Observation, run: int | None, limit: int, length_s: float,

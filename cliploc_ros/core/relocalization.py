@@ -38,8 +38,8 @@ class Relocalization:
     reason: str  #: Reason of a refusal, in one line; empty when accepted
     #: The best distinct hypotheses, best first; empty when nothing was found
     hypotheses: tuple[Hypothesis, ...] = ()
-    matches: tuple[Match, ...] = ()  #: Inliers of the best hypothesis in the newest frame
-    matched: tuple[int, ...] = ()  #: Number of its inliers in each frame; empty without a pose
+    #: Inliers of the best hypothesis in each frame, the newest last; empty when nothing was found
+    frame_matches: tuple[tuple[Match, ...], ...] = ()
     #: Evidence for the best hypothesis, which decided; None when nothing was found
     evidence: Evidence | None = None
     #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was
@@ -58,6 +58,11 @@ class Relocalization:
     recognition: Recognition | None = None
     #: Whether the depths of the objects can be right; None without depth
     depth: DepthCheck | None = None
+
+    @property
+    def matches(self) -> tuple[Match, ...]:
+        """Return the inliers of the best hypothesis in the newest frame."""
+        return self.frame_matches[-1] if self.frame_matches else ()
 
     @property
     def recognized(self) -> RecognizedPlace | None:
@@ -105,5 +110,6 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
         hypotheses=tuple(replace(one, map_from_camera=place.map_from_camera)
                          for one, place in zip(found.hypotheses, places, strict=True)
                          if place.name == name),
-        matches=tuple(replace(one, landmark=one.landmark - part.first)
-                      for one in found.matches if one.landmark in rows)), part
+        frame_matches=tuple(tuple(replace(one, landmark=one.landmark - part.first)
+                                  for one in of_frame if one.landmark in rows)
+                            for of_frame in found.frame_matches)), part

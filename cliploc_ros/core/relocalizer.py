@@ -165,8 +165,7 @@ class Relocalizer:
         return Relocalization(
             accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
-            hypotheses=_hypotheses(pose, compared, evidence), matches=shown.matches[-1],
-            matched=tuple(map(len, shown.matches)),
+            hypotheses=_hypotheses(pose, compared, evidence), frame_matches=tuple(shown.matches),
             evidence=evidence, covariance=covariance, tried=_tried(frames),
             best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,

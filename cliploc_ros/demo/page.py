@@ -50,6 +50,13 @@ renderer drew there. A ✗ can also mean that the object was moved after mapping
 map.</p>"""
 
 
+def rig_section(cameras: Sequence[str], alone: int, count: int) -> str:
+    """Return what the page says of several cameras: how many are accepted with the first alone."""
+    return (f'<p class="note">The robot has {len(cameras)} cameras, {escape(", ".join(cameras))}, '
+            'and does not turn. Its pose is that of the first. With the first alone, '
+            f'{alone} of {count} wake-ups would be accepted.</p>')
+
+
 def picture_name(judged: Judged) -> str:
     """Return the file name of a wake-up's picture."""
     return PICTURES.replace('??', f'{judged.number:02d}')

@@ -37,16 +37,22 @@ _HEADING_M = 0.28
 
 def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     """Draw the camera image with boxes and projected landmarks, and list the matches beside it."""
-    figure = Figure(figsize=(14.0, 6.9), dpi=_DPI)
-    judged, wake_up = review.judged, review.judged.wake_up
-    figure.text(0.008, 0.945, f'Wake-up {judged.number}: {judged.verdict}', fontsize=15,
+    figure = Figure(figsize=(14.0, 11.3 if review.beside else 6.9), dpi=_DPI)
+    judged, wake_up, top = review.judged, review.judged.wake_up, 0.965 if review.beside else 0.945
+    figure.text(0.008, top, f'Wake-up {judged.number}: {judged.verdict}', fontsize=15,
                 color=ACCEPTED if wake_up.accepted else REFUSED, fontweight='bold')
-    figure.text(0.992, 0.945, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
+    figure.text(0.992, top, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
                 fontsize=11, ha='right')
-    # a number for the row of each detection, from left to right
-    order = np.argsort(review.detections.bboxes_xyxy[:, [0, 2]].sum(axis=1), kind='stable')
-    numbers = {int(row): number for number, row in enumerate(order, start=1)}
-    _draw_image(figure.add_axes((0.008, 0.075, 0.552, 0.84)), review, landmark_map, numbers)
+    numbers = _numbers(review)
+    if review.beside:
+        views = {review.camera_name: review, **review.beside}
+        for place, (name, one) in enumerate(views.items()):
+            axes = figure.add_axes((0.008 + 0.496 * (place % 2), 0.48 - 0.45 * (place // 2),
+                                    0.488, 0.425))
+            _draw_image(axes, one, landmark_map, _numbers(one))
+            axes.set_title(name, loc='left', fontsize=10, pad=3)
+    else:
+        _draw_image(figure.add_axes((0.008, 0.075, 0.552, 0.84)), review, landmark_map, numbers)
     figure.legend(loc='lower left', bbox_to_anchor=(0.0, 0.0), ncol=4, frameon=False, fontsize=9,
                   handles=[
         Line2D([], [], color=_BOX, linewidth=2, label='box with its landmark'),
@@ -54,11 +60,20 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
         Line2D([], [], color=_ELLIPSE, linewidth=2, label='matched landmark, projected'),
         Line2D([], [], color='#B8A800', linewidth=1.5, linestyle=':',
                label='any other landmark of the map')])
+    if review.beside:
+        figure.savefig(path)
+        return
     panel = figure.add_axes((0.572, 0.03, 0.42, 0.885))
     panel.set_axis_off()
     panel.set(xlim=(0, 1), ylim=(_MOST_ROWS, -1))
     _list_matches(panel, review, landmark_map, numbers)
     figure.savefig(path)
+
+
+def _numbers(review: Review) -> dict[int, int]:
+    """Return a number for the row of each detection, from left to right."""
+    order = np.argsort(review.detections.bboxes_xyxy[:, [0, 2]].sum(axis=1), kind='stable')
+    return {int(row): number for number, row in enumerate(order, start=1)}
 
 
 def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: dict[int, int]

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare the demo's wake-ups with the ground truth, and find the matches behind each pose."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.localizer import localize_on_demand, recorded_crops
+from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
+from cliploc_ros.core.localizer import Localizer, can_do_without_crops, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
@@ -88,6 +88,10 @@ class Review:
     true_landmarks: tuple[str, ...] | None
     #: Whether the repeated search found the pose that the node sent. If not, there are no matches.
     repeated: bool
+    camera_name: str = ''  #: Of one of several cameras
+    accepted_alone: bool = True  #: Whether the first camera alone would do
+    #: What the other cameras of the robot saw, by their names
+    beside: Mapping[str, 'Review'] = field(default_factory=dict)
 
 
 def judge(wake_up: WakeUp, number: int, sequence: TumSequence) -> Judged:
@@ -97,16 +101,18 @@ def judge(wake_up: WakeUp, number: int, sequence: TumSequence) -> Judged:
 
 
 class Reviewer:
-    """Repeats the relocalizer's search of a frame with the same code, options and seed.
+    """Repeats the relocalizer's search of a wake-up with the same code, options and seed.
 
-    ``landmark_of`` returns the id of an object's landmark, '' if the map lacks it. By default the
-    two ids are equal.
+    Each camera has a sequence, and a mount on the first. ``landmark_of`` returns the id of an
+    object's landmark, '' if the map lacks it. By default the two ids are equal.
     """
 
     def __init__(self, values: RelocalizerParameters, landmark_map: LandmarkMap,
-                 sequence: TumSequence, landmark_of: Callable[[str], str] = str) -> None:
-        self._values, self._sequence, self._landmark_of = values, sequence, landmark_of
-        self._camera, _ = find_camera(None, sequence.folder)
+                 sequences: Mapping[str, TumSequence], mounts: Mapping[str, Sequence[float]],
+                 landmark_of: Callable[[str], str] = str) -> None:
+        self._values, self._sequences, self._landmark_of = values, sequences, landmark_of
+        self._mounts = {name: transform_from_pose(np.array(mount[:3]), np.array(mount[3:]))
+                        for name, mount in mounts.items()}
         self._options = values.options()
         self._relocalizer = Relocalizer(landmark_map, self._options)
         self._observer = None
@@ -118,39 +124,65 @@ class Reviewer:
                 landmark_map, [values.map_file], values.landmark_embeddings))
         # the true boxes of each image, where the recording says them
         self._true_boxes = {
-            parse_stamp_ns(frame.timestamp, 'truth.json'): frame.boxes
-            for frame in read_frames(sequence.folder, least_visibility=0.0)
-        } if (sequence.folder / 'truth.json').is_file() else {}
-
-    def search(self, image_rgb: NDArray[np.uint8], detections: Detections, stamp_ns: int
-               ) -> tuple[Observation, Relocalization]:
-        """Return the observation of an image (h, w, 3), and the pose with all similarities."""
-        if self._observer is None:
-            observation = Observation(self._camera, detections, stamp_ns=stamp_ns)
-        else:
-            observation = self._observer.observe(image_rgb, self._camera, detections, stamp_ns)
-        return observation, localize_on_demand(
-            self._relocalizer, (), observation, recorded_crops(observation, self._options))[1]
+            (name, parse_stamp_ns(frame.timestamp, 'truth.json')): frame.boxes
+            for name, sequence in sequences.items()
+            if (sequence.folder / 'truth.json').is_file()
+            for frame in read_frames(sequence.folder, least_visibility=0.0)}
 
     def review(self, judged: Judged) -> Review:
         """Repeat the search of a wake-up."""
-        stamp_ns, camera = judged.wake_up.stamp_ns, self._camera
-        path = self._sequence.image_paths[self._sequence.stamps_ns.index(stamp_ns)]
-        pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        assert pixels_bgr is not None  # the conversion to a recording has read it
-        image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
-        detections = judged.wake_up.detections.usable(camera.width, camera.height,
-                                                      self._values.max_detections)
-        observation, found = self.search(image_rgb, detections, stamp_ns)
+        seen = {name: self._observed(name, judged.wake_up) for name in self._sequences}
+        (_, first), *others = seen.values()
+        found = self._search(first, [observation for _, observation in others])
         if found.map_from_camera is None or judged.pose is None:
             repeated = found.map_from_camera is judged.pose
         else:
             error_m, error_deg = pose_error(found.map_from_camera, judged.pose)
             repeated = error_m < _SAME_POSE[0] and error_deg < _SAME_POSE[1]
-        similarities = observation.similarities
-        true_boxes = self._true_boxes.get(stamp_ns)
+        # the search has the first camera last
+        matches = [*found.frame_matches[-1:], *found.frame_matches[:-1]] \
+            if repeated and found.solved else [()] * len(seen)
+        reviews = {name: self._review(name, judged, *one, its, repeated)
+                   for (name, one), its in zip(seen.items(), matches, strict=True)}
+        first_review, *_ = reviews.values()
+        return replace(first_review, beside=dict(list(reviews.items())[1:]), accepted_alone=(
+            self._search(first, []) if others else found).accepted)
+
+    def _observed(self, name: str, wake_up: WakeUp) -> tuple[NDArray[np.uint8], Observation]:
+        """Return the image (h, w, 3) of a camera, and what was detected in it."""
+        sequence, stamp_ns = self._sequences[name], wake_up.stamp_ns
+        camera, _ = find_camera(None, sequence.folder)
+        path = sequence.image_paths[sequence.stamps_ns.index(stamp_ns)]
+        pixels_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        assert pixels_bgr is not None  # the conversion to a recording has read it
+        image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
+        detections = wake_up.detections[name].usable(camera.width, camera.height,
+                                                     self._values.max_detections)
+        observation = Observation(camera, detections, stamp_ns=stamp_ns) \
+            if self._observer is None else self._observer.observe(image_rgb, camera, detections,
+                                                                  stamp_ns)
+        return image_rgb, replace(observation, camera_name=name,
+                                  odom_from_camera=self._mounts[name])
+
+    def _search(self, first: Observation, others: Sequence[Observation]) -> Relocalization:
+        """Return the pose of the first camera, as the relocalizer finds it."""
+        if self._observer is not None and can_do_without_crops(self._options):
+            none = np.empty(0, dtype=np.int64)
+            others = [replace(one, compared=none, similarities=np.asarray(one.similarities)[none])
+                      for one in others]
+        return Localizer(self._relocalizer).localize(
+            first, run=None, crops=recorded_crops(first, self._options), others=others)
+
+    def _review(self, name: str, judged: Judged, image_rgb: NDArray[np.uint8],
+                observation: Observation, matches: tuple[Match, ...], repeated: bool) -> Review:
+        """Return the review of what one camera saw, from its own pose."""
+        poses = tuple(pose @ self._mounts[name] for pose in judged.wake_up.hypotheses)
+        detections = observation.detections
+        true_boxes = self._true_boxes.get((name, judged.wake_up.stamp_ns))
         return Review(
-            judged, image_rgb, camera, detections, found.matches if repeated else (),
-            None if similarities is None else np.asarray(similarities),
+            replace(judged, wake_up=replace(judged.wake_up, hypotheses=poses)), image_rgb,
+            observation.camera, detections, matches,
+            None if observation.similarities is None else np.asarray(observation.similarities),
             None if true_boxes is None else tuple(
-                map(self._landmark_of, true_ids(detections.bboxes_xyxy, true_boxes))), repeated)
+                map(self._landmark_of, true_ids(detections.bboxes_xyxy, true_boxes))), repeated,
+            name)

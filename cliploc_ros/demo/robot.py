@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo's robot: play a recording, and request the pose at each wake-up."""
 
+import heapq
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 
 import numpy as np
@@ -23,6 +25,7 @@ from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.frame_source import of_camera
 from cliploc_ros.ros.replay import create_publisher
 from cliploc_ros.units import NS_PER_S
 
@@ -44,7 +47,7 @@ class WakeUp:
     #: tuple of (4, 4): ``map_from_camera`` of the distinct best, best first; an accepted pose is
     #: the first
     hypotheses: tuple[NDArray[np.float64], ...]
-    detections: Detections  #: The detector's
+    detections: Mapping[str, Detections]  #: The detector's, by the name of the camera
     answer_s: float  #: From the request to the answer, including detection [s]
 
     @property
@@ -74,30 +77,33 @@ class WakeUp:
 
 
 class Robot(Node):
-    """Publishes a recording and stops for each wake-up.
+    """Publishes the recording of each camera and stops for each wake-up.
 
     ``check`` is called while waiting; it raises if a node has ended.
     """
 
-    def __init__(self, reader: BagReader, check: Callable[[], None]) -> None:
+    def __init__(self, readers: Mapping[str, BagReader], check: Callable[[], None]) -> None:
         super().__init__('robot')
-        self._reader, self._check = reader, check
+        self._readers, self._check = readers, check
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._topics = {topic.name: create_publisher(self, topic, topic.name)
-                        for topic in reader.topics.values()}
+                        for reader in readers.values() for topic in reader.topics.values()}
         self._client = self.create_client(Trigger, 'relocalizer/relocalize')
-        self._detections: dict[int, Detections] = {}
+        self._detections: dict[str, dict[int, Detections]] = {}
         self._hypotheses: dict[int, tuple[NDArray[np.float64], ...]] = {}
-        self.create_subscription(Detection2DArray, 'detections', self._on_detections,
-                                 qos.DETECTIONS_OUT)
+        for camera in readers:
+            self._detections[camera] = {}
+            self.create_subscription(Detection2DArray, of_camera(camera, 'detections'), partial(
+                self._on_detections, camera), qos.DETECTIONS_OUT)
         self.create_subscription(PoseArray, 'relocalizer/hypotheses', self._on_hypotheses,
                                  qos.POSE)
 
     def connect(self) -> None:
         """Wait until detector and relocalizer are discovered."""
         self._wait(lambda: self._client.service_is_ready()
-                   and self.count_publishers('detections') > 0
+                   and all(self.count_publishers(of_camera(camera, 'detections'))
+                           for camera in self._readers)
                    and self.count_publishers('relocalizer/hypotheses') > 0)
 
     def walk(self, wake_up_at: Collection[int], rate: float) -> Iterator[WakeUp]:
@@ -105,8 +111,10 @@ class Robot(Node):
 
         The rate is the speed between wake-ups; 1 is as recorded.
         """
-        last_ns = self._reader.start_ns
-        for stamp, group in groupby(self._reader.messages(), key=lambda message: message.stamp_ns):
+        last_ns = min(reader.start_ns for reader in self._readers.values())
+        messages = heapq.merge(*(reader.messages() for reader in self._readers.values()),
+                               key=lambda message: message.stamp_ns)
+        for stamp, group in groupby(messages, key=lambda message: message.stamp_ns):
             seconds = (stamp - last_ns) / NS_PER_S / rate
             end = time.monotonic() + seconds
             while time.monotonic() < end:
@@ -129,7 +137,8 @@ class Robot(Node):
         def answered() -> bool:
             nonlocal shown_at
             # The relocalizer alone listens to camera_info, and only until it has its frame.
-            if (self._topics['/camera_info'].get_subscription_count() > 0
+            if (all(publisher.get_subscription_count() > 0 for name, publisher
+                    in self._topics.items() if name.endswith('/camera_info'))
                     and time.monotonic() - shown_at >= _FRAME_PERIOD_S):
                 self._publish(frame)
                 shown_at = time.monotonic()
@@ -139,9 +148,11 @@ class Robot(Node):
         answer_s, answer = time.monotonic() - start, future.result()
         if not answer.message.startswith(('accepted', 'refused')):
             raise DemoError(f'the relocalizer gave no answer: {answer.message}')
-        self._wait(lambda: stamp in self._hypotheses and stamp in self._detections)
+        self._wait(lambda: stamp in self._hypotheses
+                   and all(stamp in heard for heard in self._detections.values()))
         return WakeUp(stamp, answer.success, answer.message, self._hypotheses[stamp],
-                      self._detections[stamp], answer_s)
+                      {camera: heard[stamp] for camera, heard in self._detections.items()},
+                      answer_s)
 
     def _publish(self, frame: list[BagMessage]) -> None:
         for message in frame:
@@ -157,8 +168,8 @@ class Robot(Node):
                                 'block UDP on this machine?')
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
-    def _on_detections(self, msg: Detection2DArray) -> None:
-        self._detections[stamp_ns(msg.header.stamp)] = detections_from_msg(msg)
+    def _on_detections(self, camera: str, msg: Detection2DArray) -> None:
+        self._detections[camera][stamp_ns(msg.header.stamp)] = detections_from_msg(msg)
 
     def _on_hypotheses(self, msg: PoseArray) -> None:
         self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(transform_from_pose(

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the demo from its start to its page of pictures."""
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -61,11 +63,24 @@ class DemoOptions:
     method: str = 'hybrid_auto'  #: Matching and algorithm, joined as in the paper: ``hybrid_auto``
     rviz: bool = False  #: Whether to open RViz if it is installed
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
+    has_rig: bool = False  #: Whether the robot has the cameras of rig/ instead of one
 
     @property
     def map_file(self) -> Path:
         """Return the file of the map to wake up in."""
         return self.assets / 'map.yaml' if self.wake_up_map is None else self.wake_up_map.file
+
+    @property
+    def mounts(self) -> dict[str, list[float]]:
+        """Return the mount of each camera on the first: x, y, z [m], quaternion x, y, z, w."""
+        return dict(json.loads((self.assets / 'rig' / 'mounts.json').read_text())) \
+            if self.has_rig else {'': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """Return the TUM folder of each camera."""
+        return {name: self.assets / 'rig' / name if name else self.assets / 'sequence'
+                for name in self.mounts}
 
     @property
     def parameters(self) -> dict[str, object]:
@@ -79,7 +94,19 @@ class DemoOptions:
         if matching != 'class':
             parameters |= {'clip_model': self.assets / 'clip.json',
                            'clip_pretrained': self.assets / 'clip.safetensors'}
+        if self.has_rig:
+            parameters |= {**self.of_detector, 'base_frame': next(iter(self.mounts)),
+                           'base_from_camera': list(chain(*self.mounts.values()))}
         return parameters
+
+    @property
+    def of_detector(self) -> dict[str, object]:
+        """Return what differs from a detector of one camera.
+
+        Raw images of four cameras at once are more than Fast DDS delivers as it is.
+        """
+        return {'cameras': list(self.mounts), 'image_transport': 'compressed'} \
+            if self.has_rig else {}
 
     @property
     def values(self) -> RelocalizerParameters:
@@ -97,12 +124,16 @@ def run_demo(options: DemoOptions) -> list[Judged]:
     start = time.monotonic()
     prepare(options)
     landmark_map = LandmarkMap.from_file(options.map_file)
-    sequence = read_tum(options.assets / 'sequence')
+    sequences = {name: read_tum(folder) for name, folder in options.folders.items()}
+    sequence = next(iter(sequences.values()))
     with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
-        bag = Path(folder) / 'walk'
-        convert_tum(sequence, find_camera(None, sequence.folder)[0], bag,
-                    ConversionOptions(world_frame=landmark_map.frame_id))
-        print(f'converted a walk of {len(sequence)} images into a recording', flush=True)
+        for name, one in sequences.items():
+            convert_tum(one, find_camera(None, one.folder)[0], Path(folder) / f'walk_{name}',
+                        ConversionOptions(
+                            world_frame=landmark_map.frame_id, prefix=name,
+                            image_format='compressed' if options.has_rig else 'raw'))
+        print(f'converted a walk of {sum(map(len, sequences.values()))} images into a recording',
+              flush=True)
         domain = stack.enter_context(own_ros_domain())
         rviz = None
         if options.rviz and shutil.which('rviz2'):
@@ -111,9 +142,9 @@ def run_demo(options: DemoOptions) -> list[Judged]:
                 ['rviz2', '-d', config, '-f', landmark_map.frame_id], options.out / 'rviz2.log'))
         elif options.rviz:
             print('RViz (rviz2) is not installed or not sourced here: continuing without it')
-        judged = _walk(options, bag, sequence, domain)
+        judged = _walk(options, Path(folder), sequence, domain)
         print(page.summary(judged), flush=True)
-        index = _draw(options, landmark_map, sequence, judged)
+        index = _draw(options, landmark_map, sequences, judged)
         print(f'pictures: {index.resolve()} ({time.monotonic() - start:.0f} s in all)', flush=True)
         if rviz is not None:
             print('close RViz to end')
@@ -131,7 +162,8 @@ def prepare(options: DemoOptions) -> None:
     make_folder(options.out)
     for picture in options.out.glob(page.PICTURES):
         picture.unlink()
-    needed = [options.assets / 'sequence', options.assets / 'yolo.pt',
+    needed = [options.assets / ('rig' if options.has_rig else 'sequence'),
+              options.assets / 'yolo.pt',
               *(value for value in options.parameters.values() if isinstance(value, Path))]
     for path in needed:
         if not path.exists():
@@ -139,15 +171,18 @@ def prepare(options: DemoOptions) -> None:
                             'folder with --assets')
 
 
-def _walk(options: DemoOptions, bag: Path, sequence: TumSequence, domain: int) -> list[Judged]:
-    """Let the robot wake up along the recording; print each answer as it arrives."""
+def _walk(options: DemoOptions, folder: Path, sequence: TumSequence, domain: int
+          ) -> list[Judged]:
+    """Let the robot wake up along the recordings; print each answer as it arrives."""
     chosen = np.linspace(0, len(sequence) - 1, min(options.wake_ups, len(sequence)))
     wake_up_at = {sequence.stamps_ns[round(index)] for index in chosen}
     judged: list[Judged] = []
-    with _nodes(options, domain) as check, BagReader(bag) as reader:
+    with _nodes(options, domain) as check, ExitStack() as stack:
+        readers = {name: stack.enter_context(BagReader(folder / f'walk_{name}'))
+                   for name in options.mounts}
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         try:
-            robot = Robot(reader, check)
+            robot = Robot(readers, check)
             robot.connect()
             print('\n' + page.console_header(), flush=True)
             for wake_up in robot.walk(wake_up_at, options.rate):
@@ -165,7 +200,8 @@ def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
-    with (running(node_command('detector', {'model': options.assets / 'yolo.pt'}),
+    with (running(node_command('detector', {'model': options.assets / 'yolo.pt',
+                                            **options.of_detector}),
                   options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),
                   options.out / 'relocalizer.log') as relocalizer):
@@ -180,11 +216,11 @@ def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
         yield check
 
 
-def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence,
+def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequences: dict[str, TumSequence],
           judged: list[Judged]) -> Path:
     """Draw all pictures and the page that shows them; return the page."""
-    own = options.wake_up_map
-    reviewer = Reviewer(options.values, landmark_map, sequence,
+    own, sequence = options.wake_up_map, next(iter(sequences.values()))
+    reviewer = Reviewer(options.values, landmark_map, sequences, options.mounts,
                         str if own is None else own.landmark_of)
     reviews = []
     for one in judged:
@@ -195,5 +231,10 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequence: TumSequence
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
     walked = truth.positions_xyz[(truth.stamps_ns >= first) & (truth.stamps_ns <= last)]
     draw_top_view(judged, landmark_map, walked, options.out / page.TOP_VIEW)
-    return page.write_page(options.out, reviews, options.method,
-                           '' if own is None else own.section)
+    section = '' if own is None else own.section
+    if options.has_rig:
+        alone = sum(review.accepted_alone for review in reviews)
+        print(f'{len(sequences)} cameras; with the first of them alone, {alone} of {len(reviews)} '
+              'would be accepted', flush=True)
+        section += page.rig_section(list(sequences), alone, len(reviews))
+    return page.write_page(options.out, reviews, options.method, section)

@@ -316,7 +316,8 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
         depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
             else ', depth contradicts the boxes'
     return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
-            f'{len(found.matches)} inliers, {found.tried} hypotheses, '
+            f'{sum(map(len, found.frame_matches[-localized.cameras:]))} inliers, '
+            f'{found.tried} hypotheses, '
             f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}; '
             f'{in_words(stages_ms)}]')
 

@@ -54,6 +54,19 @@ def test_poses_are_right_or_refused(finished):
     assert max(errors_m) < 1.0
 
 
+def test_four_cameras_need_not_turn(executables, tmp_path):
+    code, output, errors = run(executables, '--out', tmp_path, '--cameras', 4, '--wake-ups', 2)
+    assert code == 0, errors
+    print(output)
+    assert '2 wake-ups: 2 accepted, 0 refused, none wrong' in output
+    assert '4 cameras; with the first of them alone, ' in output
+    page = (tmp_path / 'index.html').read_text()
+    assert page.count(', 4 cameras') == 2
+    assert 'The robot has 4 cameras, front, left, back, right,' in page
+    height, width = cv2.imread(str(tmp_path / 'wake_up_01.png')).shape[:2]
+    assert height > 0.7 * width, 'two rows of two images'
+
+
 def test_pictures_show_something(finished):
     out, _ = finished
     pictures = sorted(out.glob('*.png'))

@@ -56,8 +56,8 @@ def test_boxes_and_outlines_are_where_they_were_seen(room, found):
 
 
 def test_what_is_not_matched_is_white(room, found):
-    canvas = draw_debug_image(grey_image(room), replace(found, matches=found.matches[:1]), room,
-                              '')
+    few = replace(found, frame_matches=(found.matches[:1],))
+    canvas = draw_debug_image(grey_image(room), few, room, '')
     assert len(pixels_of(canvas, UNMATCHED)) > 100
 
 

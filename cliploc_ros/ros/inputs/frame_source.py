@@ -117,6 +117,10 @@ class ExactPairing:
                 self._forget(name, next(iter(other)))
         return complete
 
+    def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
+        """Return whether an item of a topic waits whose stamp is near another one."""
+        return any(abs(one - stamp_ns) <= tolerance_ns for one in self._waiting[topic])
+
     def oldest(self, topic: str) -> Any:
         """Return the oldest item of a topic that waits; None if there is none."""
         return next((item for item, _ in self._waiting[topic].values()), None)
@@ -339,6 +343,10 @@ class FrameSource:
             health.values |= {
                 'images dropped unpaired': self._pairing.dropped['image'],
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
+
+    def awaits_detections(self, stamp_ns: int, tolerance_s: float) -> bool:
+        """Return whether an image near a stamp waits for its detections; holds the condition."""
+        return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
 
     def newest_since(self, moment: float) -> Frame | None:
         """Return the newest frame if its image arrived after a moment of the monotonic clock."""

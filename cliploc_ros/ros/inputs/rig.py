@@ -17,7 +17,7 @@ from cliploc_ros.ros.node.worker import LatestOnly, Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
-# The detections of other cameras come at most this much later, or not at all.
+# The images of other cameras come at most this much later, or not at all.
 _PATIENCE_S = 0.3
 
 
@@ -68,10 +68,21 @@ class Rig:
         """Return the first instant whose images arrived after a moment; see FrameSource."""
         sources = list(self._sources.values())
         frame = next_of_any(sources, after, deadline)
+        begun_at = time.monotonic()
+        # a detector that serves the cameras in turn is done with the last one after this time
+        in_turn_s = _PATIENCE_S + len(sources) * (frame.detected_at - frame.received_at)
+
+        def is_all(awaited: Callable[[FrameSource], bool]) -> bool:
+            return sources[0].is_closed or not any(
+                awaited(self._sources[name]) for name in self._instant(frame, after).left_out)
         with self._changed:
             self._changed.wait_for(
-                lambda: sources[0].is_closed or not self._instant(frame, after).left_out,
-                max(0.0, min(_PATIENCE_S, deadline - time.monotonic())))
+                lambda: is_all(lambda source: True),
+                max(0.0, min(begun_at + _PATIENCE_S, deadline) - time.monotonic()))
+            self._changed.wait_for(
+                lambda: is_all(lambda source: source.awaits_detections(
+                    _stamp_ns(frame), self._tolerance_s)),
+                max(0.0, min(begun_at + in_turn_s, deadline) - time.monotonic()))
             return self._instant(frame, after)
 
     def missing(self) -> list[str]:
