@@ -137,6 +137,12 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
     add_topic_options(group)
+    group.add_argument('--cameras', nargs='+', default=[''], metavar='NAME',
+                       help='several cameras of --bag, the namespaces of all topics below; the '
+                       'images of an instant are localized together, from the first camera')
+    group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
+                       help='images of several cameras within this time are of one instant '
+                       '(%(default)s)')
     group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
@@ -151,11 +157,13 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.recording import with_features
     from cliploc_ros.evaluation.run import compare_methods
-    from cliploc_ros.evaluation.trials import make_queries
+    from cliploc_ros.evaluation.trials import join_cameras, make_queries
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
+        raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if options.bag is not None and _is_case(options):
@@ -169,10 +177,15 @@ def evaluate(options: argparse.Namespace) -> int:
     methods = parse_methods(options.methods, paper, len(landmark_map))
     layer = _read_layer(options, landmark_map, methods)
     make_folder(options.out)
-    recorded = _read_queries(options, landmark_map)
+    of_cameras = {camera: _read_queries(options, landmark_map, camera)
+                  for camera in options.cameras}
+    recorded = of_cameras[options.cameras[0]]
     queries = make_queries(recorded, landmark_map, every_frame=True)
+    if len(of_cameras) > 1:
+        queries = join_cameras({camera: make_queries(its, landmark_map, every_frame=True)
+                                for camera, its in of_cameras.items()}, options.sync_tolerance)
     if layer is not None:
-        queries = with_features(queries, _frames(options))
+        queries = with_features(queries, _frames(options, options.cameras[0]))
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
@@ -255,8 +268,9 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     return 0 if is_same else 1
 
 
-def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> 'Queries':
-    """Return the queries of a file, or record them."""
+def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str
+                  ) -> 'Queries':
+    """Return the queries of a file, or record them, of one of several cameras."""
     from cliploc_ros.datasets.queries import load_queries, save_queries
     from cliploc_ros.evaluation.recording import recorded_queries
     from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
@@ -265,9 +279,10 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or --tum')
         return load_queries(options.queries, landmark_map.landmark_ids)
-    frames = _frames(options)
+    frames = _frames(options, camera)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
-                    options.ground_truth, options.body_from_camera, options.rectified])
+                    options.ground_truth, options.body_from_camera, options.rectified,
+                    *([camera] if camera else [])])
     recording = RecordingOptions(detector_options(options), clip_options(options), EVERY_FRAME,
                                  reading, options.workers or 1, options.scheduler)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
@@ -281,7 +296,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> '
     return queries
 
 
-def _frames(options: argparse.Namespace) -> 'Frames':
+def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
     from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.bag_poses import poses_of_topic
     from cliploc_ros.datasets.folders import tum_frames
@@ -291,9 +306,12 @@ def _frames(options: argparse.Namespace) -> 'Frames':
     if options.tum is not None:
         sequence = read_tum(options.tum).every(options.every)
         return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
+    image, camera_info, ground_truth = (
+        f'/{camera}/{topic.lstrip("/")}' if camera else topic
+        for topic in (options.image, options.camera_info, options.ground_truth))
     return bag_frames(
-        options.bag, BagTopics(options.image, options.camera_info, options.rectified),
-        poses_of_topic(options.ground_truth, body_from_camera=mount_of(options.body_from_camera)))
+        options.bag, BagTopics(image, camera_info, options.rectified),
+        poses_of_topic(ground_truth, body_from_camera=mount_of(options.body_from_camera)))
 
 
 def _cores() -> int:

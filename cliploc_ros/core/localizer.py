@@ -129,6 +129,15 @@ def can_do_without_crops(options: RelocalizerOptions) -> bool:
     return options.algorithm == 'auto' and options.matching == 'hybrid'
 
 
+def by_classes(observation: Observation, landmarks: int) -> Observation:
+    """Return an observation of which CLIP saw no crop, for a map with a number of landmarks.
+
+    The node compares crops of one camera only; this is what the others of a rig saw.
+    """
+    return replace(observation, similarities=np.empty((0, landmarks), dtype=np.float32),
+                   compared=np.empty(0, dtype=np.int64))
+
+
 def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
     """Return the crops on demand of an observation that has all similarities.
 

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
-from cliploc_ros.core.localizer import Localizer, can_do_without_crops, recorded_crops
+from cliploc_ros.core.localizer import (
+    Localizer,
+    by_classes,
+    can_do_without_crops,
+    recorded_crops,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
@@ -166,10 +171,8 @@ class Reviewer:
 
     def _search(self, first: Observation, others: Sequence[Observation]) -> Relocalization:
         """Return the pose of the first camera, as the relocalizer finds it."""
-        if self._observer is not None and can_do_without_crops(self._options):
-            none = np.empty(0, dtype=np.int64)
-            others = [replace(one, compared=none, similarities=np.asarray(one.similarities)[none])
-                      for one in others]
+        if can_do_without_crops(self._options):
+            others = [by_classes(one, len(self._relocalizer.landmark_map)) for one in others]
         return Localizer(self._relocalizer).localize(
             first, run=None, crops=recorded_crops(first, self._options), others=others)
 

@@ -17,7 +17,12 @@ from cliploc_ros.core.keyframes.localization import (
     KeyframeLocalizer,
     query_features,
 )
-from cliploc_ros.core.localizer import Localizer, can_do_without_crops, recorded_crops
+from cliploc_ros.core.localizer import (
+    Localizer,
+    by_classes,
+    can_do_without_crops,
+    recorded_crops,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -81,11 +86,8 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
     for *beside, frame in case.instants():
         image, observation = _observed(frame, parameters, class_map)
         others = [_observed(one, parameters, class_map)[1] for one in beside]
-        if can_do_without_crops(options):  # the node compares crops of one camera
-            none = np.empty(0, dtype=np.int64)
-            others = [replace(one, similarities=np.empty((0, len(landmark_map)), dtype=np.float32),
-                              compared=none)
-                      for one in others]
+        if can_do_without_crops(options):
+            others = [by_classes(one, len(landmark_map)) for one in others]
         recognizer = None if keyframes is None else ImageRecognizer(
             keyframes, query_features(image), observation.camera)
         if observer is not None:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods run on queries: the pose that each search found, and its error."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
 from cliploc_ros.core.localizer import (
+    by_classes,
     can_do_without_crops,
     localize_on_demand,
     recorded_crops,
@@ -46,7 +47,8 @@ class Query:
     number: int  #: Number of the frame in its query file, from 0
     observation: Observation
     map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    neighbours: tuple[Observation, ...] = ()  #: Other frames, which odometry links to it
+    #: Other frames, which odometry links to it, or those of other cameras at its instant
+    neighbours: tuple[Observation, ...] = ()
     image: ImageFeatures | None = None  #: Its local features, for keyframes
 
 
@@ -116,6 +118,32 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
         for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
 
 
+def join_cameras(queries: Mapping[str, Sequence[Query]], tolerance_s: float
+                 ) -> tuple[Query, ...]:
+    """Return the queries of the first camera, each with what the others saw at its instant.
+
+    The true poses tell how the cameras are mounted. DatasetError: no other image is so near in
+    time to one of the first camera.
+    """
+    (first, main), *others = queries.items()
+    stamps = {name: np.array([one.observation.stamp_ns for one in its]) for name, its in others}
+    found = []
+    for query in main:
+        stamp_ns, beside = query.observation.stamp_ns, []
+        for name, its in others:
+            near = np.abs(stamps[name] - stamp_ns)
+            if len(near) and near.min() <= tolerance_s * NS_PER_S:
+                one = its[int(near.argmin())]
+                beside.append(replace(one.observation, camera_name=name, stamp_ns=stamp_ns,
+                                      odom_from_camera=one.map_from_camera))
+        found.append(replace(query, neighbours=tuple(beside), observation=replace(
+            query.observation, camera_name=first, odom_from_camera=query.map_from_camera)))
+    if not any(one.neighbours for one in found):
+        raise DatasetError(f'no image of {", ".join(name for name, _ in others)} is within '
+                           f'{tolerance_s:g} s of one of {first}')
+    return tuple(found)
+
+
 def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query],
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
     """Run one trial of a method, numbered from 0, on some queries.
@@ -150,7 +178,11 @@ def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observa
     Return the result and the share of crops that were compared.
     """
     frames: list[SearchedFrame] = []
+    count = len(relocalizer.landmark_map)
     for observation in observations:
+        if observation.camera_name and observation is not observations[-1]:
+            frames.append(relocalizer.search(by_classes(observation, count)))
+            continue
         frame, found = localize_on_demand(
             relocalizer, frames, observation, recorded_crops(observation, relocalizer.options),
             recognizer=recognizer if observation is observations[-1] else None)

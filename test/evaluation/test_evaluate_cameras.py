@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of several cameras: the images of an instant are localized together."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.datasets.bags import BagReader, BagWriter
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+            '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
+CAMERAS = ('front', 'left', 'back')
+
+
+@pytest.fixture(scope='module')
+def rig_bag(tmp_path_factory):
+    """Three cameras of the demo's rig in one recording."""
+    folder = tmp_path_factory.mktemp('rig')
+    for name in CAMERAS:
+        sequence = read_tum(ASSETS / 'rig' / name)
+        convert_tum(sequence, find_camera(None, sequence.folder)[0], folder / name,
+                    ConversionOptions(world_frame='map', prefix=name, image_format='compressed'))
+    with BagWriter(folder / 'bag') as writer:
+        for name in CAMERAS:
+            with BagReader(folder / name) as reader:
+                for topic in reader.topics.values():
+                    writer.add_topic(topic.name, topic.msgtype)
+                for message in reader.messages():
+                    writer.write(message.topic, message.stamp_ns, message.data)
+            shutil.rmtree(folder / name)
+    return folder / 'bag'
+
+
+def run(rig_bag, out, *arguments):
+    return evaluate(list(map(str, (
+        '--bag', rig_bag, *NETWORKS, '--methods', 'auto', '--trials', 1, '--sweep',
+        '--no-figures', '--image', 'image/compressed', '--out', out, *arguments))))
+
+
+def results_of(folder):
+    return json.loads((folder / 'results.json').read_text())
+
+
+def test_together_they_are_nearer_the_truth(rig_bag, tmp_path):
+    assert run(rig_bag, tmp_path / 'one', '--cameras', 'front') == 0
+    assert run(rig_bag, tmp_path / 'three', '--cameras', *CAMERAS) == 0
+    one, three = (results_of(tmp_path / name) for name in ('one', 'three'))
+    assert len(one) == len(three) == 6
+    assert all(row['accepted'] and row['error_m'] < 0.05 for row in three)
+    errors = [np.median([row['error_m'] for row in rows]) for rows in (one, three)]
+    print(f'\nmedian error: one camera {errors[0]:.3f} m, three {errors[1]:.3f} m')
+    assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--cameras', 'front', 'nowhere'), '/nowhere/image/compressed'),
+    (('--cameras', 'front', 'left', '--fuse'), '--cameras is for --bag, without --fuse'),
+])
+def test_what_does_not_fit_is_named(rig_bag, tmp_path, capsys, arguments, named):
+    assert run(rig_bag, tmp_path, *arguments) == 1
+    assert named in capsys.readouterr().err
