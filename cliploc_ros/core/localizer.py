@@ -44,7 +44,7 @@ from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -164,7 +164,8 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
                        observation: Observation, crops: Crops | None = None,
-                       looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None
+                       looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+                       budget: TimeBudget | None = None
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
@@ -178,6 +179,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         Results of earlier frames, which have to agree.
     recognizer : ImageRecognizer, optional
         Of the keyframes.
+    budget : TimeBudget, optional
+        Of the first search; by default a new one, as for each search after it.
 
     Returns
     -------
@@ -199,10 +202,10 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         left = informative_first(relocalizer.landmark_map, observation)
         left = left[~np.isin(left, compared)]
     while True:
-        budget = relocalizer.begin(len(earlier) + 1)
+        budget = budget or relocalizer.begin(len(earlier) + 1)
         frame = relocalizer.search(observation, budget.search_end())
         found = relocalizer.locate([*earlier, frame], budget, looks, recognizer)
-        search_ms += found.search_ms
+        search_ms, budget = search_ms + found.search_ms, None
         if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
             return frame, replace(found, search_ms=search_ms)
         compared, left = np.append(compared, left[:count]), left[count:]
@@ -292,12 +295,12 @@ class Localizer:
     def _localize(self, observation: Observation, run: int | None, limit: int, length_s: float,
                   crops: Crops | None, recognizer: ImageRecognizer | None,
                   others: Sequence[Observation]) -> Relocalization:
-        budget = self._relocalizer.begin(len(others) + 1)
+        budget = self._relocalizer.begin(len(others) + 1, len(others) + 1) if others else None
         beside = [self._relocalizer.search(one, budget.search_end(number, len(others) + 1))
-                  for number, one in enumerate(others, start=1)]
+                  for number, one in enumerate(others, start=1)] if budget else []
         if observation.odom_from_camera is None or run is None:
             alone, found = localize_on_demand(self._relocalizer, beside, observation, crops,
-                                              recognizer=recognizer)
+                                              recognizer=recognizer, budget=budget)
             self.observation = alone.observation
             return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
@@ -308,7 +311,7 @@ class Localizer:
             del earlier[0]
         newest, found = localize_on_demand(
             self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
-            observation, crops, self._looks, recognizer)
+            observation, crops, self._looks, recognizer, budget)
         self._instants = [*earlier, KeptInstant((*beside, newest), anchor)]
         self.observation = newest.observation
         if found.map_from_camera is not None:

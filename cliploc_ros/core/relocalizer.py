@@ -131,9 +131,12 @@ class Relocalizer:
                   for number, one in enumerate(observations, start=1)]
         return self.locate(frames, budget, recognizer=recognizer)
 
-    def begin(self, frames: int) -> TimeBudget:
-        """Return the time budget of a relocalization with some frames; it starts now."""
-        return TimeBudget.begin(self._options.time_budget_s, frames)
+    def begin(self, frames: int, cameras: int = 1) -> TimeBudget:
+        """Return the time budget of a relocalization with some frames; it starts now.
+
+        What several cameras see at one instant has the time of each.
+        """
+        return TimeBudget.begin(cameras * self._options.time_budget_s, frames)
 
     def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
         """Search one frame, until a deadline of time.perf_counter [s]."""
