@@ -53,6 +53,46 @@ def tilted_vertical(queries: Sequence[Query], angle_deg: float, seed: int = 0
     return tuple(found)
 
 
+def scaled_depth(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+    """Return queries whose depths are too large by a factor: of a scale, or of a unit."""
+    return _with_depths(queries, lambda depths, rng: factor * depths)
+
+
+def random_depth(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+    """Return queries in which a share of the depths are anything from .3 to 6 m."""
+    return _with_depths(queries, lambda depths, rng: np.where(
+        rng.random(len(depths)) < share, rng.uniform(0.3, 6.0, len(depths)), depths), seed)
+
+
+def missing_depth(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+    """Return queries in which a share of the depths are not known."""
+    return _with_depths(queries, lambda depths, rng: np.where(
+        rng.random(len(depths)) < share, np.nan, depths), seed)
+
+
+def depth_elsewhere(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+    """Return queries with a share of depths of other boxes: the depth camera looks elsewhere."""
+    known = [query.observation.depths for query in queries
+             if query.observation.depths is not None]
+    every = np.concatenate(known) if known else np.empty(0)
+    return _with_depths(queries, lambda depths, rng: np.where(
+        rng.random(len(depths)) < share, rng.choice(every, len(depths)), depths), seed)
+
+
+def _with_depths(queries: Sequence[Query], change: Callable[
+        [NDArray[np.float64], np.random.Generator], NDArray[np.float64]], seed: int = 0
+        ) -> tuple[Query, ...]:
+    """Return queries with other depths, where they have some."""
+    found = []
+    for query in queries:
+        def changed(one: Observation, number: int = query.number) -> Observation:
+            rng = np.random.default_rng([seed, number, 3])
+            return one if one.depths is None else replace(one, depths=change(one.depths, rng))
+
+        found.append(_of_all_frames(query, changed))
+    return tuple(found)
+
+
 def wrong_mount(queries: Sequence[Query], angle_deg: float, seed: int = 0) -> tuple[Query, ...]:
     """Return queries of a camera that is turned in its mount by an angle, one way for each.
 

@@ -105,7 +105,7 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count
             rows = known[rng.integers(len(known), size=int(count))] if len(known) \
                 else np.zeros((int(count), len(landmark_map)), dtype=np.float32)
             looks = np.ascontiguousarray(rng.permuted(rows, axis=1))
-        return replace(observation, similarities=looks, detections=Detections(
+        return replace(observation, similarities=looks, depths=None, detections=Detections(
             boxes, tuple(landmark_map.class_ids[row] for row in shown), np.full(len(boxes), 0.8)))
 
     return landmark_map, [replace(query, observation=drawn(query.observation),
@@ -133,8 +133,10 @@ def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share
         rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
         looks = rng.permuted(similarities[rows], axis=1)
         classes = tuple(true.class_ids[row] for row in rng.permutation(rows))
+        depths = observation.depths
         return replace(
             observation, similarities=np.ascontiguousarray(np.vstack([similarities, looks])),
+            depths=None if depths is None else np.append(depths, np.full(count, np.nan)),
             detections=Detections(np.vstack([true.bboxes_xyxy, boxes]), true.class_ids + classes,
                                   np.concatenate([true.scores, true.scores[rows]])))
 
@@ -143,9 +145,10 @@ def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share
 
 def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
     """Return an observation with some of its boxes."""
-    similarities = observation.similarities
+    similarities, depths = observation.similarities, observation.depths
     return replace(
-        observation, detections=observation.detections.select(rows), similarities=None
+        observation, detections=observation.detections.select(rows),
+        depths=None if depths is None else depths[rows], similarities=None
         if similarities is None else np.ascontiguousarray(np.asarray(similarities)[rows]))
 
 
@@ -203,6 +206,14 @@ TROUBLES = {
                                       (LEVEL, FIVE, ALL)),
     'vertical off by [degrees]': Trouble(_of_sensor(wrong_sensors.tilted_vertical), (10.0,),
                                          (LEVEL, ALL)),
+    'depth too large by a factor': Trouble(_of_sensor(wrong_sensors.scaled_depth),
+                                           (1000.0, 1.15, 1.0 / 1.15), (ONE, LEVEL)),
+    'share of the depths that are random': Trouble(_of_sensor(wrong_sensors.random_depth),
+                                                   (1.0,), (ONE, LEVEL)),
+    'share of the depths of something else': Trouble(_of_sensor(wrong_sensors.depth_elsewhere),
+                                                     (1.0,), (ONE, LEVEL)),
+    'share of the depths that are missing': Trouble(_of_sensor(wrong_sensors.missing_depth),
+                                                    (0.5, 1.0), (ONE, LEVEL)),
     'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
                                              (FIVE, ALL))}
 #: What gets worse and worse, seen in one image.

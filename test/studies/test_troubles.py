@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps, detections and sensors go wrong as said, and the study counts every request."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -185,3 +186,15 @@ def test_little_trouble_is_mostly_right_and_much_is_refused(name, tmp_path):
     assert sum(one.accepted and not one.right for one in outcomes) <= 1
     image = cv2.imread(str(draw_curves(tmp_path, outcomes)))
     assert image.shape[0] > 200 and image.std() > 20
+
+
+@pytest.mark.parametrize(('change', 'level', 'share'), [
+    (wrong_sensors.scaled_depth, 1.15, 1.0), (wrong_sensors.random_depth, 1.0, 1.0),
+    (wrong_sensors.depth_elsewhere, 1.0, 0.9), (wrong_sensors.missing_depth, 0.5, 0.5)])
+def test_depths_are_wrong(questions, change, level, share):
+    depths = [np.linspace(1.0, 3.0, len(one.observation.detections)) for one in questions]
+    asked = [replace(one, observation=replace(one.observation, depths=its))
+             for one, its in zip(questions, depths, strict=True)]
+    wrong = np.concatenate([one.observation.depths for one in change(asked, level)])
+    assert np.mean(wrong != np.concatenate(depths)) == pytest.approx(share, abs=0.15)
+    assert [one.observation.depths for one in change(questions, level)] == [None] * len(questions)
