@@ -3,6 +3,7 @@
 """Four cameras at 30 Hz for many requests: one dies and comes back, then it is late."""
 
 import os
+import signal
 import threading
 import time
 from collections import Counter
@@ -83,6 +84,7 @@ class Cameras:
 
 @pytest.mark.parametrize('names', [NAMES, NAMES[:2]], ids=['four', 'two'])
 def test_requests_go_on_whatever_becomes_of_a_camera(start, tester, tmp_path, names):
+    signal.alarm(300 + REQUESTS)  # a long soak takes longer than a test may
     write_map(MAP, tmp_path / 'map.yaml')
     process = start('nodes.relocalizer', parameters={
         'map_file': tmp_path / 'map.yaml', 'matching': 'class', 'base_frame': 'base_link',
