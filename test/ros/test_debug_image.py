@@ -55,6 +55,18 @@ def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     assert len(pixels_of(canvas, UNMATCHED)) == 0
 
 
+def test_the_depth_of_each_box_is_written_into_it(room, found):
+    depths = np.full(len(room), np.nan)
+    plain = draw_debug_image(grey_image(room, depths=depths), found, room, '')
+    assert (plain == draw_debug_image(grey_image(room), found, room, '')).all()
+    depths[0] = 1.8
+    box = see_room(room).bboxes_xyxy[0]
+    changed = np.argwhere((plain != draw_debug_image(grey_image(room, depths=depths), found, room,
+                                                     '')).any(axis=2))[:, ::-1]
+    assert len(changed) > 20
+    assert (np.abs(changed - box[[0, 3]]) < (70, 30)).all()
+
+
 def test_what_is_not_matched_is_white(room, found):
     few = replace(found, frame_matches=(found.matches[:1],))
     canvas = draw_debug_image(grey_image(room), few, room, '')

@@ -107,7 +107,7 @@ class SeenImage:
 
 def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: LandmarkMap,
                      verdict: str) -> NDArray[np.uint8]:
-    """Return the image with every usable box and the outlines of matched landmarks.
+    """Return the image with every usable box, its depth, and the outlines of matched landmarks.
 
     Where keyframes had something to say, the best one is to the right of it.
 
@@ -123,6 +123,9 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
     matched = {match.detection for match in found.matches}
     for row, box in enumerate(boxes):
         _draw_box(canvas, box, _BOX if row in matched else _UNMATCHED)
+        if seen.observation.depths is not None and np.isfinite(seen.observation.depths[row]):
+            _write(canvas, f'{seen.observation.depths[row]:.1f} m',
+                   _pixels(box[[0, 3]]) + np.array([4, -6], dtype=np.int32), _TEXT)
     if found.map_from_camera is not None and found.matches:
         rows = [match.landmark for match in found.matches]
         outlines = project_ellipsoids(invert_transform(found.map_from_camera),
