@@ -44,7 +44,10 @@ _HOW = """\
 with the recording's ground truth, which the nodes never see. No topic carries the matches of boxes
 and landmarks. For the pictures the demo therefore repeats the search on the same detections with
 the same code, networks, options and seed, and compares its pose with the one from ROS
-({repeated}). CLIP is the cosine similarity of crop and label, rank its place among all labels of
+({repeated}).</p>"""
+
+_LIST = """\
+<p>CLIP is the cosine similarity of crop and label, rank its place among all labels of
 the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the
 renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not in the
 map.</p>"""
@@ -112,6 +115,8 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
         f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
         '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
         'poses were not published.</figcaption></figure>', how,
+        # several cameras have pictures without a list of matches
+        '' if any(one.beside for one in reviews) else _LIST,
         *figures, '</html>', '']), encoding='utf-8')
     return page
 

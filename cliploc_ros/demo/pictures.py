@@ -49,7 +49,7 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
         for place, (name, one) in enumerate(views.items()):
             axes = figure.add_axes((0.008 + 0.496 * (place % 2), 0.48 - 0.45 * (place // 2),
                                     0.488, 0.425))
-            _draw_image(axes, one, landmark_map, _numbers(one))
+            _draw_image(axes, one, landmark_map, _numbers(one), is_numbered=False)
             axes.set_title(name, loc='left', fontsize=10, pad=3)
     else:
         _draw_image(figure.add_axes((0.008, 0.075, 0.552, 0.84)), review, landmark_map, numbers)
@@ -76,8 +76,8 @@ def _numbers(review: Review) -> dict[int, int]:
     return {int(row): number for number, row in enumerate(order, start=1)}
 
 
-def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: dict[int, int]
-                ) -> None:
+def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: dict[int, int],
+                is_numbered: bool = True) -> None:
     height, width = review.image_rgb.shape[:2]
     axes.imshow(review.image_rgb, interpolation='bilinear')
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
@@ -101,6 +101,8 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: 
         axes.add_patch(Rectangle(
             (left, top), right - left, bottom - top, fill=False, edgecolor=color, linewidth=1.3,
             linestyle='-' if row in matched else (0, (3, 2)), path_effects=_EDGED))
+        if not is_numbered:  # no list refers to the boxes
+            continue
         axes.text(max(left, 2) + 1, max(top, 2) + 1, str(number), fontsize=7.5, color='black',
                   ha='left', va='top', clip_on=True,
                   bbox={'boxstyle': 'square,pad=0.12', 'facecolor': color, 'edgecolor': 'none'})

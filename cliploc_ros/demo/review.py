@@ -74,7 +74,7 @@ class Judged:
                 f'refused, the best hypothesis is {self.error[0]:.2f} m off')
         if self.error is None:
             return 'accepted'
-        return f'accepted, {self.error[0]:.2f} m and {self.error[1]:.1f}° from the truth'
+        return f'accepted, {self.error[0]:.3f} m and {self.error[1]:.1f}° from the truth'
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,7 @@ def test_four_cameras_need_not_turn(executables, tmp_path):
     page = (tmp_path / 'index.html').read_text()
     assert page.count(', 4 cameras') == 2
     assert 'The robot has 4 cameras, front, left, back, right,' in page
+    assert 'rank its place' not in page, 'the pictures have no list'
     height, width = cv2.imread(str(tmp_path / 'wake_up_01.png')).shape[:2]
     assert height > 0.7 * width, 'two rows of two images'
 
