@@ -285,7 +285,8 @@ class Localizer:
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
-        if others and found.frame_matches:
+        if others and found.accepted and found.frame_matches:
+            # where nothing is accepted, the map may be out of date
             seen, index = [*others, observation], self._relocalizer.landmark_map.classes
             self.mounts.add(seen, [int(index.are_own(index.classes_of(
                 one.detections.class_ids)).sum()) for one in seen], [

@@ -73,8 +73,14 @@ class DemoOptions:
     @property
     def mounts(self) -> dict[str, list[float]]:
         """Return the mount of each camera on the first: x, y, z [m], quaternion x, y, z, w."""
-        return dict(json.loads((self.assets / 'rig' / 'mounts.json').read_text())) \
-            if self.has_rig else {'': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+        if not self.has_rig:
+            return {'': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+        file = self.assets / 'rig' / 'mounts.json'
+        try:
+            return dict(json.loads(file.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise DemoError(f'{file} cannot be read ({error}): run script/setup again, or choose '
+                            'another folder with --assets') from error
 
     @property
     def folders(self) -> dict[str, Path]:

@@ -63,6 +63,8 @@ class CommonParameters(Parameters):
         names = self.camera_names
         if len(set(names)) < len(names):
             raise OptionsError(f'cameras: a name is given twice: {", ".join(names)}')
+        if len(names) > MAX_FRAMES:
+            raise OptionsError(f'cameras: {len(names)} are more than {MAX_FRAMES}')
         for name in names:
             if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*', name):
                 raise OptionsError(f"cameras: '{name}' is no namespace of topics")

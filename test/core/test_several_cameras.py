@@ -112,3 +112,13 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
         covered = replace(covered, detections=covered.detections.select(np.empty(0, np.int64)))
         assert localizer.localize(last, run=None, others=[covered, *others]).accepted
     assert localizer.mounts.wrong == []
+
+
+def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
+    """All objects have exchanged places; no pose is accepted, so none tells of mounts."""
+    exchanged = replace(MAP, centers=MAP.centers[np.random.default_rng(0).permutation(len(MAP))])
+    localizer = Localizer(Relocalizer(exchanged, OPTIONS))
+    for _ in range(10):
+        *others, last = look(rng, objects=5)
+        assert not localizer.localize(last, run=None, others=others).accepted
+    assert localizer.mounts.wrong == []

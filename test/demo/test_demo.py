@@ -59,7 +59,7 @@ def test_four_cameras_need_not_turn(executables, tmp_path):
     assert code == 0, errors
     print(output)
     assert '2 wake-ups: 2 accepted, 0 refused, none wrong' in output
-    assert '4 cameras; with the first of them alone, ' in output
+    assert '4 cameras; with the first of them alone, 1 of 2 would be accepted' in output
     page = (tmp_path / 'index.html').read_text()
     assert page.count(', 4 cameras') == 2
     assert 'The robot has 4 cameras, front, left, back, right,' in page
@@ -159,6 +159,7 @@ def test_no_process_outlives_it(executables, tmp_path, number, expected):
 
 @pytest.mark.parametrize(('arguments', 'named'), [
     (['--assets', '/nowhere'], '/nowhere/sequence is missing'),
+    (['--cameras', '4', '--assets', '/nowhere'], '/nowhere/rig/mounts.json cannot be read'),
     (['--method', 'class_prosac'], "algorithm 'prosac'"),
     (['--method', 'telepathy'], "'telepathy' is none of"),
     (['--out', '/proc/demo'], '--out /proc/demo'),

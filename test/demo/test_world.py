@@ -14,17 +14,25 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
     shape_matrices,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.errors import DatasetError
 from demo_world.appearance import CLASSES, COLORS, Appearance, draw_appearance
 from demo_world.recording import find_boxes, record, write_fitted_map, write_true_map
 from demo_world.renderer import Light, Renderer
 from demo_world.room import make_room, move_objects
-from demo_world.trajectories import CAMERA, draw_views, query_walk, true_map_walk
+from demo_world.trajectories import (
+    CAMERA,
+    draw_views,
+    query_walk,
+    rig_mounts,
+    rig_walk,
+    true_map_walk,
+)
 from demo_world.worlds import find_worlds, hold_out
 
 
@@ -164,3 +172,16 @@ def _iou(a, b):
     low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
     shared = np.prod(np.clip(high - low, 0, None))
     return shared / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - shared)
+
+
+def test_the_shipped_rig_is_where_its_walk_and_mounts_say():
+    mounts = json.loads((ASSETS / 'rig' / 'mounts.json').read_text())
+    assert list(mounts) == list(rig_mounts())
+    for name, expected in rig_mounts().items():
+        mount = transform_from_pose(np.array(mounts[name][:3]), np.array(mounts[name][3:]))
+        np.testing.assert_allclose(mount, expected, atol=1e-9)
+        sequence = read_tum(ASSETS / 'rig' / name)
+        poses = [sequence.pose_at(stamp) for stamp in sequence.stamps_ns]
+        np.testing.assert_allclose(poses, rig_walk() @ mount, atol=1e-5)
+    # left of the front camera is minus x, and y is down
+    assert rig_mounts()['left'][0, 2] == pytest.approx(-1.0)

@@ -9,18 +9,16 @@ import numpy as np
 
 from cliploc_ros.core.observation import Observation
 
-# A mount is wrong where the pose explains less than this share of what its camera saw, and more
-# than twice as much of what the others did. With four cameras among simulated objects, a right
-# mount has 1.0, one that is turned by 2 degrees .8, by 5 degrees .1, by more 0 to .1.
+# A mount is wrong where accepted poses explain less than this share of what its camera saw, and
+# more than twice as much of what the others did. With four cameras among simulated objects, a
+# right mount has 1.0, one that is turned by 2 degrees .8, by 5 degrees .1, by more 0 to .1.
 _LEAST_SHARE = 0.3
 # Of instants, and of objects in all of them; before, nothing is said.
 _LEAST_INSTANTS, _MOST_INSTANTS, _LEAST_OBJECTS = 5, 20, 15
-# Objects of other cameras that make a pose worth listening to.
-_LEAST_MATCHES = 3
 
 
 class MountCheck:
-    """Counts over instants how much of what each camera sees the poses explain."""
+    """Counts over instants how much of what each camera sees the accepted poses explain."""
 
     def __init__(self) -> None:
         self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=_MOST_INSTANTS)
@@ -28,9 +26,8 @@ class MountCheck:
     def add(self, seen: Sequence[Observation], known: Sequence[int], matched: Sequence[int]
             ) -> None:
         """Take in an instant: of each camera, objects of the map's classes and those matched."""
-        if sum(matched) >= _LEAST_MATCHES:
-            self._instants.append({one.camera_name: (of_map, found) for one, of_map, found
-                                   in zip(seen, known, matched, strict=True)})
+        self._instants.append({one.camera_name: (of_map, found) for one, of_map, found
+                               in zip(seen, known, matched, strict=True)})
 
     @property
     def wrong(self) -> list[str]:

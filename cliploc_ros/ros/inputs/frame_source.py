@@ -5,8 +5,8 @@
 import math
 import threading
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,14 +19,11 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detection_type, stamp_ns
+from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.units import NS_PER_S
 
-# Images that are expected at a time: two for each of the last two detections.
-_EXPECTED = 4
-# Detections may come this much later than the last ones.
-_SPARE = 1.5
 #: A robot that is refused retries at once: discovering its publishers again would cost it a tenth
 #: of a second.
 LINGER_S = 1.0
@@ -42,126 +39,6 @@ _MAX_DEPTH_BYTES = 72 * 2**20
 _OF_DEPTH = ('depth', 'depth_camera_info')
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
-
-
-class ExactPairing:
-    """Collects messages until every topic has one of the same stamp. Memory is bounded.
-
-    Stamps are compared for equality, not for order: frames may arrive out of order.
-
-    Images wait for their detections, and large ones may fill the memory before these come. Then
-    each n-th stays, and the two that are the newest when detections arrive: a detector that is
-    done with an image mostly takes the newest one next.
-
-    Parameters
-    ----------
-    max_bytes : mapping of str to int
-        The topics, and how much memory the messages of each may hold [bytes].
-    max_count : int
-        How many messages of each topic are kept.
-    early, late : str
-        The topics of the images and of what is made of them; without them, the oldest messages
-        give way.
-    """
-
-    def __init__(self, max_bytes: Mapping[str, int], max_count: int, early: str = '',
-                 late: str = '') -> None:
-        self._max_bytes = dict(max_bytes)
-        self._max_count = max_count
-        self._waiting: dict[str, OrderedDict[int, tuple[Any, int]]] = {
-            topic: OrderedDict() for topic in max_bytes}
-        self._early, self._late = early, late
-        self.last_stamp_ns: dict[str, int] = {}
-        # Of the images, the number of each by its stamp, and those that stay whatever comes.
-        self._numbers: dict[int, int] = {}
-        self._expected: deque[int] = deque(maxlen=_EXPECTED)
-        self.clear()
-
-    def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
-        """Take in a message; return the set by topic that it completes, or None.
-
-        Parameters
-        ----------
-        item : object
-            Returned in the set.
-        size : int
-            Memory that the item holds [bytes].
-        """
-        self.received[topic] += 1
-        self.last_stamp_ns[topic] = stamp_ns
-        waiting = self._waiting[topic]
-        if topic == self._late:
-            self._learn(stamp_ns)
-        if stamp_ns in waiting:
-            self._forget(topic, stamp_ns)
-        if topic == self._early:
-            if waiting and not self._stays(newest := next(reversed(waiting))):
-                self._forget(topic, newest)
-            self._numbers[stamp_ns] = self.received[topic]
-            if len(self._numbers) > self._max_count:
-                del self._numbers[next(iter(self._numbers))]
-        waiting[stamp_ns] = (item, size)
-        self._bytes[topic] += size
-        while len(waiting) > self._max_count or (
-                self._bytes[topic] > self._max_bytes[topic] and len(waiting) > 1):
-            self._forget(topic, next(iter(waiting)) if topic != self._early else min(
-                waiting, key=lambda one: (one == stamp_ns, self._stays(one),
-                                          self._numbers.get(one) in self._expected)))
-        if any(stamp_ns not in other for other in self._waiting.values()):
-            return None
-        complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
-        for name, other in self._waiting.items():
-            self.dropped[name] -= 1  # the loop below counts the completed one, too
-            # Older messages will not be completed any more.
-            while stamp_ns in other:
-                self._forget(name, next(iter(other)))
-        return complete
-
-    def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
-        """Return whether an item of a topic waits whose stamp is near another one."""
-        return any(abs(one - stamp_ns) <= tolerance_ns for one in self._waiting[topic])
-
-    def oldest(self, topic: str) -> Any:
-        """Return the oldest item of a topic that waits; None if there is none."""
-        return next((item for item, _ in self._waiting[topic].values()), None)
-
-    def waiting_bytes(self) -> int:
-        """Return the memory that all waiting messages hold [bytes]."""
-        return sum(self._bytes.values())
-
-    def clear(self) -> None:
-        """Forget all waiting messages and all counts."""
-        for waiting in self._waiting.values():
-            waiting.clear()
-        self._bytes = dict.fromkeys(self._waiting, 0)
-        self.received = dict.fromkeys(self._waiting, 0)
-        self.dropped = dict.fromkeys(self.received, 0)
-        self.last_stamp_ns.clear()
-        self._numbers.clear()
-        self._expected.extend([1, 2, 1, 2])  # a detector that begins takes one of the first
-        self.every, self.outrun = 1, 0
-
-    def _stays(self, stamp_ns: int) -> bool:
-        """Return whether an image waits for its detections once it is not the newest one."""
-        number = self._numbers.get(stamp_ns, 0)
-        return number % self.every == 0 or number in self._expected
-
-    def _learn(self, stamp_ns: int) -> None:
-        """Take in how many images later detections come, and expect those of the newest ones."""
-        newest, waiting = self.received[self._early], self._waiting[self._early]
-        self._expected.extend([newest, newest + 1])
-        if stamp_ns not in self._numbers or not waiting:
-            return
-        behind = newest - self._numbers[stamp_ns] + 1
-        fitting = self._max_bytes[self._early] * len(waiting) // max(1, self._bytes[self._early])
-        self.every = 1 if _SPARE * behind <= fitting else math.ceil(
-            _SPARE * behind / max(1, fitting - _EXPECTED - 1))
-        self.outrun = behind if behind > fitting and stamp_ns not in waiting else 0
-
-    def _forget(self, topic: str, stamp_ns: int) -> None:
-        _, size = self._waiting[topic].pop(stamp_ns)
-        self._bytes[topic] -= size
-        self.dropped[topic] += 1
 
 
 class NoFrameError(CliplocError):
