@@ -21,8 +21,9 @@ SHARED_DATA = PROJECT.parent / 'shared' / 'data'
 # pytest-xdist hands whole files to its workers in this order. The folders with long files come
 # first, so that all workers end at about the same time.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
-# A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine.
-PATIENCE_S = 300
+# A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine, and
+# several in a niced process, which gets a tenth of a core there.
+PATIENCE_S = 650 if os.nice(0) else 300
 #: The tests that do not run here, by the Python module they need.
 NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 
