@@ -12,10 +12,13 @@ import numpy as np
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.mapping.building import build_map
 from cliploc_ros.simulation.sensors import simulate_depths, with_neighbours, with_vertical
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
@@ -30,6 +33,8 @@ SEED = 7
 VERTICAL_DEG, STEP_M, STEP_DEG = 1.0, 0.01, 0.5
 # By how much the height range exceeds the true heights.
 _HEIGHT_M = 0.2
+# A recording is halved this often, and each half maps once.
+_HALVINGS = 3
 
 
 class Place(NamedTuple):
@@ -122,6 +127,39 @@ class Simulated(NamedTuple):
                      [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
 
 
+class Halved(NamedTuple):
+    """The map that one half of a recording's frames makes, chosen at random; the other queries."""
+
+    observations: Path
+    seed: int
+    is_swapped: bool = False  #: The other half makes the map
+    has_depth: bool = False
+
+    @property
+    def name(self) -> str:
+        """Return the name of its rows in a table."""
+        return self.observations.stem
+
+    def load(self) -> Place:
+        """Return the place. Boxes of the queries have no similarities."""
+        recorded = load_observations(self.observations)
+        order = np.random.default_rng(self.seed).permutation(len(recorded))
+        halves = [np.sort(half) for half in np.array_split(order, 2)]
+        if self.is_swapped:
+            halves.reverse()
+        landmark_map = build_map(recorded.select_frames(halves[0])).landmark_map
+        asked = recorded.select_frames(halves[1])
+        queries = []
+        for number in range(len(asked)):
+            rows = slice(*map(int, asked.frame_offsets[number:number + 2]))
+            queries.append(Query(number, Observation(
+                asked.camera, Detections(asked.bboxes_xyxy[rows], tuple(
+                    asked.class_names[one] for one in asked.classes[rows]), asked.scores[rows]),
+                depths=None if asked.depths is None or not self.has_depth
+                else asked.depths[rows].astype(np.float64)), asked.map_from_camera[number]))
+        return Place(landmark_map, queries, range(len(queries)), [True] * len(queries))
+
+
 def _with_simulated_depth(queries: Sequence[Query], recorded: Queries, landmark_map: LandmarkMap
                           ) -> tuple[Query, ...]:
     """Return queries with depth of the landmarks that their boxes show."""
@@ -137,6 +175,9 @@ def _with_simulated_depth(queries: Sequence[Query], recorded: Queries, landmark_
     return tuple(found)
 
 
+AnyPlace = Recording | Simulated | Halved
+
+
 def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(KINDS),
                   worlds: int = 0, first_seed: int = 0) -> None:
     """Add the options that choose places, with defaults of a study; chosen_places reads them."""
@@ -144,6 +185,9 @@ def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(
                         help='recordings, in place of the worlds unless --worlds is given, too')
     parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
                         help='one for all query files, or one for each')
+    parser.add_argument('--observations', type=Path, default=[], nargs='*', metavar='NPZ',
+                        help='recordings without a map: random halves map, the others are '
+                        'queries, by classes')
     parser.add_argument('--depth', action='store_true',
                         help='of each box: that of the files, or else simulated')
     parser.add_argument('--cameras', type=positive_int, default=1, metavar='N',
@@ -160,7 +204,7 @@ def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(
     parser.set_defaults(default_worlds=worlds)
 
 
-def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
+def chosen_places(options: argparse.Namespace) -> list[AnyPlace]:
     """Return the places that the command line chooses.
 
     Raises
@@ -170,17 +214,20 @@ def chosen_places(options: argparse.Namespace) -> list[Recording | Simulated]:
     """
     worlds = options.worlds
     if worlds is None:
-        worlds = 0 if options.queries else options.default_worlds
+        worlds = 0 if options.queries or options.observations else options.default_worlds
     if worlds < 0 or options.first_seed < 0:
         raise OptionsError('--worlds and --first-seed must not be below 0')
     maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
     if len(maps) != len(options.queries):
         raise OptionsError('give one map, or as many maps as query files in the same order')
-    places: list[Recording | Simulated] = [
+    places: list[AnyPlace] = [
+        *(Halved(path, seed, is_swapped, options.depth) for path in options.observations
+          for seed in range(_HALVINGS) for is_swapped in (False, True)),
         *(Recording(path, map_path, options.frames == 'all', has_depth=options.depth)
           for path, map_path in zip(options.queries, maps, strict=True)),
         *(Simulated(kind, options.first_seed + number, options.depth, options.cameras)
           for kind in options.kinds for number in range(worlds))]
     if not places:
-        raise OptionsError('nothing to test: give --queries and --map, or --worlds')
+        raise OptionsError('nothing to test: give --queries and --map, --observations, or '
+                           '--worlds')
     return places

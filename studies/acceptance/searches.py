@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
@@ -19,10 +19,12 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.trials import run_trial
 from studies.acceptance.fit import best_recall
-from studies.acceptance.places import SEED, Place, Recording, Simulated
+from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.troubles import CURVES, TROUBLES
 from studies.reports import interval, table
 
+#: Errors below which a pose is a success [m].
+SUCCESS_M = 0.1, 0.25, 0.5, 1.0
 _PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
 _PANELS_A_ROW, _LABEL_WIDTH = 3, 22
 
@@ -30,7 +32,7 @@ _PANELS_A_ROW, _LABEL_WIDTH = 3, 22
 class Task(NamedTuple):
     """All queries of a place in a mode, with a trouble."""
 
-    place: Recording | Simulated
+    place: AnyPlace
     mode: str
     options: RelocalizerOptions = RelocalizerOptions()
     trouble: str = 'none'
@@ -49,6 +51,7 @@ class Outcome(NamedTuple):
     right: bool  # within 1 m of the truth, where the map shows the place
     accepted: bool
     confidence: float
+    error_m: float = inf  # infinite where no pose was found
 
 
 def make_search() -> Callable[[Task], list[Outcome]]:
@@ -69,16 +72,16 @@ def search(task: Task) -> list[Outcome]:
     options = replace(options, k=min(options.k, len(landmark_map)))
     return [Outcome(task.place.name, task.mode, options.matching, task.trouble, task.level,
                     one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
-                    one.confidence)
+                    one.confidence, inf if one.error_m is None else one.error_m)
             for one in run_trial(landmark_map, Method(AUTO, options), 0, queries)]
 
 
 @lru_cache(maxsize=1)
-def _loaded(place: Recording | Simulated) -> Place:
+def _loaded(place: AnyPlace) -> Place:
     return place.load()
 
 
-def tasks_of(places: Sequence[Recording | Simulated], options: RelocalizerOptions,
+def tasks_of(places: Sequence[AnyPlace], options: RelocalizerOptions,
              names: Sequence[str], seed: int = SEED) -> list[Task]:
     """Return a task for each level of some troubles in each of their modes, at each place."""
     return [Task(place, mode, options, name, level, seed) for name in names
@@ -106,11 +109,15 @@ def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
         Fields; none for one row of all outcomes.
     thresholds : sequence of float
         A column for each ``min_confidence``, and one for the greatest recall that any of them
-        reaches at a precision of .99. Without, what the search itself accepted.
+        reaches at a precision of .99. Without, what the search itself accepted, after the success
+        at .1, .25, .5 and 1 m.
     """
     def figures(some: Sequence[Outcome]) -> Iterator[str]:
         likely, right = confidences_of(some)
         yield f'{right.sum()} of {len(right)}'
+        if not thresholds:
+            errors_m = np.array([one.error_m for one in some])
+            yield ' '.join(f'{(errors_m < limit).mean():.2f}' for limit in SUCCESS_M)
         for accepted in [likely >= least for least in thresholds] if thresholds else [
                 np.array([one.accepted for one in some])]:
             false = int((accepted & ~right).sum())
@@ -120,7 +127,7 @@ def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
             yield f'{best_recall(likely, right)[0]:.2f}' if right.any() else '-'
 
     columns = [f'{least:g}' for least in thresholds] + ['best'] if thresholds \
-        else ['accepted, wrong (95 % of all); recall']
+        else ['success', 'accepted, wrong (95 % of all); recall']
     groups: dict[tuple[str, ...], list[Outcome]] = {}
     for one in outcomes:
         groups.setdefault(tuple(f'{getattr(one, name)}' for name in by), []).append(one)

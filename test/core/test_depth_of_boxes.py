@@ -98,6 +98,8 @@ def test_wrong_depth_does_no_harm(change):
         assert found.accepted == alone.accepted
         assert found.depth is None or not found.depth.is_passed
         np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
+        # a mirror image is judged without depth, too
+        assert found.confidence == alone.confidence
 
 
 @pytest.mark.parametrize('depths', [

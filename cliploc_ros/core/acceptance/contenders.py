@@ -62,6 +62,7 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
 def without_depth(joined: JoinedFrames) -> JoinedFrames:
     """Return frames as of cameras without depth."""
     return join_frames(joined.landmark_map, joined.options, [one._replace(
+        observation=replace(one.observation, depths=None),
         scene=one.scene._replace(depths=np.zeros_like(one.scene.depths)))
         for one in joined.frames])
 
