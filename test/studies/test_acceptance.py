@@ -8,10 +8,14 @@ import signal
 
 import pytest
 
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.run import RunError
+from cliploc_ros.evaluation.trials import run_trial
 from studies.acceptance.__main__ import run, run_all
-from studies.acceptance.places import ALL, FIVE, MODES, ONE, Simulated
+from studies.acceptance.places import ALL, FIVE, MODES, ONE, Halved, Simulated
 from studies.acceptance.searches import Outcome, acceptance_table
 
 
@@ -42,6 +46,19 @@ def test_modes_without_further_images_are_left_out():
     assert len(every.ask(ONE)) == len(place.frames) == 20
     alone = place._replace(groups=range(len(place.frames)))
     assert not {FIVE, ALL} & set(alone.modes)
+
+
+def test_random_halves_of_a_recording_map_and_ask(shared_data):
+    file = shared_data / 'tum_fr3_office' / 'observations.npz'
+    one, other = (Halved(file, 0, is_swapped).load() for is_swapped in (False, True))
+    assert len(one.frames) + len(other.frames) == len(load_observations(file))
+    asked = [{query.map_from_camera.tobytes() for query in place.frames}
+             for place in (one, other)]
+    assert not asked[0] & asked[1]
+    some = one._replace(frames=one.frames[::50], is_main=one.is_main[::50])
+    outcomes = run_trial(one.landmark_map, Method(AUTO, RelocalizerOptions(matching='class')), 0,
+                         some.ask(ONE))
+    assert sum(found.accepted and found.error_m < 0.3 for found in outcomes) > len(outcomes) / 2
 
 
 @pytest.mark.parametrize(('least', 'cell'), [(0.99, '1, 0; 0.50'), (0.9, '3, 1; 1.00')])

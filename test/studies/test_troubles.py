@@ -169,12 +169,14 @@ def test_the_table_counts_each_request_once(capsys):
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
     assert len(rows) == 3, 'one for each mode'
     for row in rows:
-        *_, right, accepted = row.strip('| ').split(' | ')
+        *_, right, success, accepted = row.strip('| ').split(' | ')
+        shares = [float(one) for one in success.split()]
         right, requests = map(int, right.split(' of '))
         found, false = map(int, accepted.split(' (')[0].split(', '))
         assert requests == 4
         assert 0 <= false <= found <= 4
         assert 0 <= right <= 4
+        assert shares == sorted(shares) and shares[-1] == right / 4
 
 
 @pytest.mark.parametrize('name', troubles.CURVES)
