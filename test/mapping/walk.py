@@ -95,7 +95,7 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0):
     bboxes, shown = np.concatenate(boxes), np.concatenate(rows)
     classes = np.array([CLASSES.index(name) for name in table.class_ids], dtype=np.int64)
     return PosedDetections(
-        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
+        (CAMERA,), np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
         CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
