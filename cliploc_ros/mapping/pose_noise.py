@@ -115,7 +115,8 @@ def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> V
         rotations=views.rotations[frames], translations=views.translations[frames],
         stamps_s=views.stamps_s[frames], cameras=views.cameras[frames],
         levers=views.levers[frames], bounds=views.bounds[frames],
-        viewpoints=np.arange(len(frames)), weights=np.ones(len(frames)), offsets=np.append(offsets[frames], len(rows)),
+        viewpoints=np.arange(len(frames)), weights=np.ones(len(frames)),
+        offsets=np.append(offsets[frames], len(rows)),
         frames=np.searchsorted(frames, views.frames[rows]), classes=views.classes[rows],
         edges=views.edges[rows], stiffness=views.stiffness[rows], is_open=views.is_open[rows],
         depths=views.depths[rows], depth_stiffness=views.depth_stiffness[rows])
@@ -231,8 +232,9 @@ def _share_left(stamps_s, weights, correlation_s):
     for place in range(len(stamps_s)):
         if place > 0:
             step = stamps_s[place] - stamps_s[place - 1]
-            kept = np.exp(-step / correlation_s) if correlation_s > 0.0 else float(
-                step <= INSTANT_S)
+            kept = 1.0 if step <= INSTANT_S else 0.0
+            if correlation_s > 0.0:
+                kept = np.exp(-step / correlation_s)
             before = kept * (before + weights[place - 1])
         squares += weights[place] * (weights[place] + 2.0 * before)
         total += weights[place]
