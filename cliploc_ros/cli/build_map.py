@@ -37,6 +37,7 @@ EPILOG = """\
 examples:
   build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \\
             --map-frame map --out office.yaml
+  build_map --bag drive --cameras front left back --map-frame map --out office.yaml
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
@@ -106,17 +107,10 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
-    # Refuse an output whose folder is missing, before the work is done.
     path, update, name = options.out, options.update, source_of(options).name
-    if not path.parent.is_dir():
-        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
-    if path.is_dir():
-        raise MappingError(f'{path} is a folder; name the map file to write')
-    check_layer_options(options)
+    _check(options)
     if update is not None:
         LandmarkMap.from_file(update)
-        if options.refine_mount:
-            raise OptionsError('--refine-mount is for new maps, not for --update')
     mapping = MappingOptions(
         pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
         odometry_errors=OdometryErrors(*options.odometry_noise or ()),
@@ -155,6 +149,21 @@ def build(options: argparse.Namespace) -> int:
         print(f'note: {labeller.note}')
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s')
     return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse an output that cannot be written, and options, before the work is done."""
+    path = options.out
+    if not path.parent.is_dir():
+        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
+    if path.is_dir():
+        raise MappingError(f'{path} is a folder; name the map file to write')
+    check_layer_options(options)
+    if options.refine_mount and options.update is not None:
+        raise OptionsError('--refine-mount is for new maps, not for --update')
+    if options.refine_mount and len(options.cameras) > 1:
+        raise OptionsError('--refine-mount is for one camera: correct each with a map of '
+                           '--cameras NAME alone')
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':

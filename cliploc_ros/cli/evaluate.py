@@ -15,6 +15,7 @@ from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.sources import (
     add_network_options,
     add_topic_options,
+    camera_names,
     clip_options,
     detector_options,
     mount_of,
@@ -137,12 +138,9 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='use every N-th image of --tum')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
     add_topic_options(group)
-    group.add_argument('--cameras', nargs='+', default=[''], metavar='NAME',
-                       help='several cameras of --bag, the namespaces of all topics below; the '
-                       'images of an instant are localized together, from the first camera')
     group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
-                       help='images of several cameras within this time are of one instant '
-                       '(%(default)s)')
+                       help='images of several --cameras within this time are of one instant, and '
+                       'localized together, from the first camera (%(default)s)')
     group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
@@ -178,7 +176,7 @@ def evaluate(options: argparse.Namespace) -> int:
     layer = _read_layer(options, landmark_map, methods)
     make_folder(options.out)
     of_cameras = {camera: _read_queries(options, landmark_map, camera)
-                  for camera in options.cameras}
+                  for camera in camera_names(options)}
     recorded = of_cameras[options.cameras[0]]
     queries = make_queries(recorded, landmark_map, every_frame=True)
     if len(of_cameras) > 1:
@@ -297,7 +295,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 
 def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, topic_of
     from cliploc_ros.datasets.bag_poses import poses_of_topic
     from cliploc_ros.datasets.folders import tum_frames
     from cliploc_ros.datasets.intrinsics import find_camera
@@ -306,12 +304,11 @@ def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
     if options.tum is not None:
         sequence = read_tum(options.tum).every(options.every)
         return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
-    image, camera_info, ground_truth = (
-        f'/{camera}/{topic.lstrip("/")}' if camera else topic
-        for topic in (options.image, options.camera_info, options.ground_truth))
+    topics = BagTopics(options.image, options.camera_info, options.rectified)
     return bag_frames(
-        options.bag, BagTopics(image, camera_info, options.rectified),
-        poses_of_topic(ground_truth, body_from_camera=mount_of(options.body_from_camera)))
+        options.bag, topics.of_camera(camera),
+        poses_of_topic(topic_of(camera, options.ground_truth),
+                       body_from_camera=mount_of(options.body_from_camera)))
 
 
 def _cores() -> int:

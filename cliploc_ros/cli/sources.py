@@ -84,9 +84,9 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
                        help="the camera's optical coordinate frame in /tf (that of the images)")
     group.add_argument('--trajectory', type=Path, metavar='FILE',
                        help='take poses from a file in TUM format')
-    group.add_argument('--mount', type=float, nargs=7, metavar='V',
+    group.add_argument('--mount', type=float, nargs='+', metavar='V',
                        help='x y z qx qy qz qw of the camera (z forward) on what the poses of a '
-                       'topic or file are of')
+                       'topic or file are of; 7 numbers for each of --cameras, in their order')
     odometry = group.add_mutually_exclusive_group()
     odometry.add_argument('--odometry-topic', metavar='TOPIC',
                           help='odometry of --bag, of what --pose-topic or --trajectory is of: '
@@ -99,6 +99,9 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
 
 def add_topic_options(group: Any) -> None:
     """Add the options that name the images of a bag to a parser or a group of it."""
+    group.add_argument('--cameras', nargs='+', default=[''], metavar='NAME',
+                       help='several cameras of the recording, by the namespaces of their topics: '
+                       '/NAME/image, /NAME/camera_info and so on')
     group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
     group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
                        help='(%(default)s)')
@@ -148,6 +151,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
 
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
+    camera_names(options)
     if options.observations is not None:
         return load_recorded(options.observations)
     if options.workers < 1:
@@ -155,7 +159,8 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     return record_once(read_frames(options), RecordingOptions(
         detector_options(options, conf=options.conf),
         clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
-        repr([str(getattr(options, name)) for name in _READING]), options.workers,
+        repr([str(getattr(options, name)) for name in _READING]
+             + (options.cameras if options.cameras != [''] else [])), options.workers,
         options.scheduler), options.record_to, _odometry(options))
 
 
@@ -169,26 +174,65 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
 
     CliplocError: the source or the options cannot be used.
     """
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
     from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+    from cliploc_ros.datasets.frames import join_frames
     from cliploc_ros.datasets.intrinsics import find_camera
     from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
 
+    names, mounts = camera_names(options), _mounts(options)
     if options.bag is not None:
-        topics = BagTopics(options.image, options.camera_info, options.rectified,
-                           options.depth or '')
-        return bag_frames(options.bag, topics, _read_poses(options), _depth_format(options))
+        of_cameras = {name: _frames_of(options, name, mounts[name]) for name in names}
+        return of_cameras[''] if names == [''] else join_frames(of_cameras)
     if options.pose_topic or options.map_frame or options.depth:
         raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
     folder = FolderOptions(
         options.intrinsics,
         None if options.trajectory is None else read_tum_trajectory(options.trajectory),
         round(options.max_gap * NS_PER_S),
-        mount_of(options.mount), _depth_format(options))
+        mounts[''], _depth_format(options))
     if options.rgbd is not None:
         return rgbd_frames(options.rgbd, folder)
     return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
                       folder)
+
+
+def camera_names(options: argparse.Namespace) -> list[str]:
+    """Return the names of the cameras of a bag; [''] for one without a name.
+
+    OptionsError: a name is given twice, or the source is no bag.
+    """
+    names: list[str] = options.cameras
+    if len(set(names)) < len(names):
+        raise OptionsError(f'--cameras {" ".join(names)}: names a camera twice')
+    if names != [''] and options.bag is None:
+        raise OptionsError('--cameras is for --bag')
+    return names
+
+
+def _mounts(options: argparse.Namespace) -> 'dict[str, NDArray[np.float64] | None]':
+    """Return the mount (4, 4) of each camera by its name; None where it is not given."""
+    names, numbers = camera_names(options), options.mount
+    if numbers is None:
+        return dict.fromkeys(names)
+    if len(numbers) != 7 * len(names):
+        raise OptionsError(f'--mount has {len(numbers)} numbers, expected 7 for each of '
+                           f'{len(names)} camera{"s" if len(names) > 1 else ""}')
+    return {name: mount_of(numbers[7 * row:7 * row + 7]) for row, name in enumerate(names)}
+
+
+def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float64] | None'
+               ) -> 'Frames':
+    """Return the images of one camera of a bag; its name is '' where it is the only one."""
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+
+    topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
+    read = _read_poses(options, name, mount)
+    try:
+        return bag_frames(options.bag, topics.of_camera(name), read, _depth_format(options))
+    except DatasetError as error:
+        if not name:
+            raise
+        raise DatasetError(f"camera '{name}': {error}") from error
 
 
 def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
@@ -198,8 +242,13 @@ def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
     return None if numbers is None else mount_from_numbers(numbers)
 
 
-def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
-    """Return what reads the poses of a bag."""
+def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.float64] | None'
+                ) -> 'ReadPoses':
+    """Return what reads the poses of a camera of a bag.
+
+    A topic without a mount is the camera's own, in its namespace.
+    """
+    from cliploc_ros.datasets.bag_frames import topic_of
     from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_tf, poses_of_topic
     from cliploc_ros.datasets.tum import read_tum_trajectory
 
@@ -209,34 +258,45 @@ def _read_poses(options: argparse.Namespace) -> 'ReadPoses':
         there = ', '.join(pose_sources(options.bag)) or 'none'
         raise DatasetError(f'{options.bag}: say where the poses are: --pose-topic, --map-frame '
                            f'(tf) or --trajectory; topics with poses here: {there}')
-    max_gap_ns, mount = round(options.max_gap * NS_PER_S), mount_of(options.mount)
+    max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.pose_topic is not None:
-        return poses_of_topic(options.pose_topic, max_gap_ns, mount)
+        topic = options.pose_topic if mount is not None else topic_of(camera, options.pose_topic)
+        return poses_of_topic(topic, max_gap_ns, mount)
     if options.trajectory is not None:
+        if mount is None and len(options.cameras) > 1:
+            raise OptionsError('--trajectory of several cameras: give the --mount of each')
         poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
                         body_from_camera=mount)
         return lambda reader, camera_frame: poses
     if mount is not None:
         raise OptionsError('--mount is not for --map-frame: tf knows the mount')
+    if options.camera_frame is not None and len(options.cameras) > 1:
+        raise OptionsError('--camera-frame is of one camera: several have the frames of their '
+                           'images')
     return poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns)
 
 
-def _odometry(options: argparse.Namespace) -> 'Poses | None':
-    """Return the camera of a bag by odometry; None where none is asked for."""
-    from cliploc_ros.datasets.bag_frames import bag_odometry
+def _odometry(options: argparse.Namespace) -> 'dict[str, Poses] | None':
+    """Return the cameras of a bag by odometry, by name; None where none is asked for."""
+    from cliploc_ros.datasets.bag_frames import bag_odometry, topic_of
     from cliploc_ros.datasets.bag_poses import poses_of_tf, poses_of_topic
 
     max_gap_ns = round(options.max_gap * NS_PER_S)
-    if options.odometry_frame is not None:
-        read = poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns)
-    elif options.odometry_topic is None:
+    if options.odometry_frame is None and options.odometry_topic is None:
         return None
-    elif options.map_frame is not None:
+    if options.odometry_topic is not None and options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
                            '--odometry-frame')
-    else:
-        read = poses_of_topic(options.odometry_topic, max_gap_ns, mount_of(options.mount))
-    return bag_odometry(options.bag, options.image, read)
+    found = {}
+    for name, mount in _mounts(options).items():
+        if options.odometry_frame is not None:
+            read = poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns)
+        else:
+            topic = options.odometry_topic
+            read = poses_of_topic(topic if mount is not None else topic_of(name, topic),
+                                  max_gap_ns, mount)
+        found[name] = bag_odometry(options.bag, topic_of(name, options.image), read)
+    return found
 
 
 def _depth_format(options: argparse.Namespace) -> 'DepthFormat':

@@ -18,6 +18,7 @@ from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.mapping.posed_detections import PosedDetections
     from cliploc_ros.studio.images import Images
     from cliploc_ros.studio.live import LiveRelocalizer
     from cliploc_ros.studio.phrases import PhraseFinder
@@ -121,12 +122,12 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     from cliploc_ros.studio.studio import Studio
 
     images = detections = None
-    if options.images is not None:
-        images = open_images(options.images,
-                             BagTopics(options.image, options.camera_info, options.rectified))
     if options.observations is not None:
         detections = load_observations(options.observations)
-    elif options.images is not None:
+    if options.images is not None:
+        topics = BagTopics(options.image, options.camera_info, options.rectified)
+        images = open_images(options.images, topics, _cameras(options, detections))
+    if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)
     finder = _phrase_finder(options, recording, images)
@@ -136,6 +137,17 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
     return Studio(document, recording, images, finder, layer)
+
+
+def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:
+    """Return the cameras whose images are shown: by default those of the observations."""
+    known = [''] if detections is None else list(detections.camera_names)
+    if options.cameras == ['']:
+        return known
+    if unknown := [name for name in options.cameras if name not in known]:
+        raise OptionsError(f"--cameras: the observations have no camera '{unknown[0]}'; they have "
+                           f'{", ".join(filter(None, known)) or "one without a name"}')
+    return list(dict.fromkeys(options.cameras))
 
 
 def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',

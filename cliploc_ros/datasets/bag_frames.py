@@ -5,7 +5,7 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -44,6 +44,17 @@ class BagTopics:
     #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
     #: none
     depth: str = ''
+
+    def of_camera(self, name: str) -> 'BagTopics':
+        """Return the topics of one of several cameras; '' changes nothing."""
+        return replace(self, image=topic_of(name, self.image),
+                       camera_info=topic_of(name, self.camera_info),
+                       depth=topic_of(name, self.depth))
+
+
+def topic_of(camera: str, topic: str) -> str:
+    """Return the topic of one of several cameras: NAME/topic; '' changes nothing."""
+    return f'/{camera.strip("/")}/{topic.lstrip("/")}' if camera and topic else topic
 
 
 def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,

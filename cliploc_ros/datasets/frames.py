@@ -6,9 +6,10 @@ The one reader of evaluation, mapping and map editor. A source is read as a stre
 what is not wanted is never decoded, and a raw frame can be decoded in another process.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -45,10 +46,12 @@ class RawFrame:
     map_from_camera: NDArray[np.float64] | None  #: (4, 4)
     color: Callable[[], tuple[NDArray[np.uint8], Camera]]  #: Returns the image and its camera
     depth: Callable[[], DepthImage] | None = None  #: Returns the depth image
+    camera: str = ''  #: Its name, of several cameras
 
     def __str__(self) -> str:
         """Name the frame in messages."""
-        return f'image {self.place} at {self.stamp_ns / NS_PER_S:.6f} s'
+        of = f' of {self.camera}' if self.camera else ''
+        return f'image {self.place}{of} at {self.stamp_ns / NS_PER_S:.6f} s'
 
     def decode(self) -> Frame:
         """Return the frame.
@@ -72,6 +75,14 @@ class Frames:
     count: int  #: How many images there are
     #: Returns an iterator over the wanted frames, asked once for each image in order
     read_raw: Callable[[Wanted], Iterator[RawFrame]]
+    camera: str = ''  #: Its name, of several cameras
+    #: The frames of each of several cameras; empty for one
+    of_cameras: tuple['Frames', ...] = ()
+
+    @property
+    def each(self) -> tuple['Frames', ...]:
+        """Return the frames of each camera, one at least."""
+        return self.of_cameras or (self,)
 
     def read(self) -> Iterator[Frame]:
         """Yield all frames, decoded."""
@@ -86,6 +97,20 @@ class Frames:
             return self.read_raw(lambda place, stamp_ns, pose: place in chosen
                                  and is_wanted(place, stamp_ns, pose))
         return Frames(self.source, len(chosen), read_raw)
+
+
+def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
+    """Return the frames of several cameras of one recording, by name: camera after camera."""
+    first, parts = 0, []
+    for name, frames in of_cameras.items():
+        def read_raw(is_wanted: Wanted, name: str = name, frames: Frames = frames,
+                     first: int = first) -> Iterator[RawFrame]:
+            for raw in frames.read_raw(is_wanted):
+                yield replace(raw, place=first + raw.place, camera=name)
+        parts.append(replace(frames, read_raw=read_raw, camera=name))
+        first += frames.count
+    return Frames(parts[0].source, first, lambda is_wanted: chain.from_iterable(
+        part.read_raw(is_wanted) for part in parts), of_cameras=tuple(parts))
 
 
 @dataclass(frozen=True)

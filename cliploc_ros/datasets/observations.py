@@ -16,10 +16,25 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.datasets.queries import FRAME_FIELDS
 from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.files.arrays import FINITE, Arrays, Check, Field, Schema
+from cliploc_ros.files.arrays import FINITE, UNIQUE, ArrayError, Arrays, Check, Field, Schema
 from cliploc_ros.mapping.posed_detections import PosedDetections
 
-# F frames, n boxes, d numbers of an embedding.
+_OF_CAMERAS = ('camera_names', 'camera_sizes', 'camera_intrinsics', 'camera_rows')
+
+
+def _check_cameras(name: str, arrays: Arrays) -> None:
+    if missing := [one for one in _OF_CAMERAS if one not in arrays]:
+        raise ArrayError(f'array {missing[0]} is missing next to {name}')
+    if name != 'camera_rows':
+        return
+    count = len(arrays['camera_names'])
+    Check(f'names none of the {count} cameras', lambda rows: (rows < 0) | (rows >= count)
+          )(name, arrays)
+    if unseen := sorted({*range(count)} - {*arrays[name].tolist()}):
+        raise ArrayError(f"no frame is of the camera '{arrays['camera_names'][unseen[0]]}'")
+
+
+# F frames, n boxes, d numbers of an embedding, C cameras.
 _SCHEMA = Schema('observation file', {
     **FRAME_FIELDS,
     'image_size': Field('integers', (2,)),
@@ -33,6 +48,12 @@ _SCHEMA = Schema('observation file', {
         'is no rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
     'image_counts': Field('integers', (2,), is_optional=True),
+    # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each
+    # frame; image_size and intrinsics_fx_fy_cx_cy are the first one's
+    'camera_names': Field('text', ('C',), (UNIQUE, _check_cameras), is_optional=True),
+    'camera_sizes': Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
+    'camera_intrinsics': Field('numbers', ('C', 4), (FINITE, _check_cameras), is_optional=True),
+    'camera_rows': Field('integers', ('F',), (_check_cameras,), is_optional=True),
     'described': Field('text', is_optional=True),
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
@@ -56,6 +77,15 @@ class Recorded:
     described: str  #: All that the observations depend on; '' where unknown
 
 
+def camera_from_numbers(size: NDArray[Any], intrinsics: NDArray[Any]) -> Camera:
+    """Return the camera of width and height (2,), and fx, fy, cx, cy (4,).
+
+    CameraError: they are invalid.
+    """
+    (width, height), (fx, fy, cx, cy) = map(int, size), map(float, intrinsics)
+    return Camera(width, height, fx, fy, cx, cy)
+
+
 def load_observations(path: str | Path) -> PosedDetections:
     """Read and validate an observation file.
 
@@ -69,15 +99,15 @@ def load_observations(path: str | Path) -> PosedDetections:
 def load_recorded(path: str | Path) -> Recorded:
     """Read and validate an observation file, and how it came about; see load_observations."""
     arrays = _SCHEMA.read(Path(path))
-    width, height = map(int, arrays['image_size'])
     try:
-        fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
-        camera = Camera(width, height, fx, fy, cx, cy)
+        cameras = tuple(camera_from_numbers(*numbers) for numbers in zip(
+            arrays.get('camera_sizes', arrays['image_size'][None]),
+            arrays.get('camera_intrinsics', arrays['intrinsics_fx_fy_cx_cy'][None]), strict=True))
     except CameraError as error:
         raise _SCHEMA.invalid(Path(path), error) from error
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
     detections = PosedDetections(
-        camera=camera, map_from_camera=arrays['map_from_camera'].astype(np.float64),
+        cameras=cameras, map_from_camera=arrays['map_from_camera'].astype(np.float64),
         stamps_s=arrays['timestamps'].astype(np.float64),
         frame_offsets=arrays['frame_offsets'].astype(np.int64),
         bboxes_xyxy=arrays['boxes_xyxy'].astype(np.float64),
@@ -86,6 +116,8 @@ def load_recorded(path: str | Path) -> Recorded:
         encoder_key=str(arrays.get('encoder_key', '')),
         odom_from_camera=(arrays['odom_from_camera'].astype(np.float64)
                           if 'odom_from_camera' in arrays else None),
+        camera_rows=arrays['camera_rows'].astype(np.int64) if 'camera_rows' in arrays else None,
+        camera_names=tuple(map(str, arrays.get('camera_names', ('',)))),
         **{name: arrays.get(name) for name in _OPTIONAL if name != 'odom_from_camera'})
     order = np.argsort(detections.stamps_s, kind='stable')
     if (order != np.arange(len(order))).any():
@@ -118,11 +150,11 @@ def save_recorded(path: str | Path, recorded: Recorded) -> None:
 
 
 def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
-    camera = detections.camera
+    sizes = np.array([[one.width, one.height] for one in detections.cameras])
+    intrinsics = np.array([[one.fx, one.fy, one.cx, one.cy] for one in detections.cameras])
     names = np.array(detections.class_names, dtype=np.str_)
     arrays: dict[str, NDArray[Any]] = {
-        'intrinsics_fx_fy_cx_cy': np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-        'image_size': np.array([camera.width, camera.height]),
+        'intrinsics_fx_fy_cx_cy': intrinsics[0], 'image_size': sizes[0],
         'frame_offsets': detections.frame_offsets,
         'boxes_xyxy': detections.bboxes_xyxy,
         'class_ids': names[detections.classes] if len(names) else np.empty(0, dtype=np.str_),
@@ -133,6 +165,9 @@ def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
     for name in _OPTIONAL:
         if (values := getattr(detections, name)) is not None:
             arrays[name] = values
+    if detections.camera_names != ('',):
+        arrays |= {'camera_names': np.array(detections.camera_names), 'camera_sizes': sizes,
+                   'camera_intrinsics': intrinsics, 'camera_rows': detections.frame_cameras}
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
     # embeddings do not compress, and take minutes to try

@@ -57,7 +57,7 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
     """Return recorded frames as queries, each a group of its own; true landmarks are unknown."""
     detections = recorded.detections
     assert detections.embeddings is not None
-    camera, names = detections.camera, detections.class_names
+    camera, names = detections.cameras[0], detections.class_names
     frames = []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))

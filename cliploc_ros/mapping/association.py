@@ -116,7 +116,7 @@ def _overlaps(views, centers, bases, groups, min_iou):
                         bases[landmark], projected[landmark])
                 if not visible[landmark]:
                     continue
-                iou = box_iou(projected[landmark], views.edges[row], views.bounds)
+                iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
                 if iou > min_iou:
                     if count == capacity:
                         capacity *= 2
@@ -181,7 +181,7 @@ def ious_with(views, rows, center, basis):
     for place in range(len(rows)):
         frame = views.frames[rows[place]]
         if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
-            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds)
+            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds[frame])
     return ious
 
 
@@ -261,6 +261,6 @@ def seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64])
     """
     _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
                                       return_indices=True)
-    apart = sum(box_iou(views.edges[row], views.edges[other], views.bounds) < _ONE_BOX_IOU
-                for row, other in zip(rows[first], others[second], strict=True))
+    apart = sum(box_iou(views.edges[row], views.edges[other], views.bounds[views.frames[row]])
+                < _ONE_BOX_IOU for row, other in zip(rows[first], others[second], strict=True))
     return float(apart) / max(1, min(len(rows), len(others)))

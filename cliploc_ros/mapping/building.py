@@ -138,6 +138,9 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     MappingError: no map can be made of this input; the message says what to correct.
     """
     options = options or MappingOptions()
+    if options.refine_mount and len(detections.cameras) > 1:
+        raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
+                           'together; correct each with a map of --cameras NAME alone')
     tell = progress or (lambda stage, share: None)
     given = make_views(detections, options)
     notes = check_input(detections, given, options)
@@ -147,8 +150,10 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         # the draft of boxes alone tells the scale of depth
         evidence = gather_evidence(given, draft.landmarks, draft.shown)
         given = add_depths(given, detections)
-        scale = depth_scale(given, draft.landmarks, draft.shown, evidence.baseline_deg)
-        given, depth_notes = correct_scale(given, detections, scale)
+        scales = [depth_scale(given, draft.landmarks, np.where(
+            given.cameras[given.frames] == number, draft.shown, -1), evidence.baseline_deg)
+            for number in range(len(detections.cameras))]
+        given, depth_notes = correct_scale(given, detections, scales)
         notes += depth_notes
         options = options_with_depth(options)
         draft = _draft(given, options, rng, tell)
@@ -307,7 +312,7 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
     centers_m = draft.left_out.centers.round(3).tolist()
     against = draft.evidence_against
     report = MappingReport(
-        len(detections), int(views.viewpoints[-1]) + 1, len(detections.classes), count,
+        len(detections), int(views.viewpoints.max()) + 1, len(detections.classes), count,
         explained, median_iou, *pose_changes(given, views), tuple(
             LeftOut(detections.class_names[draft.left_out.classes[row]], tuple(centers_m[row]),
                     int(against.support[row]), int(against.viewpoints[row]), draft.reasons[row])

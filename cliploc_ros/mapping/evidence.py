@@ -119,7 +119,7 @@ def is_expected(views, cameras, center, basis, reach):
             continue
         expected[frame] = project_box(
             views.rotations[frame], views.translations[frame], center, basis, box
-        ) and is_in_image(box, views.bounds)
+        ) and is_in_image(box, views.bounds[frame])
     return expected
 
 

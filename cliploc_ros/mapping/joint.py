@@ -37,7 +37,7 @@ from cliploc_ros.mapping.landmarks import (
     move_ellipsoid,
 )
 from cliploc_ros.mapping.odometry import Steps
-from cliploc_ros.mapping.options import PoseErrors
+from cliploc_ros.mapping.options import INSTANT_S, PoseErrors
 from cliploc_ros.mapping.views import Views, camera_centers
 
 _BEHIND_COST = 4.0 * 20.0
@@ -57,8 +57,7 @@ class Prior(NamedTuple):
     def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'Prior':
         """Return the prior of frames at some times."""
         kept = np.zeros(len(stamps_s))
-        if errors.correlation_s > 0.0:
-            kept[:-1] = np.exp(-np.maximum(np.diff(stamps_s), 1e-3) / errors.correlation_s)
+        kept[:-1] = errors.kept(np.maximum(np.diff(stamps_s), INSTANT_S))
         # information of the innovation between a frame and the next one
         gain = 1.0 / (1.0 - kept[:-1] ** 2)
         diagonal = np.ones(len(stamps_s))
@@ -154,10 +153,15 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
 
 
 def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
-    """Return by how much given poses are off (F, 6): x, y, z [m], rotation vector [rad]."""
+    """Return by how much given poses are off (F, 6): x, y, z [m], rotation vector [rad].
+
+    Errors are those of the rig's first camera. Another camera's centre is off by its lever's turn,
+    too.
+    """
     offsets = camera_centers(present) - camera_centers(given)
     turns = np.einsum('fji,fjk->fik', present.rotations, given.rotations)
-    return np.concatenate([offsets, Rotation.from_matrix(turns).as_rotvec()], axis=1)
+    rotvecs = Rotation.from_matrix(turns).as_rotvec()
+    return np.concatenate([offsets - np.cross(rotvecs, given.levers), rotvecs], axis=1)
 
 
 def pose_changes(given: Views, present: Views) -> tuple[float, float]:
@@ -183,7 +187,8 @@ class State(NamedTuple):
         turned = Rotation.from_rotvec(pose_steps[:, 3:]).as_matrix().transpose(0, 2, 1)
         origins = camera_centers(self.views)
         rotations = np.ascontiguousarray(self.views.rotations @ turned)
-        translations = -np.einsum('fij,fj->fi', rotations, origins + pose_steps[:, :3])
+        shifts = pose_steps[:, :3] + np.cross(pose_steps[:, 3:], self.views.levers)
+        translations = -np.einsum('fij,fj->fi', rotations, origins + shifts)
         return State(self.views._replace(rotations=rotations, translations=translations),
                       Landmarks(centers, bases, self.landmarks.classes),
                       self.errors + pose_steps)
@@ -291,6 +296,12 @@ def _accumulate(views, rows, landmarks, centers, bases, of_landmarks, of_poses, 
         # a pose's error in the map's axes moves the map against it in the camera's
         by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
                                  axis=1)
+        x, y, z = views.levers[frame]
+        for edge in range(4):
+            across = by_pose[edge, :3]
+            by_pose[edge, 3] += y * across[2] - z * across[1]
+            by_pose[edge, 4] += z * across[0] - x * across[2]
+            by_pose[edge, 5] += x * across[1] - y * across[0]
         for edge in range(4):
             residual = edge_residual(views, row, edge, box)
             if residual == 0.0:

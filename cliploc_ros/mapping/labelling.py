@@ -46,7 +46,7 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
     Frames of one viewpoint share the weight of one. Embeddings of the length 0 are no crops.
     """
     assert detections.embeddings is not None
-    viewpoints = number_viewpoints(detections.map_from_camera)
+    viewpoints = number_viewpoints(detections)
     weights = (1.0 / np.bincount(viewpoints))[viewpoints][detections.frames]
     size = detections.embeddings.shape[1]
     means = np.zeros((len(landmark_ids), size), dtype=np.float16)

@@ -68,10 +68,13 @@ class Steps(NamedTuple):
         jacobian = np.zeros((len(firsts), POSE_SIZE, 2 * POSE_SIZE))
         axes = np.arange(POSE_SIZE)
         jacobian[:, axes, axes], jacobian[:, axes, POSE_SIZE + axes] = -1.0, 1.0
-        x, y, z = np.einsum('fji,fj->if', views.rotations[firsts], self.shifts)
-        jacobian[:, 0, 4], jacobian[:, 0, 5] = -z, y
-        jacobian[:, 1, 3], jacobian[:, 1, 5] = z, -x
-        jacobian[:, 2, 3], jacobian[:, 2, 4] = -y, x
+        # a turn of the rig moves what odometry predicts, and both cameras
+        ahead = np.einsum('fji,fj->if', views.rotations[firsts], self.shifts)
+        for column, (x, y, z) in ((0, ahead + views.levers[firsts].T),
+                                  (POSE_SIZE, -views.levers[seconds].T)):
+            jacobian[:, 0, column + 4], jacobian[:, 0, column + 5] = -z, y
+            jacobian[:, 1, column + 3], jacobian[:, 1, column + 5] = z, -x
+            jacobian[:, 2, column + 3], jacobian[:, 2, column + 4] = -y, x
         weighted = jacobian * weights[:, :, None]
         blocks = weighted.transpose(0, 2, 1) @ jacobian
         pulls = np.einsum('mij,mi->mj', weighted, residuals.reshape(-1, POSE_SIZE))
@@ -89,8 +92,8 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
                 noise: OdometryErrors) -> tuple[Steps | None, str]:
     """Return the steps of odometry that do not contradict the given poses, and a note on them.
 
-    Odometry (F, 4, 4) is NaN where unknown. No steps: odometry as a whole contradicts the poses,
-    or joins no frames.
+    Odometry (F, 4, 4) is NaN where unknown. Of several cameras, the one with the most frames tells
+    whether odometry as a whole contradicts the poses. No steps: it does, or joins no frames.
     """
     frames = np.nonzero(np.isfinite(odom_from_camera).all(axis=(1, 2)))[0]
     before = np.nonzero(np.diff(frames) == 1)[0]
@@ -98,7 +101,7 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
         return None, 'odometry is left out: no two successive frames have it'
     with np.errstate(over='ignore', invalid='ignore'):  # NaN contradicts the poses, too
         known = _Known(given, frames, odom_from_camera[frames], errors, noise)
-        if complaint := known.contradiction():
+        if complaint := known.of_one_camera.contradiction():
             return None, complaint
         pairs = known.compare(before, before + 1)
     kept = pairs.excess <= _JUMP
@@ -137,11 +140,23 @@ class _Known:
         self._given, self._frames, self._poses = given, frames, poses
         self._errors, self._noise = errors, noise
         self._stamps_s = given.stamps_s[frames]
-        # by odometry since the first frame, along the way [m] [rad]
-        steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-        turns = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
-        self._distances_m = np.cumsum([0.0, *steps_m])
-        self._angles = np.cumsum([0.0, *Rotation.from_matrix(turns).magnitude()])
+        cameras = given.cameras[frames]
+        self._is_leading = cameras == np.argmax(np.bincount(cameras))
+        # by odometry since the first frame, along the way [m] [rad] of the camera with the most
+        # frames: from one camera to the next there is no way
+        own, times = poses[self._is_leading], self._stamps_s[self._is_leading]
+        steps_m = np.linalg.norm(np.diff(own[:, :3, 3], axis=0), axis=1)
+        turns = own[:-1, :3, :3].transpose(0, 2, 1) @ own[1:, :3, :3]
+        self._distances_m, self._angles = (
+            np.interp(self._stamps_s, times, np.cumsum([0.0, *steps]))
+            for steps in (steps_m, Rotation.from_matrix(turns).magnitude()))
+
+    @property
+    def of_one_camera(self) -> '_Known':
+        """Return the frames of the camera with the most of them."""
+        rows = self._is_leading
+        return _Known(self._given, self._frames[rows], self._poses[rows], self._errors,
+                      self._noise)
 
     def contradiction(self) -> str:
         """Return how odometry as a whole contradicts the poses; '' where it does not."""
@@ -176,8 +191,7 @@ class _Known:
                                     self._angles[seconds] - self._angles[firsts])
         # deviations of motions by odometry and by given poses
         seconds_s = self._stamps_s[seconds] - self._stamps_s[firsts]
-        kept = (np.exp(-seconds_s / errors.correlation_s) if errors.correlation_s > 0.0
-                else np.zeros(len(seconds_s)))
+        kept = errors.kept(seconds_s)
         sigma_m, sigma_rad = errors.sigmas[[0, 3]]
         of_turns = np.square(sigmas[:, 1]) + 2.0 * sigma_rad ** 2 * (1.0 - kept)
         # a rotation that is off moves what is far away

@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 
+#: Frames this near in time are of one instant [s], and the share of a pose's error that they have
+#: in common where errors have no time constant.
+INSTANT_S, _KEPT_AT_ONCE = 1e-3, 0.999
+
 
 @dataclass(frozen=True)
 class PoseErrors:
@@ -25,6 +29,15 @@ class PoseErrors:
     def sigmas(self) -> NDArray[np.float64]:
         """Return the standard deviations (6,) [m] [rad]."""
         return np.repeat([self.sigma_m, np.radians(self.sigma_deg)], 3)
+
+    def kept(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the share of an error that is left after times (n,) [s].
+
+        Frames of one instant are of several cameras of one robot, and err alike.
+        """
+        if self.correlation_s > 0.0:
+            return np.asarray(np.exp(-seconds / self.correlation_s))
+        return np.where(seconds <= INSTANT_S, _KEPT_AT_ONCE, 0.0)
 
 
 @dataclass(frozen=True)

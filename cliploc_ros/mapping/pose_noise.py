@@ -32,7 +32,7 @@ from cliploc_ros.mapping.joint import (
     refine_jointly,
 )
 from cliploc_ros.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes, project_box
-from cliploc_ros.mapping.options import PoseErrors
+from cliploc_ros.mapping.options import INSTANT_S, PoseErrors
 from cliploc_ros.mapping.views import Views
 
 # The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
@@ -98,8 +98,9 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
 
 def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return one frame of each of some viewpoints, evenly chosen, and the rows of their boxes."""
-    _, firsts = np.unique(views.viewpoints, return_index=True)
-    middles = (firsts + np.append(firsts[1:], len(views.rotations))) // 2
+    order = np.argsort(views.viewpoints, kind='stable')
+    _, firsts, counts = np.unique(views.viewpoints[order], return_index=True, return_counts=True)
+    middles = np.sort(order[firsts + counts // 2])
     left_out = max(0, len(middles) - _MAX_SPAN)
     places = np.linspace(left_out // 2, len(middles) - 1 - (left_out - left_out // 2),
                          _MAX_FRAMES).astype(np.int64)
@@ -112,8 +113,10 @@ def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> V
     offsets = np.searchsorted(rows, views.offsets)
     return views._replace(
         rotations=views.rotations[frames], translations=views.translations[frames],
-        stamps_s=views.stamps_s[frames], viewpoints=np.arange(len(frames)),
-        weights=np.ones(len(frames)), offsets=np.append(offsets[frames], len(rows)),
+        stamps_s=views.stamps_s[frames], cameras=views.cameras[frames],
+        levers=views.levers[frames], bounds=views.bounds[frames],
+        viewpoints=np.arange(len(frames)), weights=np.ones(len(frames)),
+        offsets=np.append(offsets[frames], len(rows)),
         frames=np.searchsorted(frames, views.frames[rows]), classes=views.classes[rows],
         edges=views.edges[rows], stiffness=views.stiffness[rows], is_open=views.is_open[rows],
         depths=views.depths[rows], depth_stiffness=views.depth_stiffness[rows])
@@ -229,7 +232,9 @@ def _share_left(stamps_s, weights, correlation_s):
     for place in range(len(stamps_s)):
         if place > 0:
             step = stamps_s[place] - stamps_s[place - 1]
-            kept = np.exp(-step / correlation_s) if correlation_s > 0.0 else 0.0
+            kept = 1.0 if step <= INSTANT_S else 0.0
+            if correlation_s > 0.0:
+                kept = np.exp(-step / correlation_s)
             before = kept * (before + weights[place - 1])
         squares += weights[place] * (weights[place] + 2.0 * before)
         total += weights[place]

@@ -18,9 +18,12 @@ _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embe
 
 @dataclass(frozen=True)
 class PosedDetections:
-    """Detections of F frames with their poses: n boxes of C classes, in the order of time."""
+    """Detections of F frames with their poses: n boxes of C classes, in the order of time.
 
-    camera: Camera  #: Of the undistorted images
+    The frames of several cameras of one robot interleave.
+    """
+
+    cameras: tuple[Camera, ...]  #: Of the undistorted images
     map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses to map with
     stamps_s: NDArray[np.float64]  #: (F,): times of the images [s], ascending
     #: (F + 1,): frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1]
@@ -41,6 +44,9 @@ class PosedDetections:
     #: lens with distortion, whose border is no straight line of the undistorted image; None: an
     #: edge is open at the border of that.
     open_edges: NDArray[np.bool_] | None = None
+    #: (F,): the row of each frame's camera among the cameras; None: all are of the first
+    camera_rows: NDArray[np.int64] | None = None
+    camera_names: tuple[str, ...] = ('',)  #: Of the cameras; '' where the only one has no name
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -50,6 +56,37 @@ class PosedDetections:
     def frames(self) -> NDArray[np.int64]:
         """Return the frame (n,) of each box."""
         return np.repeat(np.arange(len(self)), np.diff(self.frame_offsets))
+
+    @cached_property
+    def frame_cameras(self) -> NDArray[np.int64]:
+        """Return the row (F,) of each frame's camera."""
+        rows = self.camera_rows
+        return np.zeros(len(self), dtype=np.int64) if rows is None else rows
+
+    @cached_property
+    def by_camera(self) -> NDArray[np.int64]:
+        """Return the frames (F,) camera after camera, those of each in the order of time."""
+        return np.argsort(self.frame_cameras, kind='stable')
+
+    def camera_of(self, frame: int) -> Camera:
+        """Return the camera of a frame."""
+        return self.cameras[self.frame_cameras[frame]]
+
+    def name_of(self, frame: int) -> str:
+        """Return the name of a frame's camera; '' where there is one without a name."""
+        return self.camera_names[self.frame_cameras[frame]]
+
+    @property
+    def of_first_camera(self) -> NDArray[np.float64]:
+        """Return the poses (k, 4, 4) of the first camera."""
+        return self.map_from_camera[self.frame_cameras == 0]
+
+    def every(self, step: int, first: int = 0) -> NDArray[np.int64]:
+        """Return each n-th frame of each camera, in the order of time.
+
+        Of interleaved frames alone, each n-th one may be of the same camera.
+        """
+        return np.sort(self.by_camera[first::step])
 
     def select_frames(self, frames: Sequence[int] | NDArray[np.int64]) -> 'PosedDetections':
         """Return the detections of some frames, in the order given."""
@@ -61,7 +98,8 @@ class PosedDetections:
             self, map_from_camera=self.map_from_camera[frames], stamps_s=self.stamps_s[frames],
             frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])), **self._of(boxes),
             odom_from_camera=(None if self.odom_from_camera is None
-                              else self.odom_from_camera[frames]))
+                              else self.odom_from_camera[frames]),
+            camera_rows=None if self.camera_rows is None else self.camera_rows[frames])
 
     def select_boxes(self, boxes: NDArray[np.bool_]) -> 'PosedDetections':
         """Return all frames with some of their boxes: those of a mask (n,)."""

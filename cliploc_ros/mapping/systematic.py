@@ -13,7 +13,7 @@ sum takes that into account (the sandwich estimator, White 1980).
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -92,16 +92,20 @@ class _Cause(NamedTuple):
 
 def find_corrections(detections: PosedDetections, views: Views, landmarks: Landmarks,
                      shown: NDArray[np.int64]) -> list[Correction]:
-    """Return the corrections that fit the edges best; none with too few boxes.
+    """Return the corrections that fit the edges best; none of a camera with too few boxes.
 
-    The landmarks are fitted to these boxes.
+    The landmarks are fitted to these boxes. Each camera is corrected on its own, while the
+    landmarks fit the boxes of all.
     """
-    rows = _sample(shown)
-    if len(rows) < _MIN_BOXES:
-        return []
-    return [one for cause in (_intrinsics(detections.camera), _mount(detections.camera),
-                              _stamps(detections.camera, views))
-            for one in _fit(cause, views, landmarks, rows, shown[rows])]
+    rows, found = _sample(shown), list[Correction]()
+    for number, camera in enumerate(detections.cameras):
+        if np.count_nonzero(views.cameras[views.frames[rows]] == number) < _MIN_BOXES:
+            continue
+        name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
+        found += [replace(one, name=one.name + name) for cause in (
+            _intrinsics(camera), _mount(camera), _stamps(camera, views, number))
+            for one in _fit(cause, number, views, landmarks, rows, shown[rows])]
+    return found
 
 
 def _intrinsics(camera: Camera) -> _Cause:
@@ -146,11 +150,12 @@ def _mount(camera: Camera) -> _Cause:
                       views, np.tile(values, (len(views.rotations), 1))))
 
 
-def _stamps(camera: Camera, views: Views) -> _Cause:
+def _stamps(camera: Camera, views: Views, number: int) -> _Cause:
     # how the map moves in the camera (F, 6) [m/s] [rad/s], by central differences
     rotations, translations = views.rotations, views.translations
-    later = np.minimum(np.arange(len(rotations)) + 1, len(rotations) - 1)
-    earlier = np.maximum(np.arange(len(rotations)) - 1, 0)
+    own = np.nonzero(views.cameras == number)[0]
+    later, earlier = np.arange(len(rotations)), np.arange(len(rotations))
+    later[own[:-1]], earlier[own[1:]] = own[1:], own[:-1]
     seconds = (views.stamps_s[later] - views.stamps_s[earlier])[:, None]
     turns = np.einsum('fij,fkj->fik', rotations[later], rotations[earlier])
     # x_later = turn x_earlier + shift, linearized about the frame
@@ -159,7 +164,7 @@ def _stamps(camera: Camera, views: Views) -> _Cause:
     smooth = (seconds > 0.0) & (seconds < 0.5)
     twists = np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
     speeds = np.abs(twists[:, 3:]).max(axis=1) + np.abs(twists[:, :3]).max(axis=1) / 2.0
-    pixels_per_ms = 0.5 * (camera.fx + camera.fy) * float(np.quantile(speeds, 0.9)) / 1000.0
+    pixels_per_ms = 0.5 * (camera.fx + camera.fy) * float(np.quantile(speeds[own], 0.9)) / 1000.0
     return _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,), (pixels_per_ms,),
                   lambda views, rows, linear: np.einsum(
                       'mep,mp->me', linear.by_pose, twists[views.frames[rows]])[:, :, None],
@@ -174,17 +179,29 @@ def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
         translations=np.einsum('fij,fj->fi', turns, views.translations) + motions[:, :3])
 
 
-def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int64],
+def _only(camera: int, moved: Views, given: Views) -> Views:
+    """Return the views with what was moved of one camera."""
+    frames = given.cameras == camera
+    boxes = frames[given.frames]
+    return given._replace(**{
+        name: np.where(own.reshape(-1, *[1] * (getattr(given, name).ndim - 1)),
+                       getattr(moved, name), getattr(given, name))
+        for name, own in (('rotations', frames), ('translations', frames), ('edges', boxes),
+                          ('stiffness', boxes))})
+
+
+def _fit(cause: _Cause, camera: int, given: Views, landmarks: Landmarks, rows: NDArray[np.int64],
          numbers: NDArray[np.int64]) -> Iterator[Correction]:
-    """Yield the numbers of a cause that fit best."""
+    """Yield the numbers of a cause that fit one camera best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
+    own = given.cameras[given.frames[rows]] == camera
     linear = linearize_boxes(views, rows, numbers, landmarks)
-    cost_before = cost = _cost_of(linear)
+    cost, own_before = _cost_of(linear), _cost_of(linear, own)
     for _ in range(_STEPS):
-        step, deviations = _solve(cause.differentiate(views, rows, linear), linear, numbers,
-                                  viewpoints)
-        moved = cause.apply(given, values + step)
+        step, deviations = _solve(cause.differentiate(views, rows, linear) * own[:, None, None],
+                                  linear, numbers, viewpoints)
+        moved = _only(camera, cause.apply(given, values + step), given)
         refitted = _refit(moved, landmarks, rows, numbers)
         trial = linearize_boxes(moved, rows, numbers, refitted)
         if _cost_of(trial) >= cost:
@@ -193,7 +210,7 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, rows: NDArray[np.int
         cost = _cost_of(linear)
         if (np.abs(step) < 0.2 * deviations).all():
             break
-    explained = max(0.0, 1.0 - cost / max(cost_before, 1e-12))
+    explained = max(0.0, 1.0 - _cost_of(linear, own) / max(own_before, 1e-12))
     for value, deviation, name, unit, factor, effect in zip(
             values, deviations, cause.names, cause.units, cause.factors, cause.effects_px,
             strict=True):
@@ -211,10 +228,10 @@ def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
     return fit_landmarks(views, landmarks, boxes, _REFIT_STEPS)
 
 
-def _cost_of(linear: Linear) -> float:
+def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
     """Return the robust cost of residuals; their weight is 1 / (1 + r^2 / c^2)."""
-    known = linear.weights > 0.0
-    return float(-np.log(linear.weights[known]).sum())
+    weights = linear.weights[rows]
+    return float(-np.log(weights[weights > 0.0]).sum())
 
 
 def linearize_boxes(views: Views, rows: NDArray[np.int64], numbers: NDArray[np.int64],

@@ -8,6 +8,7 @@ hypothesis with the greatest support is fitted to that support and takes its box
 next. Every box is the seed of some hypotheses, so that rare objects get their share.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import sqrt
 
@@ -64,12 +65,14 @@ def options_with_depth(options: MappingOptions) -> MappingOptions:
         options.max_position_sigma_m, _MAX_POSITION_SIGMA_M))
 
 
-def add_depths(views: Views, detections: PosedDetections, scale: float = 1.0) -> Views:
+def add_depths(views: Views, detections: PosedDetections,
+               scales: NDArray[np.float64] | None = None) -> Views:
     """Return views that know how deep the centre of each box's object lies.
 
-    The scale is true depth divided by measured depth.
+    The scales are true depth divided by measured depth, of each camera; None: all are 1.
     """
     assert detections.depths is not None
+    scale = 1.0 if scales is None else scales[views.cameras[views.frames]]
     surfaces = scale * detections.depths.astype(np.float64)
     spreads = (np.zeros_like(surfaces) if detections.depth_spreads is None
                else scale * detections.depth_spreads)
@@ -106,7 +109,8 @@ def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                 baselines_deg: NDArray[np.float64]) -> float | None:
     """Return true depth divided by measured depth; None where too few landmarks tell.
 
-    The landmarks are fitted to boxes only; those with enough parallax tell.
+    The landmarks are fitted to boxes only; those with enough parallax tell. The array shown (n,)
+    is -1 for boxes of other cameras.
     """
     ratios = []
     for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
@@ -120,22 +124,26 @@ def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
     return float(np.median(ratios)) if len(ratios) >= _LEAST_LANDMARKS else None
 
 
-def correct_scale(views: Views, detections: PosedDetections, scale: float | None
+def correct_scale(views: Views, detections: PosedDetections, scales: Sequence[float | None]
                   ) -> tuple[Views, list[str]]:
-    """Return the views with depth of the right scale, and notes.
+    """Return the views with depth of the right scale, and notes; each camera has its own scale.
 
-    MappingError: the scale is so far off that depth must have another unit.
+    MappingError: a scale is so far off that depth must have another unit.
     """
-    if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
-        return views, []
-    if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
-        raise MappingError(
-            f'measured depth is {1.0 / scale:.3g} times what boxes and poses say: wrong unit? '
-            f'multiply --depth-unit by {scale:.3g}, check the poses are in metres, or leave '
-            'depth out')
-    note = (f'measured depth is {1.0 / scale:.3f} times what boxes and poses say; it is corrected '
-            'by that')
-    return add_depths(views, detections, scale), [note]
+    kept, notes = np.ones(len(scales)), list[str]()
+    for number, scale in enumerate(scales):
+        if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
+            continue
+        name = f' of {detections.camera_names[number]}' if len(scales) > 1 else ''
+        if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
+            raise MappingError(
+                f'measured depth{name} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
+                f'unit? multiply --depth-unit by {scale:.3g}, check the poses are in metres, or '
+                'leave depth out')
+        kept[number] = scale
+        notes.append(f'measured depth{name} is {1.0 / scale:.3f} times what boxes and poses say; '
+                     'it is corrected by that')
+    return (add_depths(views, detections, kept) if notes else views), notes
 
 
 def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
@@ -292,7 +300,7 @@ def _support(views, rows, frames, starts, center, basis):
             continue
         best = SUPPORT_IOU
         for row in rows[starts[place]:starts[place + 1]]:
-            iou = box_iou(box, views.edges[row], views.bounds)
+            iou = box_iou(box, views.edges[row], views.bounds[frame])
             if iou > best:
                 best = iou
                 found[count] = row

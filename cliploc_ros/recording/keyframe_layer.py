@@ -61,16 +61,17 @@ _DEFAULT = LayerOptions()
 
 
 class _Seen(NamedTuple):
-    """A keyframe: its features (undistorted pixels, strongest first), their depths, its JPEG."""
+    """A keyframe: its features (strongest first), their depths, its JPEG, and its camera."""
 
     posed: PosedFeatures
     depths: NDArray[np.float64]
     jpeg: bytes
+    camera: Camera  #: Of the undistorted image
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
                 ) -> KeyframeLayer:
-    """Return the keyframes of a recording, in the coordinate frame of its poses.
+    """Return the keyframes of each camera of a recording, in the coordinate frame of its poses.
 
     Parameters
     ----------
@@ -84,21 +85,19 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     MappingError
         No image has enough points.
     """
-    camera, seen = None, []
-    for frame in _chosen(frames, options):
-        camera = camera or frame.camera.pinhole
-        seen.append(_look(frame, options))
+    seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
     images = [one.posed for one in seen]
     points = [_points(images, row, one.depths) for row, one in enumerate(seen)]
     # the strongest features that have a point
     kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
             for found in points]
     rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
-    if camera is None or not rows:
+    if not rows:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
                            f'{_LEAST_POINTS} features with a place in the map; record depth, or '
                            'images that overlap and are 5 cm or more apart')
-    layer = _assemble(landmark_map, camera, [images[row] for row in rows],
+    layer = _assemble(landmark_map, [seen[row].camera for row in rows],
+                      [images[row] for row in rows],
                       [points[row] for row in rows], [kept[row] for row in rows],
                       FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
                       else TRIANGULATED)
@@ -145,7 +144,7 @@ def _look(frame: Frame, options: LayerOptions) -> _Seen:
         known &= np.cumsum(known) <= options.most_points
     return _Seen(PosedFeatures(frame.map_from_camera, bearings[known],
                                features.descriptors[known]), depths[known],
-                 _small_jpeg(frame) if options.images else b'')
+                 _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
 
 
 def _small_jpeg(frame: Frame) -> bytes:
@@ -169,13 +168,15 @@ def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float6
     return triangulate(images, row)
 
 
-def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedFeatures],
-              points: Sequence[NDArray[np.float64]], kept: Sequence[NDArray[np.int64]],
-              deviation_per_metre: float) -> KeyframeLayer:
+def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
+              images: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
+              kept: Sequence[NDArray[np.int64]], deviation_per_metre: float) -> KeyframeLayer:
     descriptors = np.concatenate([one.descriptors[rows]
                                   for one, rows in zip(images, kept, strict=True)])
-    pixels = np.concatenate([one.bearings[rows] for one, rows in zip(images, kept, strict=True)])
-    pixels = pixels * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    pixels = np.concatenate([
+        one.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        for one, rows, camera in zip(images, kept, cameras, strict=True)])
+    camera, *others = dict.fromkeys(cameras)
     vocabulary = learn_words(descriptors)
     return KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
@@ -186,4 +187,6 @@ def _assemble(landmark_map: LandmarkMap, camera: Camera, images: Sequence[PosedF
         np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
                        ).astype(np.float32),
         descriptors, nearest_words(unit_rows(descriptors), unit_rows(vocabulary)
-                                   ).astype(np.uint16), vocabulary, deviation_per_metre)
+                                   ).astype(np.uint16), vocabulary, deviation_per_metre,
+        other_cameras=tuple(others), camera_rows=None if not others else np.array(
+            [[camera, *others].index(one) for one in cameras]))

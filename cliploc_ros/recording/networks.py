@@ -16,6 +16,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets.depth import depths_of_boxes
 from cliploc_ros.datasets.frames import RawFrame
 from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.views import at_border
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.profiles import load_detector
@@ -29,8 +30,9 @@ MAX_DETECTIONS = 50
 class SeenFrame:
     """What detector and CLIP said about a frame: n boxes."""
 
-    #: Number of the image in its source, and its stamp [ns]
+    #: Number of the image in its source, name of its camera ('' for one), and its stamp [ns]
     place: int
+    camera: str
     stamp_ns: int
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     #: (2,), (4,): width and height, and fx, fy, cx, cy of the undistorted image [px]
@@ -117,7 +119,7 @@ class Look:
         if frame.depth is not None:
             depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
         return SeenFrame(
-            raw.place, raw.stamp_ns, frame.map_from_camera,
+            raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
             np.array([camera.width, camera.height]),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
             open_edges[rows] if any(camera.distortion) else open_edges,
@@ -132,8 +134,7 @@ def _undistorted(detections: Detections, camera: Camera
     boxes = detections.bboxes_xyxy
     if not any(camera.distortion):
         return boxes, np.empty((0, 4), dtype=np.bool_)
-    border_px = MappingOptions.border_px
-    is_open = np.hstack([boxes[:, :2] <= border_px, boxes[:, 2:] >= np.array(
-        [camera.width, camera.height]) - border_px])
+    is_open = at_border(boxes, np.array([camera.width, camera.height] * 2),
+                        MappingOptions.border_px)
     undistorted = camera.normalize_bboxes(boxes)
     return undistorted * ([camera.fx, camera.fy] * 2) + [camera.cx, camera.cy] * 2, is_open

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,20 @@ from tqdm import tqdm
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.datasets.depth import check_depth_unit
-from cliploc_ros.datasets.frames import Frames, RawFrame, Wanted
-from cliploc_ros.datasets.observations import Recorded, load_recorded, save_recorded
+from cliploc_ros.datasets.frames import Frames, RawFrame
+from cliploc_ros.datasets.observations import (
+    Recorded,
+    camera_from_numbers,
+    load_recorded,
+    save_recorded,
+)
 from cliploc_ros.datasets.poses import Poses
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.views import at_border
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.networks import LoadNetworks, SeenFrame
@@ -62,7 +69,7 @@ EVERY_FRAME = KeyframeOptions(0.0, 0.0)
 
 
 class KeyframeFilter:
-    """Asked once for each frame of a recording in order, tells whether it is a keyframe."""
+    """Asked once for each frame of a camera in order, tells whether it is a keyframe."""
 
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
@@ -132,7 +139,7 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
 
 
 def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
-                odometry: Poses | None = None) -> Recorded:
+                odometry: Mapping[str, Poses] | None = None) -> Recorded:
     """Return the observations of a source: those of an earlier run, or record them.
 
     Odometry is no part of what the networks depend on: an earlier run without it serves as well.
@@ -141,8 +148,9 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     ----------
     file : Path, optional
         The observation file; None: see observation_file.
-    odometry : Poses, optional
-        Of the camera, with odometry's coordinate frame in the place of the map's.
+    odometry : dict, optional
+        Poses of each camera by its name, with odometry's coordinate frame in the place of the
+        map's.
 
     Raises
     ------
@@ -173,11 +181,12 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     return recorded
 
 
-def _with_odometry(recorded: Recorded, odometry: Poses | None) -> Recorded:
+def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> Recorded:
     """Return observations with the odometry at their stamps, in the place of any other one."""
     placed = None
     if odometry is not None:
-        poses = [odometry.pose_at(int(stamp_ns)) for stamp_ns in recorded.stamps_ns]
+        poses = [odometry[recorded.detections.name_of(frame)].pose_at(int(stamp_ns))
+                 for frame, stamp_ns in enumerate(recorded.stamps_ns)]
         placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
     return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
 
@@ -189,10 +198,9 @@ def _adds_odometry(before: Recorded, after: Recorded) -> bool:
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
     """Return what networks at hand say of every frame with a pose; nothing is written."""
-    keyframes = KeyframeFilter(EVERY_FRAME)
-    with _progress(frames, keyframes) as is_wanted:
-        seen = [look(raw) for raw in frames.read_raw(is_wanted)]
-    return _assemble(seen, frames.source, keyframes, '', '')
+    with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
+        seen = [look(raw) for raw in raws]
+    return _assemble(seen, frames.source, filters, '', '')
 
 
 def _record(frames: Frames, options: RecordingOptions, described: str, log: Log) -> Recorded:
@@ -207,9 +215,8 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         log.restart([run])
     if seen:
         logger.warning('going on after %d frames of an unfinished run', len(seen))
-    keyframes = KeyframeFilter(options.keyframes)
-    with _progress(frames, keyframes) as is_wanted:
-        tasks = (raw for raw in frames.read_raw(is_wanted) if raw.place not in seen)
+    with _read_keyframes(frames, options.keyframes) as (raws, filters):
+        tasks = (raw for raw in raws if raw.place not in seen)
         for _, result in run_tasks(options.networks, tasks, workers=options.workers,
                                    scheduler=options.scheduler):
             if result is not None:
@@ -217,7 +224,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
                 seen[result.place] = result
                 _judge_depth(seen, frames.source)
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(list(seen.values()), frames.source, keyframes, encoder_key, described)
+    return _assemble(list(seen.values()), frames.source, filters, encoder_key, described)
 
 
 def _parse_entry(line: bytes) -> Any:
@@ -227,13 +234,17 @@ def _parse_entry(line: bytes) -> Any:
 
 
 @contextmanager
-def _progress(frames: Frames, keyframes: KeyframeFilter) -> Iterator[Wanted]:
-    """Yield the filter of keyframes, which shows a bar on a terminal."""
+def _read_keyframes(frames: Frames, options: KeyframeOptions
+                    ) -> Iterator[tuple[Iterator[RawFrame], dict[str, KeyframeFilter]]]:
+    """Yield the keyframes of each camera and its filter, and show a bar on a terminal."""
+    filters = {part.camera: KeyframeFilter(options) for part in frames.each}
     with tqdm(total=frames.count, desc='detector and CLIP', unit='image', disable=None) as bar:
-        def is_wanted(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
-            bar.update()
-            return keyframes(place, stamp_ns, pose)
-        yield is_wanted
+        def wanted_of(part: Frames) -> Iterator[RawFrame]:
+            def is_wanted(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+                bar.update()
+                return filters[part.camera](place, stamp_ns, pose)
+            return part.read_raw(is_wanted)
+        yield chain.from_iterable(map(wanted_of, frames.each)), filters
 
 
 def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
@@ -243,30 +254,29 @@ def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
         check_depth_unit(np.concatenate(depths), str(source))
 
 
-def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, encoder_key: str,
-              described: str) -> Recorded:
+def _assemble(seen: list[SeenFrame], source: Path, filters: Mapping[str, KeyframeFilter],
+              encoder_key: str, described: str) -> Recorded:
     """Return the observations of frames in the order of time.
 
-    DatasetError: there are no frames, or they are of several cameras.
+    DatasetError: a camera has no frames, or changes.
     """
-    if not seen:
-        raise DatasetError(f'{source}: none of {keyframes.asked} images has a pose; interpolate '
-                           'over wider gaps with --max-gap, or record poses with the images')
     seen = sorted(seen, key=lambda one: (one.stamp_ns, one.place))
-    first = seen[0]
-    for one in seen:
-        if (one.image_size != first.image_size).any() or (one.intrinsics
-                                                          != first.intrinsics).any():
-            raise DatasetError(f'{source}: the camera changes at {one.stamp_ns / NS_PER_S:.6f}, '
-                               'but observations have one camera')
-    check_depth_unit(np.concatenate([one.depths for one in seen]), str(source))
+    cameras = tuple(_camera_of([one for one in seen if one.camera == name], f'{source}: {name}:'
+                               if name else f'{source}:', keyframes.asked)
+                    for name, keyframes in filters.items())
+    camera_names = tuple(filters)
     names = np.concatenate([one.class_ids for one in seen])
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([one.depths for one in seen])
     has_depth = bool(np.isfinite(depths).any())
     open_edges = np.concatenate([one.open_edges for one in seen])
+    if 0 < len(open_edges) < len(names):  # some lenses have distortion
+        open_edges = np.concatenate([
+            one.open_edges if len(one.open_edges) else at_border(
+                one.bboxes_xyxy, np.tile(one.image_size, 2), MappingOptions.border_px)
+            for one in seen])
     detections = PosedDetections(
-        camera=_camera(first),
+        cameras=cameras,
         map_from_camera=np.array([one.map_from_camera for one in seen]),
         stamps_s=np.array([one.stamp_ns / NS_PER_S for one in seen]),
         frame_offsets=np.cumsum([0, *(len(one.scores) for one in seen)]),
@@ -278,17 +288,34 @@ def _assemble(seen: list[SeenFrame], source: Path, keyframes: KeyframeFilter, en
                        else None),
         embeddings=(np.concatenate([one.embeddings for one in seen])
                     if any(one.embeddings.shape[1] for one in seen) else None),
-        encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None)
+        encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None,
+        camera_rows=(None if camera_names == ('',)
+                     else np.array([camera_names.index(one.camera) for one in seen])),
+        camera_names=camera_names)
     return Recorded(
         detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
         np.array([one.detector_ms for one in seen]), np.array([one.clip_ms for one in seen]),
-        keyframes.asked, keyframes.without_pose, described)
+        sum(one.asked for one in filters.values()),
+        sum(one.without_pose for one in filters.values()), described)
 
 
-def _camera(seen: SeenFrame) -> Camera:
-    width, height = map(int, seen.image_size)
-    fx, fy, cx, cy = map(float, seen.intrinsics)
-    return Camera(width, height, fx, fy, cx, cy)
+def _camera_of(seen: list[SeenFrame], where: str, images: int) -> Camera:
+    """Return the camera of frames that one camera took.
+
+    DatasetError: there are none, they are of several cameras, or their depth has another unit.
+    """
+    if not seen:
+        raise DatasetError(f'{where} none of {images} images has a pose; interpolate over wider '
+                           'gaps with --max-gap, or record poses with the images')
+    first = seen[0]
+    for one in seen:
+        if (one.image_size != first.image_size).any() or (one.intrinsics
+                                                          != first.intrinsics).any():
+            raise DatasetError(f'{where} the camera changes at {one.stamp_ns / NS_PER_S:.6f}, but '
+                               'observations of one name have one camera; name several with '
+                               '--cameras')
+    check_depth_unit(np.concatenate([one.depths for one in seen]), where.removesuffix(':'))
+    return camera_from_numbers(first.image_size, first.intrinsics)
 
 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:

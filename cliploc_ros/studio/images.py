@@ -49,34 +49,47 @@ Pixel = Sequence[float] | NDArray[np.float64]
 class Images:
     """The images of a folder or a recording, taken at stamps (F,) [ns].
 
-    ``read`` returns image and camera of a place, 0 to F - 1.
+    ``read`` returns image and camera of a place, 0 to F - 1; ``cameras`` are the names (F,) of
+    several cameras.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
-                 read: Callable[[int], tuple[NDArray[np.uint8], Camera]]):
+                 read: Callable[[int], tuple[NDArray[np.uint8], Camera]],
+                 cameras: Sequence[str] = ()):
         self._stamps_ns = stamps_ns
+        self._cameras = np.array(cameras or [''] * len(stamps_ns), dtype=np.str_)
         self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
             lambda place: undistorted(*read(place)))
 
-    def near(self, stamp_s: float) -> NDArray[np.uint8] | None:
-        """Return the undistorted image (h, w, 3) of a time [s], red first; None without one."""
-        if not len(self._stamps_ns):
+    def near(self, stamp_s: float, camera: str = '') -> NDArray[np.uint8] | None:
+        """Return the undistorted image (h, w, 3) of a camera at a time [s], red first.
+
+        None without one.
+        """
+        places = np.nonzero(self._cameras == camera)[0]
+        if not len(places):
             return None
-        offsets = np.abs(self._stamps_ns - round(stamp_s * NS_PER_S))
-        place = int(np.argmin(offsets))
-        return self._read(place) if offsets[place] <= _MAX_DELAY_NS else None
+        offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
+        nearest = int(np.argmin(offsets))
+        return self._read(int(places[nearest])) if offsets[nearest] <= _MAX_DELAY_NS else None
 
 
-def open_images(path: Path, topics: BagTopics) -> Images:
-    """Open the images of a TUM folder or of a rosbag2 recording; DatasetError: it is neither."""
+def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',)) -> Images:
+    """Open the images of a TUM folder, or those of each camera of a rosbag2 recording.
+
+    DatasetError: it is neither, or lacks a camera.
+    """
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
     if (path / 'rgb.txt').exists():
         sequence, camera = read_tum(path), find_camera(None, path)[0]
         return Images(np.array(sequence.stamps_ns, dtype=np.int64),
                       lambda place: read_color(sequence.image_paths[place], camera))
-    images = bag_images(path, topics)
-    return Images(images.times_ns[:, 0], images.read)
+    of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
+    places = [(one, place) for one in of_cameras for place in range(len(one.times_ns))]
+    names = np.repeat(np.array(cameras), [len(one.times_ns) for one in of_cameras])
+    return Images(np.concatenate([one.times_ns[:, 0] for one in of_cameras]),
+                  lambda number: places[number][0].read(places[number][1]), names.tolist())
 
 
 def views_of_folder(path: Path) -> PosedDetections:
@@ -90,7 +103,7 @@ def views_of_folder(path: Path) -> PosedDetections:
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
     return PosedDetections(
-        camera=camera.pinhole, map_from_camera=np.array([pose for _, pose in posed]),
+        cameras=(camera.pinhole,), map_from_camera=np.array([pose for _, pose in posed]),
         stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
         class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0))

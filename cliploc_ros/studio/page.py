@@ -84,9 +84,7 @@ class Page:
             draw_recording(scene, recording.detections, lambda event, view: self._actions.act(
                 event, lambda: self._studio.show_view(view)))
             self._answers = Answers(scene, recording.detections)
-            self._image = ViewImage(scene, recording.detections.camera)
-            self._image.handle.on_click(self._clicked_image)
-            self._image.handle.on_drag('left')(self._dragged_image)
+            self._image = ViewImage(scene, self._clicked_image, self._dragged_image)
         centers = np.array([one.center for one in self._studio.document.landmarks.values()])
         middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
         spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0
@@ -210,7 +208,7 @@ class Page:
         except CliplocError as error:
             self._actions.notify(None, 'No image', str(error), 'red')
             return
-        self._image.show(picture, studio.map_from_camera)
+        self._image.show(picture, studio.camera, studio.map_from_camera)
         self._view.show(picture)
 
 

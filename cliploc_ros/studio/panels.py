@@ -368,6 +368,7 @@ class ViewPanel:
         self._actions, self._studio = actions, actions.studio
         gui, button, studio = actions.server.gui, actions.button, actions.studio
         self._view = Field(gui.add_slider('View', 0, max(1, studio.views - 1), 1, 0))
+        self._camera = gui.add_html('')
         self._picture = gui.add_image(np.zeros((3, 4, 3), dtype=np.uint8), format='jpeg')
         look = gui.add_button('Look through this view')
         here = gui.add_button('Relocalize here')
@@ -398,8 +399,7 @@ class ViewPanel:
         if event.client is None or self._studio.recording is None:
             return
         with self._studio.document.lock:
-            pose = self._studio.map_from_camera
-        intrinsics = self._studio.recording.detections.camera
+            pose, intrinsics = self._studio.map_from_camera, self._studio.camera
         camera = event.client.camera
         with event.client.atomic():
             camera.position = pose[:3, 3]
@@ -415,5 +415,7 @@ class ViewPanel:
         """Show the picture of the selected view."""
         self._picture.image = picture
         self._view.show(self._studio.view)
+        if name := self._studio.camera_name:
+            show_props(self._camera, content=paragraph([f'camera <b>{html.escape(name)}</b>']))
         count = len(self._studio.drawn)
         show_props(self._create, label=f'Create landmark from {count} boxes', disabled=count < 2)

@@ -160,7 +160,8 @@ class PhraseFinder:
             return None
         embeddings = []
         for view, box in self._recording.best_views(question.landmark)[:_CROPS]:
-            image = self._images.near(float(self._recording.detections.stamps_s[view]))
+            detections = self._recording.detections
+            image = self._images.near(float(detections.stamps_s[view]), detections.name_of(view))
             if image is not None:
                 if self._encoder is None:
                     self._encoder = ClipEncoder(weights, self._clip)

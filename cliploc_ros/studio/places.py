@@ -104,7 +104,7 @@ def _detector(landmark_map: LandmarkMap, recording: Recording | None
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections
-    guess = replace(guess, camera=detections.camera)
+    guess = replace(guess, camera=detections.cameras[0])
     if len(detections.classes) == 0:
         return guess, 'without boxes, the detector is a guess'
     witness = hear_witness(recording.views, landmark_map, detections.class_names,
@@ -117,7 +117,7 @@ def _detector(landmark_map: LandmarkMap, recording: Recording | None
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Places | None) -> Grid:
     """Return positions all over the map, those of the time before if their corners agree."""
-    poses = None if recording is None else recording.detections.map_from_camera
+    poses = None if recording is None else recording.detections.of_first_camera
     grid = make_grid(landmark_map, poses, _OPTIONS)
     if before is not None and len(grid.positions) and len(before.grid.positions):
         offset_m = max(np.abs(corner(grid.positions, axis=0)

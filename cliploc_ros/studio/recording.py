@@ -112,9 +112,9 @@ class Recording:
 
     def best_views(self, landmark: Landmark) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the views that show all of a landmark, and the box (4,) there; largest first."""
-        camera = self.detections.camera
         found = []
         for view, pose in enumerate(self.detections.map_from_camera):
+            camera = self.detections.camera_of(view)
             for one in outlines_of({'': landmark}, camera, pose):
                 half = np.sqrt(one.ellipse[[2, 4]])
                 box = np.concatenate([one.ellipse[:2] - half, one.ellipse[:2] + half])
@@ -170,7 +170,7 @@ class Recording:
             similarities = labels.similarities(shown[rows], class_ids, boxes,
                                                np.random.default_rng([0, view]))
             result = relocalizer.relocalize([Observation(
-                detections.camera, Detections(boxes, class_ids, detections.scores[rows]),
+                detections.camera_of(view), Detections(boxes, class_ids, detections.scores[rows]),
                 similarities)])
             if result.map_from_camera is None:
                 answers.append(Answer(view, 'refused', None, None, result))
@@ -185,11 +185,11 @@ class Recording:
 
 # ---- a landmark from boxes that a person drew ---------------------------------------------------
 
-def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
+def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
               bboxes_xyxy: NDArray[np.float64]) -> tuple[Fit, str]:
     """Return the ellipsoid that fits boxes of one object, and what is doubtful about it, or ''.
 
-    The boxes (n, 4) lie in undistorted images [px] of n poses (n, 4, 4).
+    The boxes (n, 4) lie in undistorted images [px] of n cameras with poses (n, 4, 4).
 
     EditError: there are fewer than two boxes, one is too small, or their rays do not meet in front
     of the cameras.
@@ -203,10 +203,10 @@ def fit_boxes(camera: Camera, map_from_camera: NDArray[np.float64],
             raise EditError(f'create: the box {tuple(box.tolist())} is smaller than '
                             f'{MIN_BOX_PX:g} pixels; draw it around the whole object')
     views = make_views(PosedDetections(
-        camera=camera, map_from_camera=map_from_camera,
+        cameras=tuple(cameras), map_from_camera=map_from_camera,
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
         bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
-        scores=np.ones(count)), MappingOptions())
+        scores=np.ones(count), camera_rows=np.arange(count)), MappingOptions())
     # each box was drawn for itself: none shares the error of a detector that stood still
     views = views._replace(weights=np.ones(count))
     origins = camera_centers(views)

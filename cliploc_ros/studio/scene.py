@@ -110,22 +110,36 @@ class Labels:
 
 
 class ViewImage:
-    """The picture of the selected view, in the scene in front of its camera."""
+    """The picture of the selected view, in the scene in front of its camera.
 
-    def __init__(self, scene: viser.SceneApi, camera: Camera):
-        self._camera = camera
+    A click and a drag call functions with their events.
+    """
+
+    def __init__(self, scene: viser.SceneApi, on_click: Callable[[Any], None],
+                 on_drag: Callable[[Any], None]):
+        self._scene, self._on_click, self._on_drag = scene, on_click, on_drag
+        self._camera: Camera | None = None
+        self.handle: Any = None
+        self.pose = np.eye(4)
+
+    def _take(self, camera: Camera, picture: NDArray[np.uint8]) -> None:
+        """Show the pictures of this camera from now on, as large as its view."""
+        self._camera, self.pose = camera, np.eye(4)
         half = (camera.width / 2.0, camera.height / 2.0)
         self._middle = np.array([(half[0] - camera.cx) / camera.fx,
                                  (half[1] - camera.cy) / camera.fy, 1.0]) * _IMAGE_DEPTH_M
-        blank = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
-        self.handle = scene.add_image(
-            '/view/image', blank, camera.width / camera.fx * _IMAGE_DEPTH_M,
+        self.handle = self._scene.add_image(
+            '/view/image', picture, camera.width / camera.fx * _IMAGE_DEPTH_M,
             camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
             receive_shadow=False)
-        self.pose = np.eye(4)
+        self.handle.on_click(self._on_click)
+        self.handle.on_drag('left')(self._on_drag)
 
-    def show(self, picture: NDArray[np.uint8], map_from_camera: NDArray[np.float64]) -> None:
-        """Show a picture at a pose (4, 4)."""
+    def show(self, picture: NDArray[np.uint8], camera: Camera,
+             map_from_camera: NDArray[np.float64]) -> None:
+        """Show a picture of a camera at a pose (4, 4)."""
+        if camera != self._camera:
+            self._take(camera, picture)
         self.handle.image = picture
         if not np.array_equal(self.pose, map_from_camera):
             self.pose = map_from_camera
@@ -141,6 +155,7 @@ class ViewImage:
         along = (_IMAGE_DEPTH_M - first[2]) / step[2] if abs(step[2]) > 1e-9 else 0.0
         x, y, _ = (first + along * step) / _IMAGE_DEPTH_M
         camera = self._camera
+        assert camera is not None  # nobody clicks before the first picture
         return np.array([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
 
 
@@ -183,13 +198,16 @@ def some_cameras(count: int) -> NDArray[np.int64]:
 def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
                    on_click: Callable[[Any, int], None]) -> None:
     """Draw the trajectory and the cameras, all of them or every n-th; a click chooses a view."""
-    poses = detections.map_from_camera
-    if len(poses) > 1:
-        path = np.stack([poses[:-1, :3, 3], poses[1:, :3, 3]], axis=1)
+    poses, order = detections.map_from_camera, detections.by_camera
+    is_way = np.diff(detections.frame_cameras[order]) == 0
+    if is_way.any():
+        path = np.stack([poses[order[:-1][is_way], :3, 3], poses[order[1:][is_way], :3, 3]],
+                        axis=1)
         scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
                                 thickness_units='screen')
-    shown = some_cameras(len(poses))
-    scene.add_line_segments('/cameras', frusta(detections.camera, poses[shown], _FRUSTUM_M),
+    shown = order[some_cameras(len(poses))]
+    scene.add_line_segments('/cameras', frusta([detections.camera_of(row) for row in shown],
+                                               poses[shown], _FRUSTUM_M),
                             (120, 120, 200), thickness=1.0, thickness_units='screen')
     handle = scene.add_batched_meshes_simple(
         '/camera_centers', _SPHERE.vertices * 0.012, _SPHERE.faces,

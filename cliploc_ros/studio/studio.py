@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.check.relocalization import sample_frames
@@ -89,6 +90,16 @@ class Studio:
         pose: NDArray[np.float64] = self._recording().detections.map_from_camera[self.view]
         return pose
 
+    @property
+    def camera(self) -> Camera:
+        """The camera of the selected view."""
+        return self._recording().detections.camera_of(self.view)
+
+    @property
+    def camera_name(self) -> str:
+        """Its name; '' where the recording has one camera without a name."""
+        return '' if self.recording is None else self.recording.detections.name_of(self.view)
+
     def show_view(self, view: int) -> None:
         """Select a view; a number beyond the last one selects the last one."""
         self.view = max(0, min(int(view), self.views - 1))
@@ -100,7 +111,8 @@ class Studio:
         if not views:
             raise EditError(f'{landmark_id}: no view shows all of it')
         self.view = views[0][0]
-        return f'view {self.view} shows {landmark_id} largest'
+        of = f' of {self.camera_name}' if self.camera_name else ''
+        return f'view {self.view}{of} shows {landmark_id} largest'
 
     def boxes_in_view(self) -> NDArray[np.float64]:
         """Return the detector's boxes (n, 4) in the selected view [px]."""
@@ -110,17 +122,16 @@ class Studio:
 
     def outlines(self) -> list[Outline]:
         """Return the landmarks' outlines in the selected view, the nearest first."""
-        return outlines_of(self.document.landmarks, self._recording().detections.camera,
-                           self.map_from_camera)
+        return outlines_of(self.document.landmarks, self.camera, self.map_from_camera)
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the selected view with boxes and outlines (h, w, 3), red first."""
         detections = self._recording().detections
         image = None
         if self._images is not None:
-            image = self._images.near(float(detections.stamps_s[self.view]))
+            image = self._images.near(float(detections.stamps_s[self.view]), self.camera_name)
         colors = {key: color_of(one.class_id) for key, one in self.document.landmarks.items()}
-        return draw(detections.camera, image, self.boxes_in_view(), self.drawn.get(self.view),
+        return draw(self.camera, image, self.boxes_in_view(), self.drawn.get(self.view),
                     self.outlines(), colors, self.document.selection)
 
     def _recording(self) -> Recording:
@@ -224,8 +235,7 @@ class Studio:
 
     def draw_box(self, corner: Pixel, other: Pixel) -> str:
         """Draw a box in the selected view between two opposite corners (2,) [px]."""
-        camera = self._recording().detections.camera
-        size = np.array([camera.width, camera.height], dtype=np.float64)
+        size = np.array([self.camera.width, self.camera.height], dtype=np.float64)
         low, high = (np.clip(select(np.asarray(corner), np.asarray(other)), 0.0, size)
                      for select in (np.minimum, np.maximum))
         if (high - low).min() < MIN_BOX_PX:
@@ -254,7 +264,8 @@ class Studio:
         recording, landmarks = self._recording(), self.document.landmarks
         detections = recording.detections
         views = sorted(self.drawn)
-        fit, warning = fit_boxes(detections.camera, detections.map_from_camera[views],
+        fit, warning = fit_boxes([detections.camera_of(view) for view in views],
+                                 detections.map_from_camera[views],
                                  np.array([self.drawn[view] for view in views]))
         change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
         (landmark_id,) = change.after
@@ -325,7 +336,7 @@ class Studio:
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the time before."""
         recording = self._recording()
-        views = sample_frames(self.views, _MAX_TRIALS).tolist()
+        views = sample_frames(recording.detections, _MAX_TRIALS).tolist()
         self.answers = tuple(recording.relocalize(self.document.landmarks, views))
         before = self._counts
         self._counts = {verdict: sum(one.verdict == verdict for one in self.answers)

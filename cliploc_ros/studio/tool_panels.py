@@ -200,7 +200,8 @@ def add_keyframes(actions: Actions, layer: KeyframeLayer) -> None:
                                      for row in range(len(layer))])
             handles.append(scene.add_line_segments(
                 '/keyframes/cameras',
-                frusta(layer.camera, layer.map_from_camera[shown], _KEYFRAME_FRUSTUM_M),
+                frusta([layer.camera_of(row) for row in shown], layer.map_from_camera[shown],
+                       _KEYFRAME_FRUSTUM_M),
                 _KEYFRAME_RGB, thickness=2.0, thickness_units='screen'))
             handles.append(scene.add_point_cloud(
                 '/keyframes/points', points.astype(np.float32), _KEYFRAME_RGB,

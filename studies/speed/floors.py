@@ -156,7 +156,7 @@ def see_floor(floor: Floor, frames: int, seed: int = 0) -> SeenFloor:
     wrong = (true < 0) | (rng.random(len(true)) < _WRONG_CLASS)
     seen_classes = np.where(wrong, rng.integers(0, len(CLASS_NAMES), len(true)), classes[true])
     detections = PosedDetections(
-        CAMERA, poses, np.arange(frames) / FRAMES_PER_S, np.cumsum([0, *map(len, shown)]),
+        (CAMERA,), poses, np.arange(frames) / FRAMES_PER_S, np.cumsum([0, *map(len, shown)]),
         np.concatenate(boxes), CLASS_NAMES, seen_classes, rng.uniform(0.3, 1.0, len(true)))
     return SeenFloor(detections, true)
 

@@ -262,7 +262,8 @@ def test_full_disk_keeps_the_old_file(tmp_path):
 
 def test_reads_every_array(tmp_path):
     loaded = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
-    assert (loaded.camera.width, loaded.camera.height, loaded.camera.fy) == (640, 480, 501.0)
+    camera, = loaded.cameras
+    assert (camera.width, camera.height, camera.fy) == (640, 480, 501.0)
     assert loaded.class_names == ('cup', 'tv')
     assert loaded.classes.tolist() == [0, 1, 0]
     assert loaded.frames.tolist() == [0, 0, 2]
@@ -286,7 +287,7 @@ def test_a_written_file_is_read_back(tmp_path):
     for name in ('map_from_camera', 'stamps_s', 'frame_offsets', 'bboxes_xyxy', 'classes',
                  'scores'):
         assert (getattr(again, name) == getattr(first, name)).all()
-    assert (again.camera, again.class_names) == (first.camera, first.class_names)
+    assert (again.cameras, again.class_names) == (first.cameras, first.class_names)
 
 
 def test_odometry_is_read_back_in_the_order_of_time(tmp_path):

@@ -114,7 +114,7 @@ def test_sightings_count_images_by_class():
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
     # twice the same box in the first image, and nothing at the place of b
     detections = PosedDetections(
-        camera, np.tile(np.eye(4), (2, 1, 1)), np.array([1000.0, 1001.0]), np.array([0, 3, 4]),
+        (camera,), np.tile(np.eye(4), (2, 1, 1)), np.array([1000.0, 1001.0]), np.array([0, 3, 4]),
         np.array([boxes[0], boxes[0] + 2, boxes[1] + 90, boxes[0]]), ('can', 'mug'),
         np.array([1, 1, 1, 0]), np.ones(4))
     found = count_sightings(frames, detections)

@@ -3,17 +3,13 @@
 """A recording of several cameras: the images of an instant are localized together."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_bag import write_rig_bag
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.datasets.bags import BagReader, BagWriter
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
@@ -24,20 +20,7 @@ CAMERAS = ('front', 'left', 'back')
 @pytest.fixture(scope='module')
 def rig_bag(tmp_path_factory):
     """Three cameras of the demo's rig in one recording."""
-    folder = tmp_path_factory.mktemp('rig')
-    for name in CAMERAS:
-        sequence = read_tum(ASSETS / 'rig' / name)
-        convert_tum(sequence, find_camera(None, sequence.folder)[0], folder / name,
-                    ConversionOptions(world_frame='map', prefix=name, image_format='compressed'))
-    with BagWriter(folder / 'bag') as writer:
-        for name in CAMERAS:
-            with BagReader(folder / name) as reader:
-                for topic in reader.topics.values():
-                    writer.add_topic(topic.name, topic.msgtype)
-                for message in reader.messages():
-                    writer.write(message.topic, message.stamp_ns, message.data)
-            shutil.rmtree(folder / name)
-    return folder / 'bag'
+    return write_rig_bag(tmp_path_factory.mktemp('rig') / 'bag', CAMERAS)
 
 
 def run(rig_bag, out, *arguments):
@@ -63,6 +46,7 @@ def test_together_they_are_nearer_the_truth(rig_bag, tmp_path):
 
 @pytest.mark.parametrize(('arguments', 'named'), [
     (('--cameras', 'front', 'nowhere'), '/nowhere/image/compressed'),
+    (('--cameras', 'front', 'left', 'front'), '--cameras front left front: names a camera twice'),
     (('--cameras', 'front', 'left', '--fuse'), '--cameras is for --bag, without --fuse'),
 ])
 def test_what_does_not_fit_is_named(rig_bag, tmp_path, capsys, arguments, named):

@@ -218,8 +218,9 @@ def test_windows_cover_every_frame(stamps_s, expected):
 
 def test_a_camera_that_stands_still_gives_few_frames():
     poses = np.repeat(walk_around(5, turn_deg=90.0), [40, 1, 3, 2, 1], axis=0)
-    assert number_viewpoints(poses).tolist() == np.repeat(range(5), [40, 1, 3, 2, 1]).tolist()
-    views = make_views(see(make_table(), poses), MappingOptions())
+    seen = see(make_table(), poses)
+    assert number_viewpoints(seen).tolist() == np.repeat(range(5), [40, 1, 3, 2, 1]).tolist()
+    views = make_views(seen, MappingOptions())
     kept = thin_out(views, 3)
     assert np.bincount(views.viewpoints[kept]).tolist() == [3, 1, 3, 2, 1]
     assert views.weights[0] == pytest.approx(1 / 40)

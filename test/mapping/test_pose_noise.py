@@ -128,9 +128,10 @@ def views_of(stamps_s, frames):
     count, boxes = len(stamps_s), len(frames)
     nothing = np.zeros((boxes, 4))
     return Views(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), stamps_s,
-                 np.arange(count), np.ones(count), np.searchsorted(frames, np.arange(count + 1)),
-                 frames, np.zeros(boxes, int), nothing, nothing, nothing > 0, np.zeros(4),
-                 np.zeros(boxes), np.zeros(boxes))
+                 np.zeros(count, int), np.zeros((count, 3)), np.arange(count), np.ones(count),
+                 np.searchsorted(frames, np.arange(count + 1)), frames, np.zeros(boxes, int),
+                 nothing, nothing, nothing > 0, np.zeros((count, 4)), np.zeros(boxes),
+                 np.zeros(boxes))
 
 
 @pytest.mark.parametrize('correlation_s', [0.0, 3.0, 200.0])

@@ -77,14 +77,14 @@ def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDet
     return see_rows(table, poses, noise_px, missed, seed)[0]
 
 
-def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0):
+def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera=CAMERA):
     """Return what a detector sees, and the row of the landmark that each box shows."""
     rng = np.random.default_rng(seed)
-    size = np.array([640.0, 480.0, 640.0, 480.0])
+    size = np.array([camera.width, camera.height] * 2, dtype=float)
     rows, boxes, counts = [], [], [0]
     for pose in poses:
         outlines = project_ellipsoids(invert_transform(pose), table.centers, table.shapes)
-        full = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+        full = ellipse_bboxes(ellipses_in_pixels(outlines, camera))
         full = full + rng.normal(scale=noise_px, size=full.shape) if noise_px else full
         clipped = np.clip(full, 0.0, size)
         seen = (clipped[:, 2:] - clipped[:, :2] > 8.0).all(axis=1)
@@ -95,7 +95,7 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0):
     bboxes, shown = np.concatenate(boxes), np.concatenate(rows)
     classes = np.array([CLASSES.index(name) for name in table.class_ids], dtype=np.int64)
     return PosedDetections(
-        CAMERA, np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
+        (camera,), np.asarray(poses), 0.2 * np.arange(len(poses)), np.cumsum(counts), bboxes,
         CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 

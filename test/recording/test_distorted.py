@@ -72,7 +72,7 @@ def landmarks_off(file):
 def test_a_folder_gives_the_map_of_the_room(recorded, folder):
     off = landmarks_off(folder / 'map.yaml')
     assert len(off) > 50 and (off < 0.1).mean() > 0.95, off
-    assert recorded.camera == Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    assert recorded.cameras == (Camera(640, 480, 500.0, 500.0, 319.5, 239.5),)
 
 
 def test_an_edge_at_the_border_of_the_image_is_open(recorded):

@@ -54,7 +54,7 @@ def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
     """A new object from three drawn boxes, a duplicate merged; another browser sees it all."""
     document, truth = studio.document, studio.document.landmarks['mug_2']
     second = Person(chromium, studio.url)
-    camera = studio.recording.detections.camera
+    camera = studio.camera
     poses = studio.recording.detections.map_from_camera
     seen = [(view, outline[0].ellipse) for view, pose in enumerate(poses)
             if (outline := outlines_of({'mug_2': truth}, camera, pose))]
@@ -112,7 +112,7 @@ def test_a_box_is_dragged_on_the_image(person, studio):
     pose = studio.map_from_camera
     wait_for(lambda: np.allclose(camera.position, pose[:3, 3], atol=1e-3), 'looking through')
     person.field('Draw boxes').check()
-    intrinsics = studio.recording.detections.camera
+    intrinsics = studio.camera
     pixels = np.array([[300.0, 200.0], [360.0, 290.0]])
     rays = np.column_stack([(pixels - (intrinsics.cx, intrinsics.cy))
                             / (intrinsics.fx, intrinsics.fy), np.ones(2)])

@@ -35,7 +35,7 @@ def with_simulated_boxes(detections, landmark_map):
     names = tuple(sorted(set(landmark_map.class_ids)))
     found = [model.detect(pose, rng)[0] for pose in detections.map_from_camera]
     return PosedDetections(
-        detections.camera, detections.map_from_camera, detections.stamps_s,
+        detections.cameras, detections.map_from_camera, detections.stamps_s,
         np.cumsum([0, *(len(one) for one in found)]),
         np.concatenate([one.bboxes_xyxy for one in found]), names,
         np.array([names.index(name) for one in found for name in one.class_ids]),

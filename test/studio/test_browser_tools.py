@@ -50,7 +50,7 @@ def studio_with_keyframes(path):
     count = len(points)
     layer = KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
-        landmark_map.centers.astype(np.float32), detections.camera, poses,
+        landmark_map.centers.astype(np.float32), detections.cameras[0], poses,
         np.arange(KEYFRAMES + 1) * POINTS, np.zeros((count, 2), np.uint16),
         points.astype(np.float32), np.ones((count, 128), np.uint8), np.zeros(count, np.uint16),
         np.ones((1, 128), np.uint8))

@@ -73,7 +73,7 @@ def iou_in_other_views(office, script):
     detections, views = office[:2]
     medians = []
     for boxes, others in draw_boxes(office, script, np.random.default_rng(0)):
-        fit, warning = fit_boxes(detections.camera, *boxes)
+        fit, warning = fit_boxes(3 * detections.cameras, *boxes)
         assert warning == ''
         medians.append(np.median(ious_with(views, others, fit.center, fit.basis)))
     return np.array(medians)
@@ -89,7 +89,7 @@ def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, least):
     rng = np.random.default_rng(1)
 
     def as_person(row, center, basis):
-        frame, box, camera = views.frames[row], np.empty(4), detections.camera
+        frame, box, camera = views.frames[row], np.empty(4), detections.cameras[0]
         assert project_box(views.rotations[frame], views.translations[frame], center, basis, box)
         edges = box * np.tile([camera.fx, camera.fy], 2) + np.tile([camera.cx, camera.cy], 2)
         extents = np.tile(edges[2:] - edges[:2], 2)
@@ -116,7 +116,7 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
     drawn, unseen = {}, {}
     for boxes, others in draw_boxes(office, {'min_iou': 0.2, 'frames': half},
                                     np.random.default_rng(0)):
-        (fit, _), number = fit_boxes(detections.camera, *boxes), shown[others[0]]
+        (fit, _), number = fit_boxes(3 * detections.cameras, *boxes), shown[others[0]]
         drawn[str(number)] = Landmark({
             'label': 'x', 'class_id': detections.class_names[landmarks.classes[number]],
             **shape_fields(fit.center, fit.basis)})
@@ -135,7 +135,7 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
 def test_views_that_look_alike_are_warned_of(office):
     detections, views, landmarks, shown = office
     rows = group_boxes(shown, len(landmarks.centers))[0][:3]
-    _, warning = fit_boxes(detections.camera, detections.map_from_camera[views.frames[rows]],
+    _, warning = fit_boxes(3 * detections.cameras, detections.map_from_camera[views.frames[rows]],
                            detections.bboxes_xyxy[rows])
     assert 'degrees apart' in warning
 
@@ -150,4 +150,4 @@ def test_what_is_no_object_is_refused(second, distance_m, message):
     poses[1, 0, 3] = distance_m
     boxes = np.array([(300.0, 220.0, 340.0, 260.0)] + ([] if second is None else [second]))
     with pytest.raises(EditError, match=message):
-        fit_boxes(camera, poses[:len(boxes)], boxes)
+        fit_boxes([camera] * len(boxes), poses[:len(boxes)], boxes)

@@ -75,7 +75,8 @@ def chosen_views(seen, centers, size):
 def drawings(walk, views, rng):
     """Return the most visible objects, each with its boxes by view."""
     objects = {one.object_id: one for one in read_objects(walk)}
-    size, centers = (views.camera.width, views.camera.height), views.map_from_camera[:, :3, 3]
+    camera, = views.cameras
+    size, centers = (camera.width, camera.height), views.map_from_camera[:, :3, 3]
     found = sightings(walk)
 
     def visible(object_id):
@@ -96,7 +97,7 @@ def fitted(drawn, views):
     """Return the map that the studio makes of drawn boxes."""
     landmarks = {}
     for one, boxes in drawn:
-        fit, _ = fit_boxes(views.camera, views.map_from_camera[list(boxes)],
+        fit, _ = fit_boxes(len(boxes) * views.cameras, views.map_from_camera[list(boxes)],
                            np.array(list(boxes.values()), dtype=float))
         landmarks = edits.create(landmarks, one.label, one.class_id, fit.center, fit.basis
                                  ).apply(landmarks)

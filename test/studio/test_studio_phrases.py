@@ -96,7 +96,7 @@ def observed(tmp_path, object_id):
     embeddings, count = np.concatenate(rows).astype(np.float16), sum(map(len, boxes))
     file = tmp_path / 'walk.npz'
     save_observations(file, PosedDetections(
-        views.camera, views.map_from_camera, views.stamps_s,
+        views.cameras, views.map_from_camera, views.stamps_s,
         np.cumsum([0, *map(len, boxes)]), np.concatenate([one for one in boxes if one]),
         ('bowl',), np.zeros(count, dtype=np.int64), np.ones(count), embeddings=embeddings,
         encoder_key=encoder.key))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera: intrinsics, distortion, and the projection between pixels and the plane z = 1."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -159,19 +160,22 @@ class Camera:
         return edges
 
 
-def frusta(camera: Camera, map_from_camera: NDArray[np.float64], depth_m: float
+def frusta(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64], depth_m: float
            ) -> NDArray[np.float64]:
-    """Return the edges (8 f, 2, 3) of the frusta of a camera at some poses [m].
+    """Return the edges (8 f, 2, 3) of the frusta of cameras at some poses [m].
 
     Parameters
     ----------
+    cameras : sequence of Camera
+        Of each pose.
     map_from_camera : ndarray (f, 4, 4)
     depth_m : float
         From the tip to the base [m].
     """
-    half = np.array([camera.width / camera.fx, camera.height / camera.fy]) * 0.5 * depth_m
-    corners = np.column_stack([_CORNERS * half, np.full(4, depth_m)])
-    points = np.einsum('fij,kj->fki', map_from_camera[:, :3, :3], corners) \
+    half = np.array([(one.width / one.fx, one.height / one.fy) for one in cameras]).reshape(-1, 2)
+    corners = np.full((len(half), 4, 3), depth_m)
+    corners[:, :, :2] = _CORNERS * (half[:, None] * 0.5 * depth_m)
+    points = np.einsum('fij,fkj->fki', map_from_camera[:, :3, :3], corners) \
         + map_from_camera[:, None, :3, 3]
     tips = np.broadcast_to(map_from_camera[:, None, :3, 3], points.shape)
     lines = np.concatenate([np.stack([tips, points], axis=2),

@@ -59,7 +59,7 @@ class KeyframeLayer:
     #: The map's landmarks when the layer was made, which identify the map
     landmark_ids: tuple[str, ...]
     landmark_centers: NDArray[np.float32]  #: (L, 3): where they were [m]
-    camera: Camera  #: That took the keyframes, of the undistorted images
+    camera: Camera  #: That took the keyframes, of the undistorted images; the first of several
     map_from_camera: NDArray[np.float64]  #: (K, 4, 4)
     #: (K + 1,): keyframe k has the points from offsets[k] up to offsets[k + 1]
     offsets: NDArray[np.int64]
@@ -76,6 +76,9 @@ class KeyframeLayer:
     images: NDArray[np.uint8] | None = None
     #: (K + 1,): keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1]
     image_offsets: NDArray[np.int64] | None = None
+    other_cameras: tuple[Camera, ...] = ()  #: Of a robot with several cameras
+    #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
+    camera_rows: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -85,13 +88,18 @@ class KeyframeLayer:
         """Compute the indices now, so that the first request does not wait for them."""
         _ = self._profiles, self._unit_vocabulary
 
+    def camera_of(self, keyframe: int) -> Camera:
+        """Return the camera that took a keyframe."""
+        row = 0 if self.camera_rows is None else int(self.camera_rows[keyframe])
+        return (self.camera, *self.other_cameras)[row]
+
     def camera_note(self, camera: Camera) -> str:
-        """Return how a camera differs from that of the keyframes; empty if it does not."""
-        own = self.camera
-        ours = np.array([own.fx, own.fy]) / own.width
-        theirs = np.array([camera.fx, camera.fy]) / camera.width
-        if np.abs(theirs / ours - 1.0).max() <= _SAME_FOCAL:
-            return ''
+        """Return how a camera differs from those of the keyframes; empty if one is like it."""
+        theirs, own = np.array([camera.fx, camera.fy]) / camera.width, self.camera
+        for one in (own, *self.other_cameras):
+            ours = np.array([one.fx, one.fy]) / one.width
+            if np.abs(theirs / ours - 1.0).max() <= _SAME_FOCAL:
+                return ''
         return (f'the camera differs from that of the keyframes: fx {camera.fx:.1f} of '
                 f'{camera.width} px, theirs {own.fx:.1f} of {own.width} px; is camera_info right?')
 
@@ -196,6 +204,8 @@ _SCHEMA = Schema('file of keyframes', {
     # only there where images were asked for, both of them
     'images': Field('uint8', ('b',), is_optional=True, stays=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
+    # only there for several cameras, which the header has
+    'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
     {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True, checks_sums=False,
     largest_read=256_000_000)
@@ -213,7 +223,9 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     """
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
-              'camera': {name: getattr(layer.camera, name) for name in _CAMERA}}
+              'camera': _numbers_of(layer.camera)}
+    if layer.other_cameras:
+        header['other_cameras'] = list(map(_numbers_of, layer.other_cameras))
     names = [name for name in _SCHEMA.fields
              if name != 'header' and getattr(layer, name) is not None]
     arrays: dict[str, NDArray[Any]] = {'header': np.array(json.dumps(header))} | {
@@ -222,6 +234,10 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
         name: array if _SCHEMA.fields[name].type == 'text'
         else array.astype(_SCHEMA.fields[name].type, copy=False)
         for name, array in arrays.items()})
+
+
+def _numbers_of(camera: Camera) -> dict[str, float]:
+    return {name: getattr(camera, name) for name in _CAMERA}
 
 
 def remove_layer(map_path: str | os.PathLike[str]) -> str:
@@ -277,16 +293,20 @@ def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
     if kind != KIND:
         raise ArrayError(f'has descriptors of the kind {kind!r}, expected {KIND!r}')
     try:
-        camera = Camera(*(header['camera'][name] for name in _CAMERA))
+        camera, *others = (Camera(*(one[name] for name in _CAMERA))
+                           for one in (header['camera'], *header.get('other_cameras', ())))
         deviation = float(header['deviation_per_metre'])
     except (CameraError, KeyError, TypeError, ValueError) as error:
         raise ArrayError(f'has no valid camera or deviation in its header ({error})') from error
     if not 0.0 <= deviation <= _MOST_DEVIATION:
         raise ArrayError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
+    rows = arrays.get('camera_rows', np.zeros(1, dtype=np.int64))
+    if not ((rows >= 0) & (rows <= len(others))).all():
+        raise ArrayError(f'array camera_rows names none of the {1 + len(others)} cameras')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), camera, **arrays,
-                         deviation_per_metre=deviation)
+                         deviation_per_metre=deviation, other_cameras=tuple(others))
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:

@@ -89,10 +89,13 @@ def _on_corrections(report: CheckReport) -> Iterator[str]:
         return
     what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
             'stamps': 'check the clock and the delay of the images'}
-    cause = max(found, key=lambda one: one.explained).cause
+    best = max(found, key=lambda one: one.explained)
+    # those of one fit, of one camera: what is wrong with it makes others look wrong, too
+    cause, of_best = best.cause, [one for one in found if (one.cause, one.explained) == (
+        best.cause, best.explained)]
     numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
                f'{one.deviation:.2f})'
-               for one in sorted(found, key=lambda one: -one.effect_px) if one.cause == cause]
+               for one in sorted(of_best, key=lambda one: -one.effect_px)]
     others = sorted({one.cause for one in found} - {cause})
     rivals = f'; an error of the {" or the ".join(others)} would look similar' if others else ''
     yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{rivals}'

@@ -92,11 +92,17 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         witness = hear_witness(views, landmark_map, detections.class_names, options.mapping)
         if not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
-        model = measure_detector(landmark_map, detections, views, witness, options.mapping)
-        recording = _check_recording(landmark_map, detections, views, witness, model, options,
+        models = [measure_detector(landmark_map, detections, views, witness, options.mapping,
+                                   number) for number in range(len(detections.cameras))]
+        model = models[0]
+        if len(models) > 1:
+            notes.append(f'the grid has one camera, {detections.camera_names[0]}, the first of '
+                         f'{len(models)}')
+        recording = _check_recording(landmark_map, detections, views, witness, models, options,
                                      tell)
     overlaps = find_map_overlaps(landmark_map, witness, views)
-    places = make_grid(landmark_map, recorded, options)
+    places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
+                       options)
     grid = judge_grid(places, model, try_poses(
         model, landmark_map, places.poses, options,
         partial(tell, 'relocalizing on the grid')), options.headings)
@@ -129,7 +135,7 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, model: DetectorModel, options: CheckOptions,
+                     witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
                      tell: Progress) -> RecordingCheck:
     tell('cross-validating', 0.0)
     folds, blocks, held_out = [], [], []
@@ -141,9 +147,11 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            partial(tell, 'relocalizing recorded frames'))
-    sampled = sample_frames(len(detections), options.frames)
-    simulated = try_poses(model, landmark_map, detections.map_from_camera[sampled], options,
-                          partial(tell, 'relocalizing simulated frames'))
+    sampled = sample_frames(detections, options.frames)
+    simulated = [trial for number, model in enumerate(models) for trial in try_poses(
+        model, landmark_map,
+        detections.map_from_camera[sampled[detections.frame_cameras[sampled] == number]], options,
+        partial(tell, 'relocalizing simulated frames'))]
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
@@ -153,7 +161,7 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
-        edge_scale=model.edge_scale)
+        edge_scale=models[0].edge_scale)
 
 
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:

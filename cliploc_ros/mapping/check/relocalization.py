@@ -96,13 +96,14 @@ def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, options: MappingOptions) -> DetectorModel:
-    """Return the detector of a recording.
+                     witness: Witness, options: MappingOptions, camera: int = 0
+                     ) -> DetectorModel:
+    """Return the detector of a recording, on the images of one of its cameras.
 
     A landmark that was never detected does not exist: the model never detects it.
     """
     landmarks, cameras = witness.landmarks, camera_centers(views)
-    frames = np.arange(0, len(detections), -(-len(detections) // _MAX_SAMPLED_FRAMES))
+    frames = detections.every(-(-len(detections) // _MAX_SAMPLED_FRAMES))
     reach, sightings = np.zeros(len(landmark_map)), []
     for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
         center, basis = landmarks.centers[row], landmarks.bases[row]
@@ -115,12 +116,14 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
                            & (distances > 0.0))[frames]]
         sightings.append(Sightings(offsets[expected] / distances[expected, None],
                                     np.isin(expected, views.frames[rows])))
-    sides = np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1).min(axis=(1, 2))
+    own = detections.frame_cameras == camera
+    sides = np.diff(detections.bboxes_xyxy[own[views.frames]].reshape(-1, 2, 2), axis=1
+                    ).min(axis=(1, 2))
     min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
     # the boxes that no landmark explains, by frame
     is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
     clutter = []
-    for frame in frames:
+    for frame in frames[own[frames]]:
         rows = np.arange(*detections.frame_offsets[frame:frame + 2])
         rows = rows[is_clutter[rows]]
         clutter.append((detections.bboxes_xyxy[rows],
@@ -131,8 +134,8 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
     return DetectorModel(
-        landmark_map, detections.camera, tuple(sightings), witness.evidence.seen_ratio, reach,
-        (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
+        landmark_map, detections.cameras[camera], tuple(sightings), witness.evidence.seen_ratio,
+        reach, (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
 
 
 class PosedObservation(NamedTuple):
@@ -180,7 +183,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     of each box, -1 for none. The callable tell is told the share that is done.
     """
     labels = LabelModel.of(landmark_map)
-    chosen = set(sample_frames(len(detections), options.frames).tolist())
+    chosen = set(sample_frames(detections, options.frames).tolist())
     trials, done = [], 0
     for fold in folds:
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
@@ -206,16 +209,17 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                 continue
             similarities = labels.similarities(seen, class_ids, boxes, rng)[:, fold.rows]
             trials.append(_try(
-                relocalizer, detections.camera, Detections(boxes, class_ids,
-                                                           detections.scores[rows]),
+                relocalizer, detections.camera_of(frame), Detections(boxes, class_ids,
+                                                                     detections.scores[rows]),
                 similarities, pose, int((seen >= 0).sum()), options, stamp_s))
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
 
-def sample_frames(count: int, limit: int) -> NDArray[np.int64]:
-    """Return at most a limit of frames, evenly spread."""
+def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
+    """Return at most a limit of frames, evenly spread over the cameras and over time."""
+    count = len(detections)
     step = max(1, -(-count // limit))
-    return np.arange(min(step // 2, count - 1), count, step)
+    return detections.every(step, min(step // 2, count - 1))
 
 
 def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],

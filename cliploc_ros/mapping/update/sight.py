@@ -118,7 +118,7 @@ def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, besi
         for i in range(in_front):
             place = near[i]
             box = boxes[place]
-            if distances[place] > reaches[place] or not is_in_image(box, views.bounds):
+            if distances[place] > reaches[place] or not is_in_image(box, views.bounds[frame]):
                 continue
             # large enough to be detected
             if (box[2] - box[0]) * (box[3] - box[1]) < least[place] * least[place]:

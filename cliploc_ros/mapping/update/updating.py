@@ -87,7 +87,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     updated = renew(old, known, aligned.views, objects, fates, detections.class_names)
     notes += _notes(old, known, aligned, detections)
     report = UpdateReport(
-        frames=len(detections), viewpoints=int(given.viewpoints[-1]) + 1,
+        frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **describe(old, updated, objects, fates, judged), left_out=judged.finds.left_out,

@@ -48,7 +48,7 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
     keyframe = seen.keyframes[0]
     height, width = canvas.shape[:2]
     rows = layer.rows(keyframe)
-    scale = height / layer.camera.height
+    scale = height / layer.camera_of(keyframe).height
     panel, place = _panel(layer, keyframe, scale), np.array([width, 0])
     both = np.concatenate([canvas, panel], axis=1)
     pixels = np.asarray(layer.pixels[rows]) / PIXEL_SCALE * scale + place
@@ -74,8 +74,8 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
 
 def _panel(layer: KeyframeLayer, keyframe: int, scale: float) -> NDArray[np.uint8]:
     """Return the keyframe's image, as high as the localized one; blank where there is none."""
-    width = max(1, round(scale * layer.camera.width))
-    height = max(1, round(scale * layer.camera.height))
+    camera = layer.camera_of(keyframe)
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
     image = layer.image_rgb(keyframe)
     if image is None:
         return np.full((height, width, 3), _BLANK, dtype=np.uint8)

@@ -74,13 +74,14 @@ def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
 
 def _keyframe_marker(layer: KeyframeLayer) -> Marker:
     """Return the frusta of keyframes; of more than MAX_SHOWN, every n-th."""
-    poses = layer.map_from_camera[::-(-len(layer) // MAX_SHOWN)]
+    shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))
     lines = Marker(header=Header(frame_id=layer.frame_id), ns='keyframes', type=Marker.LINE_LIST,
                    color=_KEYFRAMES)
     lines.pose.orientation.w = 1.0
     lines.scale.x = _LINE_WIDTH_M
-    lines.points = [_point(end) for edge in frusta(layer.camera, poses, _FRUSTUM_M)
-                    for end in edge]
+    lines.points = [_point(end) for edge in frusta(
+        [layer.camera_of(row) for row in shown], layer.map_from_camera[shown], _FRUSTUM_M)
+        for end in edge]
     return lines
 
 

@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_bag import MOUNTS, RIG, write_rig_bag
+
+from cliploc_ros.cli.build_map import main as build_map
+from cliploc_ros.cli.check_map import main as check_map
+from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.keyframes.layer import load_layer_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo.truth import read_objects
+from cliploc_ros.errors import CliplocError
+
+ASSETS = RIG.parent
+ALL = tuple(MOUNTS)
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+            '--clip-pretrained', ASSETS / 'clip.safetensors', '--image', 'image/compressed',
+            '--keyframes', 0, 0)
+
+
+def run(main, *arguments):
+    return main([str(one) for one in arguments])
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """The images of one camera have half the size of the others."""
+    return write_rig_bag(tmp_path_factory.mktemp('rig') / 'bag', halved=('left',))
+
+
+@pytest.fixture(scope='module')
+def built(bag):
+    """Return the files of maps: from all cameras, whose poses are in tf, and from one."""
+    paths = {}
+    for names in (ALL, ('back',)):
+        paths[names] = path = bag.with_name(f'{len(names)}.yaml')
+        assert run(build_map, '--bag', bag, '--cameras', *names, *NETWORKS, '--map-frame', 'map',
+                   '--out', path, '--record-to', path.with_suffix('.npz'),
+                   '--keyframe-layer') == 0
+    return paths
+
+
+def errors_of(path):
+    """Return how far each landmark is from the nearest true object of its class [m]."""
+    found, objects = LandmarkMap.from_file(path), read_objects(RIG / 'front')
+    return np.array([min(np.linalg.norm(one.center - center) for one in objects
+                         if one.class_id == name)
+                     for center, name in zip(found.centers, found.class_ids, strict=True)])
+
+
+def test_four_cameras_find_more_and_are_as_near_the_truth(built):
+    one, four = errors_of(built['back',]), errors_of(built[ALL])
+    print(f'\nlandmarks, median error: one camera {len(one)}, {1e3 * np.median(one):.0f} mm; '
+          f'four {len(four)}, {1e3 * np.median(four):.0f} mm')
+    assert len(four) > 1.5 * len(one)
+    assert np.median(four) < max(0.03, 1.1 * np.median(one))
+
+
+def test_the_observations_keep_cameras_and_poses(built):
+    recorded = load_observations(built[ALL].with_suffix('.npz'))
+    assert recorded.camera_names == ALL
+    assert np.bincount(recorded.frame_cameras).tolist() == [6] * 4
+    assert [(one.width, one.fx) for one in recorded.cameras] == [
+        (640, 500.0), (320, 250.0), (640, 500.0), (640, 500.0)]
+    for frame in range(24):
+        truth = read_tum(RIG / recorded.name_of(frame)).pose_at(
+            round(1e9 * recorded.stamps_s[frame]))
+        np.testing.assert_allclose(recorded.map_from_camera[frame], truth, atol=1e-5)
+
+
+def test_each_camera_has_keyframes(built):
+    layer = load_layer_of_map(built[ALL].with_suffix('.keyframes.npz'),
+                              LandmarkMap.from_file(built[ALL]))
+    # small images have fewer features
+    assert np.bincount(layer.camera_rows).tolist() == pytest.approx([17, 3], abs=1)
+    assert {layer.camera_of(row).width for row in range(len(layer))} == {320, 640}
+    for row in range(len(layer)):  # the points lie where the keyframe shows them
+        points, camera = layer.points[layer.rows(row)], layer.camera_of(row)
+        pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        shown = np.asarray(layer.pixels[layer.rows(row)]) / 16.0
+        assert np.median(np.linalg.norm(pixels - shown, axis=1)) < 1.0
+
+
+@pytest.mark.parametrize('poses', [
+    ('--pose-topic', 'ground_truth'),
+    ('--pose-topic', '/robot', '--mount', *(value for name in ALL for value in MOUNTS[name]))])
+def test_poses_of_each_camera_or_of_the_robot_give_the_same_map(bag, built, tmp_path, poses):
+    out = tmp_path / 'again.yaml'
+    assert run(build_map, '--bag', bag, '--cameras', *ALL, *NETWORKS, *poses, '--no-clip',
+               '--out', out) == 0
+    again, first = LandmarkMap.from_file(out), LandmarkMap.from_file(built[ALL])
+    assert len(again) == len(first)
+    np.testing.assert_allclose(again.centers, first.centers, atol=5e-3)
+
+
+def test_a_map_is_checked_and_updated_with_all_cameras(built, tmp_path, capsys):
+    npz = built[ALL].with_suffix('.npz')
+    run(check_map, ASSETS / 'map.yaml', '--observations', npz, '--out', tmp_path / 'check',
+        '--frames', 8, '--positions', 4, '--headings', 4)
+    assert 'wrote' in capsys.readouterr().out
+    assert run(build_map, '--observations', npz, '--update', ASSETS / 'map.yaml', '--no-clip',
+               '--out', tmp_path / 'new.yaml') == 0
+    assert len(LandmarkMap.from_file(tmp_path / 'new.yaml')) >= 50
+
+
+def test_the_studio_names_the_camera_of_a_view(bag, built, tmp_path):
+    (tmp_path / 'map.yaml').write_bytes(built[ALL].read_bytes())
+
+    def studio_of(*cameras):
+        return open_studio(make_parser().parse_args(list(map(str, (
+            tmp_path / 'map.yaml', '--observations', built[ALL].with_suffix('.npz'), '--images',
+            bag, '--image', 'image/compressed', *cameras)))))
+    studio = studio_of()
+    try:
+        for view, name in enumerate(ALL):  # of the first instant
+            studio.show_view(view)
+            picture = studio.picture()
+            assert studio.camera_name == name
+            assert picture.shape[:2] == ((240, 320) if name == 'left' else (480, 640))
+            assert picture.std() > 20.0, 'no image is grey'
+        studio.document.select(list(studio.document.landmarks)[:1])
+        assert f' of {studio.camera_name} ' in studio.best_view()
+    finally:
+        studio.document.close()
+    with pytest.raises(CliplocError, match="no camera 'above'; they have front, left, back"):
+        studio_of('--cameras', 'above')
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (('--cameras', 'front', 'left', 'front', '--map-frame', 'map'), 'names a camera twice'),
+    (('--cameras', 'front', 'above', '--map-frame', 'map'),
+     "camera 'above': .*no topic /above/image/compressed"),
+    (('--cameras', 'front', 'right', '--map-frame', 'map'), "camera 'right': .*'right_optical'"),
+    (('--cameras', 'front', 'back', '--pose-topic', '/robot'), "camera 'front': .*/front/robot"),
+    (('--cameras', 'front', 'back', '--pose-topic', '/robot', '--mount', *[0] * 7),
+     '--mount has 7 numbers, expected 7 for each of 2 cameras'),
+    (('--cameras', 'front', 'back', '--map-frame', 'map', '--camera-frame', 'front_optical'),
+     '--camera-frame is of one camera'),
+    (('--cameras', 'front', 'back', '--map-frame', 'map', '--refine-mount'),
+     '--refine-mount is for one camera')])
+def test_what_does_not_fit_is_named(tmp_path_factory, tmp_path, capsys, arguments, message):
+    bag = tmp_path_factory.getbasetemp() / 'without_right'
+    if not bag.exists():
+        write_rig_bag(bag, ('front', 'back', 'right'), in_tf=('front', 'back'))
+    assert run(build_map, '--bag', bag, *NETWORKS, *arguments, '--out', tmp_path / 'a.yaml') == 1
+    error = ' '.join(capsys.readouterr().err.split())
+    assert re.search(message, error), error
+
+
+def test_cameras_are_those_of_a_bag(tmp_path, capsys):
+    assert run(build_map, '--tum', Path(RIG / 'front'), '--cameras', 'front', '--out',
+               tmp_path / 'a.yaml') == 1
+    assert '--cameras is for --bag' in capsys.readouterr().err

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of the demo's rig: four cameras of a robot at six places."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.bags import BagWriter, typestore
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.poses import mount_from_numbers
+from cliploc_ros.datasets.tum import read_tum
+
+RIG = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets/rig'
+#: By camera: x y z qx qy qz qw on the robot, which is where the front camera is.
+MOUNTS = json.loads((RIG / 'mounts.json').read_text())
+TF = 'tf2_msgs/msg/TFMessage'
+
+
+def write_rig_bag(path, cameras=tuple(MOUNTS), halved=(), in_tf=tuple(MOUNTS)):
+    """Write images, camera_info and ground truth of cameras, the robot's pose, and tf.
+
+    The images of some cameras are halved; some cameras are in tf.
+    """
+    with BagWriter(path) as bag:
+        for topic, msgtype in (('/tf', TF), ('/tf_static', TF), ('/robot', bag_messages.POSE)):
+            bag.add_topic(topic, msgtype)
+        robot = read_tum(RIG / 'front')
+        for stamp in robot.stamps_ns:
+            pose = robot.pose_at(stamp)
+            bag.write('/robot', stamp, bag_messages.pose_message(stamp, 'map', pose))
+            bag.write('/tf', stamp, transform(stamp, 'map', 'robot', pose))
+        for name in cameras:
+            sequence, frame = read_tum(RIG / name), f'{name}_optical'
+            camera = find_camera(None, sequence.folder)[0]
+            if name in halved:
+                camera = replace(camera, width=camera.width // 2, height=camera.height // 2,
+                                 **{key: getattr(camera, key) / 2 for key in ('fx', 'fy')},
+                                 **{key: (getattr(camera, key) + 0.5) / 2 - 0.5
+                                    for key in ('cx', 'cy')})
+            topics = [f'/{name}/{topic}' for topic in ('image/compressed', 'camera_info',
+                                                       'ground_truth')]
+            for topic, msgtype in zip(topics, (bag_messages.COMPRESSED_IMAGE,
+                                               bag_messages.CAMERA_INFO, bag_messages.POSE),
+                                      strict=True):
+                bag.add_topic(topic, msgtype)
+            first = sequence.stamps_ns[0]
+            if name in in_tf:
+                bag.write('/tf_static', first, transform(first, 'robot', frame,
+                                                         mount_from_numbers(MOUNTS[name])))
+            for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
+                data = file.read_bytes()
+                if name in halved:
+                    image = cv2.resize(cv2.imread(str(file)), (camera.width, camera.height),
+                                       interpolation=cv2.INTER_AREA)
+                    data = cv2.imencode('.jpg', image)[1].tobytes()
+                for topic, message in zip(topics, (
+                        bag_messages.compressed_image_message(stamp, frame, data, 'jpeg'),
+                        bag_messages.camera_info_message(stamp, frame, camera),
+                        bag_messages.pose_message(stamp, 'map', sequence.pose_at(stamp))),
+                        strict=True):
+                    bag.write(topic, stamp, message)
+    return path
+
+
+def transform(stamp, parent, child, pose):
+    """Make a message of tf with the pose of a coordinate frame in another one."""
+    types, header = typestore().types, bag_messages.pose_message(stamp, parent, pose).header
+    numbers = [pose[:3, 3], quaternion_from_transform(pose)]
+    translation, rotation = (
+        types[f'geometry_msgs/msg/{name}'](**dict(zip(axes, row.tolist(), strict=True)))
+        for name, axes, row in zip(('Vector3', 'Quaternion'), ('xyz', 'xyzw'), numbers,
+                                   strict=True))
+    return types[TF](transforms=[types['geometry_msgs/msg/TransformStamped'](
+        header=header, child_frame_id=child, transform=types['geometry_msgs/msg/Transform'](
+            translation=translation, rotation=rotation))])
