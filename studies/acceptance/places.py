@@ -153,7 +153,7 @@ class Halved(NamedTuple):
         for number in range(len(asked)):
             rows = slice(*map(int, asked.frame_offsets[number:number + 2]))
             queries.append(Query(number, Observation(
-                asked.camera, Detections(asked.bboxes_xyxy[rows], tuple(
+                asked.camera_of(number), Detections(asked.bboxes_xyxy[rows], tuple(
                     asked.class_names[one] for one in asked.classes[rows]), asked.scores[rows]),
                 depths=None if asked.depths is None or not self.has_depth
                 else asked.depths[rows].astype(np.float64)), asked.map_from_camera[number]))
