@@ -219,7 +219,7 @@ def mount(**change):
 
 
 @pytest.mark.parametrize(('spoil', 'name', 'value', 'tolerance'), [
-    (lambda one: replace(one, camera=replace(CAMERA, fx=500 / 1.03, fy=500 / 1.03)),
+    (lambda one: replace(one, cameras=(replace(CAMERA, fx=500 / 1.03, fy=500 / 1.03),)),
      'focal length fx', 3.0, 0.8),
     (lambda one: pixels(one, (0.0, 6.0)), 'principal point cy', 6.0, 1.0),
     (lambda one: turned(one, mount(shift=(0.05, 0.0, 0.0))), 'mount x (right)', -5.0, 0.7),
