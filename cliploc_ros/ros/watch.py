@@ -14,7 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
 from std_msgs.msg import Bool, String
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
@@ -25,7 +27,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
-from cliploc_ros.ros.inputs.localizer_pose import LocalizedCamera, LocalizerPose
+from cliploc_ros.ros.inputs.localizer_pose import LocalizerPose
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
@@ -92,6 +94,7 @@ class Watcher:
         self._pause_s, self._next_request_at, self._reaction = _FIRST_PAUSE_S, 0.0, ''
         if self.is_on:
             handoff.on_shown(self._pose.hear)
+            robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
             self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
             self._state = node.create_publisher(String, '~/localization_state', qos.LATCHED)
 
@@ -135,14 +138,15 @@ class Watcher:
             'watch': str(known.state), 'watch reason': known.reason, 'on lost': self._reaction,
             'watch look [ms]': f'{1e3 * self._cost_s:.1f}'}
         if report is not None:
-            turn = report.camera_turn
+            turned = '' if report.camera_turn is None else \
+                f'the camera is {report.camera_turn.in_words()}'
             health.values |= {
                 'watch probability': f'{report.probability:.3f}', 'watch looks': report.looks,
                 'watch matched': f'{report.matched} of {report.expected} expected',
                 'watch missing': ', '.join(report.missing), 'watch fault': report.fault,
-                'camera turned': '' if turn is None else turn.in_words(),
+                'watch camera': turned,
                 'watch last look [s]': f'{time.monotonic() - known.looked_at:.1f}'}
-            for problem in filter(None, (report.fault, turn and f'camera {turn.in_words()}')):
+            for problem in filter(None, (report.fault, turned)):
                 health.warn(problem)
         if known.problem or known.state is WatchState.LOST:
             health.warn(f'watch: {known.problem or known.reason}')
@@ -193,27 +197,23 @@ class Watcher:
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
-        camera = self._pose.at(image, state, parameters, [
+        pose = self._pose.at(image, state, parameters, [
             part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
-        if camera.has_jumped:
-            self._drop("the localizer's pose jumped, or odom restarted")
-            age += 1
         report = self._node.worker.run(
-            partial(self._score, frame, parameters, state, camera, age), begun_at + _STALE_S)
+            partial(self._score, frame, parameters, state, pose, age), begun_at + _STALE_S)
         if report is not None:
             self._say(_Known(report.state, report.reason, report, time.monotonic()), stopped, age)
         return image.stamp
 
     def _score(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
-               camera: LocalizedCamera, age: int) -> WatchReport | None:
+               pose: tuple[str, NDArray[np.float64]], age: int) -> WatchReport | None:
         """Look, in the worker's thread; None if the pose does not count any more."""
         localizer = self._pipeline.localizer  # that of now: the map may be another one
         if localizer is None or age != self._age:
             return None
         begun_s = time.thread_time()
         try:
-            return localizer.look(frame, parameters, state, camera.frame_id,
-                                  camera.map_from_camera)
+            return localizer.look(frame, parameters, state, *pose)
         finally:
             self._cost_s = time.thread_time() - begun_s
 

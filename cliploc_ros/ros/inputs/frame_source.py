@@ -375,12 +375,12 @@ def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float,
             one.want(deadline)
         changed.wait_for(lambda: sources[0].is_closed or newest() is not None,
                          max(0.0, deadline - time.monotonic()))
-        for one in sources:
-            one.want_no_more(deadline, linger_s)
         frame = newest()
+        why = '' if frame else '; '.join(one.why_none(after) for one in sources)
+        for one in sources:
+            one.want_no_more(deadline, linger_s)  # which may forget both
         if frame is None:
-            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
-                               f'{"; ".join(one.why_none(after) for one in sources)}')
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
         return frame
 
 

@@ -12,7 +12,6 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import (
-    SAME_LOOK,
     invert_transform,
     is_rigid,
     transform_from_pose,
@@ -33,15 +32,6 @@ _UNIT_TOLERANCE = 0.01
 
 class NoLocalizerPoseError(CliplocError):
     """The localizer has no valid pose for an image; the message says what to do."""
-
-
-class LocalizedCamera(NamedTuple):
-    """The camera's pose by the localizer at the stamp of an image."""
-
-    frame_id: str  #: Of the map
-    map_from_camera: NDArray[np.float64]  #: (4, 4)
-    #: Whether the localizer's pose has jumped since the image before: this is another pose
-    has_jumped: bool
 
 
 class _Anchor(NamedTuple):
@@ -68,16 +58,14 @@ class LocalizerPose:
         """Forget what was heard: time jumped, or the node is inactive."""
         self._shown: PoseWithCovarianceStamped | None = None
         self._anchor: _Anchor | None = None
-        # The run of odometry and its frame in the map, at the last image.
-        self._last: tuple[int, NDArray[np.float64]] | None = None
 
     def hear(self, shown: PoseWithCovarianceStamped) -> None:
         """Take in a pose that the localizer shows."""
         self._shown = shown
 
     def at(self, image: Header, state: RobotState, parameters: RelocalizerParameters,
-           frame_ids: Sequence[str]) -> LocalizedCamera:
-        """Return the camera's pose at the stamp of an image.
+           frame_ids: Sequence[str]) -> tuple[str, NDArray[np.float64]]:
+        """Return the camera's pose (4, 4) at the stamp of an image, and the map it is in.
 
         `state` is the robot's at that stamp, `frame_ids` are those of the maps.
 
@@ -88,12 +76,7 @@ class LocalizerPose:
         if frame_id not in frame_ids:
             raise NoLocalizerPoseError(f"the localizer's pose is in frame '{frame_id}', the map "
                                        f"in '{', '.join(frame_ids)}': correct the map's frame_id")
-        place, last = state.place, self._last
-        self._last = None if place is None else (
-            place.run, pose @ invert_transform(place.odom_from_camera))
-        has_jumped = place is not None and last is not None and (
-            last[0] != place.run or not SAME_LOOK.agree(last[1] @ place.odom_from_camera, pose))
-        return LocalizedCamera(frame_id, pose, has_jumped)
+        return frame_id, pose
 
     def _by_tf(self, image: Header, state: RobotState, parameters: RelocalizerParameters,
                frame_ids: Sequence[str]) -> tuple[str, NDArray[np.float64]]:
