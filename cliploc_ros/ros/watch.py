@@ -47,8 +47,6 @@ _FRAME_PATIENCE_S = 5.0
 _STALE_S = 10.0
 # Whether a robot rests shows within this time.
 _REST_PATIENCE_S = 3.0
-#: Of a lost robot, in the diagnostics.
-AT_REST = 'the robot stands'
 # Between requests of a robot that stays lost; the pause doubles each time.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 160.0
 
@@ -90,8 +88,9 @@ class Watcher:
         # Looks at a pose from before this number changed do not count.
         self._age = 0
         self._cost_s = 0.0
-        # What became of a robot that is lost.
-        self._pause_s, self._next_request_at, self._reaction = _FIRST_PAUSE_S, 0.0, ''
+        # What became of a robot that is lost, and whether it stands.
+        self._reaction, self._is_at_rest = '', False
+        self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
             handoff.on_shown(self._pose.hear)
             robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
@@ -136,6 +135,7 @@ class Watcher:
         report = known.report
         health.values |= {
             'watch': str(known.state), 'watch reason': known.reason, 'on lost': self._reaction,
+            'lost and at rest': known.state is WatchState.LOST and self._is_at_rest,
             'watch look [ms]': f'{1e3 * self._cost_s:.1f}'}
         if report is not None:
             turned = '' if report.camera_turn is None else \
@@ -229,7 +229,9 @@ class Watcher:
             self._localized.publish(Bool(data=known.state is WatchState.LOCALIZED))
             self._state.publish(String(data=str(known.state)))
         if known.state is WatchState.LOCALIZED:
-            self._pause_s, self._next_request_at, self._reaction = _FIRST_PAUSE_S, 0.0, ''
+            self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
+        if known.state is not WatchState.LOST:
+            self._is_at_rest = False
         if (known.state, known.problem) != (before.state, before.problem):
             text = f'watch: {known.problem or known.reason}'
             if known.state is WatchState.LOST:
@@ -263,14 +265,15 @@ class Watcher:
         parameters = self._node.settings.values
         if self._known.state is not WatchState.LOST:
             return
-        if (moves := self._why_not_at_rest(parameters)):
-            self._reaction = moves
+        self._reaction = self._why_not_at_rest(parameters)
+        self._is_at_rest = not self._reaction
+        if not self._is_at_rest:
             return
         left_s = self._next_request_at - time.monotonic()
         if parameters.on_lost == 'report' or stopped.is_set():
-            self._reaction = AT_REST
+            self._reaction = 'the robot stands'
         elif left_s > 0.0:
-            self._reaction = f'{AT_REST}; next request in {left_s:.0f} s'
+            self._reaction = f'the robot stands; next request in {left_s:.0f} s'
         else:
             self._node.get_logger().warning('watch: lost and at rest: relocalizing')
             answer = self._relocalize()

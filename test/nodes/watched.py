@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that drives to and fro in the simulated room, with odometry and a localizer like AMCL."""
+"""A robot that drives to and fro in the simulated room, with a localizer like AMCL."""
 
 import time
 
