@@ -44,7 +44,8 @@ def check(tester, node, *absent):
 
 
 def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
-    process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw', watch='amcl_pose')
+    process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw',
+                              watch='amcl_pose')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
     tester.ask()  # odometry is listened to during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')

@@ -171,7 +171,7 @@ def test_what_is_missing_is_named_and_not_taken_for_lost(watch, fault, text):
 def test_a_localizer_that_shows_nan_is_named(watch):
     watched = watch()
     watched.until_state('localized')
-    watched.robot.believed[0, 3] = float('nan')
+    watched.robot.error_m = float('nan')
     watched.until_reason('/amcl_pose shows a pose with NaN')
     assert watched.states[-1] == 'uncertain'
 

@@ -48,6 +48,8 @@ class Robot:
         self.start = MAP_FROM_CAMERA @ aside(-1.5)
         #: What the localizer takes for that.
         self.believed = self.start
+        #: Of what it shows: a number, or NaN.
+        self.error_m = 0.0
         self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
         self.clock = time.time
 
@@ -91,6 +93,8 @@ class Robot:
 
     def show(self, odom_from_base, now_s):
         """Publish the localizer's pose."""
-        self._pose.publish(pose_with_covariance_msg(
+        shown = pose_with_covariance_msg(
             Header(frame_id=self.frame_id, stamp=stamp(now_s)), self.believed @ odom_from_base,
-            0.01 * np.eye(6)))
+            0.01 * np.eye(6))
+        shown.pose.pose.position.x += self.error_m
+        self._pose.publish(shown)
