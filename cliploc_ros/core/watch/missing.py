@@ -7,6 +7,7 @@ a landmark has a beta distribution, which each look narrows down. Then the proba
 in a row is B(a, b + k) / B(a, b), if the landmark is there.
 """
 
+from collections import deque
 from math import exp, log
 from typing import NamedTuple
 
@@ -25,6 +26,10 @@ _BY_CHANCE = 0.05
 # Named from this probability on. Not more sightings than this are counted, so a landmark that is
 # taken away after a day is soon missed.
 _NAMED, _MOST_SEEN = 0.8, 15.0
+
+# The map is out of date where this many landmarks and this share of those that the last looks
+# expected are gone, by their probabilities.
+_HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.2
 
 
 class _Record(NamedTuple):
@@ -46,6 +51,7 @@ class Missing:
 
     def __init__(self) -> None:
         self._records: dict[int, _Record] = {}
+        self._expected: deque[list[int]] = deque(maxlen=_HERE)
 
     def add(self, expected: Expected, weight: float) -> None:
         """Count a look at a right pose, 1 for one that shares no errors with earlier ones."""
@@ -56,8 +62,17 @@ class Missing:
                     min(one.found + weight, _MOST_SEEN), one.not_found + one.misses)
             elif in_sight:
                 self._records[landmark] = one._replace(misses=one.misses + weight)
+        if len(expected.landmarks):
+            self._expected.append(expected.landmarks.tolist())
 
     def named(self) -> list[int]:
         """Return the landmarks that are missing, those first that are most certainly gone."""
         gone = {landmark: one.gone for landmark, one in self._records.items() if one.misses}
         return sorted((one for one in gone if gone[one] >= _NAMED), key=lambda one: -gone[one])
+
+    @property
+    def is_outdated(self) -> bool:
+        """Return whether the map is out of date at the place of the last looks."""
+        here = {landmark for look in self._expected for landmark in look}
+        gone = sum(self._records[one].gone for one in here if one in self._records)
+        return bool(gone >= _LEAST_GONE and gone >= _LEAST_SHARE * len(here))
