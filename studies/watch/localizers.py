@@ -115,10 +115,9 @@ def turned_camera(degrees: float, rng: np.random.Generator) -> NDArray[np.float6
 
 
 def recorded_drive(name: str, recorded: PosedDetections, landmark_map: LandmarkMap,
-                   first: int, step: int) -> Drive:
-    """Return every step-th frame of a recording from the first on as a drive, by class."""
-    rows = np.arange(len(recorded))[first::step]
-    poses = recorded.map_from_camera[rows]
+                   rows: Sequence[int]) -> Drive:
+    """Return some frames of a recording, in the order of time, as a drive, by class."""
+    poses = recorded.map_from_camera[np.array(rows)]
     seen = []
     for row in rows:
         boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
@@ -127,5 +126,5 @@ def recorded_drive(name: str, recorded: PosedDetections, landmark_map: LandmarkM
             tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
             recorded.scores[boxes]), stamp_ns=round(recorded.stamps_s[row] * NS_PER_S)))
     none = np.zeros(len(landmark_map), dtype=np.bool_)
-    return Drive(name, landmark_map, with_odometry(seen, poses, first), poses, none, none,
+    return Drive(name, landmark_map, with_odometry(seen, poses, rows[0]), poses, none, none,
                  np.array([poses[:, :2, 3].min(axis=0), poses[:, :2, 3].max(axis=0)]))

@@ -22,8 +22,8 @@ from cliploc_ros.core.watch.alignment import Alignment
 
 # Looks that are averaged, and from how many on a turn is named. Objects that a look must match.
 _MOST_LOOKS, _LEAST_LOOKS, _LEAST_MATCHED = 40, 8, 3
-# Standard deviations of a localizer on each axis: of the position [m], and of the yaw [deg].
-_DRIFT_M, _YAW_DEG = 0.15, 2.0
+# Standard deviations of a localizer: of x, y and height [m], and of the yaw [deg].
+_DRIFT_M, _YAW_DEG = (0.15, 0.15, 0.03), 2.0
 # A turn is significant from this angle [deg] and this many deviations on.
 _LEAST_DEG, _LEAST_SIGMAS = 1.5, 4.0
 _ROUNDS = 10
@@ -96,11 +96,10 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
     """Return the turn from a given pose (4, 4) to the one that fits, at the likeliest position.
 
     The given position is right to within _DRIFT_M, so what moves the fit away from it is in part
-    a turn. With the information [A, B; B^T, C] of position and turn and P of the given position,
-    the position moves back by s = (A + P)^-1 P step, and the turn by -C^-1 B^T s.
+    a turn: the least squares of the fit and of the given position together.
     """
     back = given[:3, 3] - pose[:3, 3]
-    prior = np.eye(3) / _DRIFT_M ** 2
+    prior = np.diag(1.0 / np.square(_DRIFT_M))
     of_step, mixed, of_turn = information[:3, :3], information[:3, 3:], information[3:, 3:]
     marginal = of_turn - mixed.T @ np.linalg.solve(of_step + prior, mixed)
     # of position and turn together, with the prior of the position
