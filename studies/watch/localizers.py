@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.evaluation.watching import observation_of
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.world import make_drive
@@ -118,13 +119,8 @@ def recorded_drive(name: str, recorded: PosedDetections, landmark_map: LandmarkM
                    rows: Sequence[int]) -> Drive:
     """Return some frames of a recording, in the order of time, as a drive, by class."""
     poses = recorded.map_from_camera[np.array(rows)]
-    seen = []
-    for row in rows:
-        boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
-        seen.append(Observation(recorded.camera, Detections(
-            recorded.bboxes_xyxy[boxes],
-            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
-            recorded.scores[boxes]), stamp_ns=round(recorded.stamps_s[row] * NS_PER_S)))
+    seen = [observation_of(recorded, row, round(recorded.stamps_s[row] * NS_PER_S))
+            for row in rows]
     none = np.zeros(len(landmark_map), dtype=np.bool_)
     return Drive(name, landmark_map, with_odometry(seen, poses, rows[0]), poses, none, none,
                  np.array([poses[:, :2, 3].min(axis=0), poses[:, :2, 3].max(axis=0)]))

@@ -10,7 +10,6 @@ little from more of them.
 
 import math
 from collections import deque
-from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -48,9 +47,8 @@ class Belief:
 
     @property
     def against(self) -> int:
-        """Return how many full looks speak against the pose since the last one for it."""
-        last = takewhile(lambda one: one.log_odds < 0.0, reversed(self._looks))
-        return sum(one.is_full for one in last)
+        """Return how many of the last full looks speak against the pose."""
+        return sum(one.is_full and one.log_odds < 0.0 for one in self._looks)
 
     def wait(self, observation: Observation, map_from_camera: NDArray[np.float64]) -> None:
         """Let the time to a look pass, and the way to its pose (4, 4)."""

@@ -27,8 +27,9 @@ from cliploc_ros.core.watch.image_faults import ImageFaults
 from cliploc_ros.core.watch.missing import Missing
 from cliploc_ros.errors import OptionsError
 
-# Looks against a pose that make it lost; no single one does.
-_LEAST_AGAINST = 2
+# Looks against a pose that make it lost, no single one does: where odometry contradicts it, too,
+# and where it does not.
+_LEAST_AGAINST = {True: 2, False: 3}
 # A look of more weight than this is at another view, see Belief.add.
 _NEW_VIEW = 0.3
 _RIGID = 1e-3
@@ -68,7 +69,7 @@ class Watch:
 
     def forget(self) -> None:
         """Begin again: the localizer was given another pose, time jumped, or the map changed."""
-        self._belief, self._missing = Belief(), Missing()
+        self._belief, self._missing = Belief(), Missing(self._map)
         self._turn, self._faults = TurnEstimate(), ImageFaults()
         self._count, self._stamp_ns = 0, -1
 
@@ -132,7 +133,8 @@ class Watch:
         state = WatchState.UNCERTAIN
         if likely > terms.localized and not self._missing.is_outdated:
             state = WatchState.LOCALIZED
-        elif likely < terms.lost and self._belief.against >= _LEAST_AGAINST:
+        elif likely < terms.lost and (
+                self._belief.against >= _LEAST_AGAINST[self._belief.has_jumped]):
             state = WatchState.LOST
         report = WatchReport(
             state, likely, '', self._count, evidence.matched if evidence else 0,
