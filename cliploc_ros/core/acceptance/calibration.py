@@ -105,7 +105,6 @@ class Looking(NamedTuple):
     missed: float
     away: float
     turned: float
-    rival: float
     crowd: float
     least: float
     least_unsure: float
@@ -116,6 +115,7 @@ class Looking(NamedTuple):
     correlated_m: float
     correlated_deg: float
     correlated_s: float
+    most_jump: float
     lost: float
     localized: float
 

@@ -3,8 +3,9 @@
 """The probability that a localizer is right, over looks: a Bayes filter.
 
 Between looks a localizer may get lost, or find itself: the probability goes to one half, at a rate
-of the time and the way. Looks of the same place from the same spot share their errors, such as
-those of the map, so a standing robot learns little from more of them.
+of the time and the way. A pose that moves against odometry is another statement. Looks of the same
+place from the same spot share their errors, such as those of the map, so a standing robot learns
+little from more of them.
 """
 
 import math
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform, pose_error
+from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, pose_error
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.units import NS_PER_S
 
@@ -25,9 +26,8 @@ _MOST_LOOKS = 10
 
 class _Look(NamedTuple):
     observation: Observation
-    map_from_camera: NDArray[np.float64]
     log_odds: float
-    known: int
+    is_full: bool  #: Whether a wrong pose would show: enough objects, and enough mapped ones
 
 
 class Belief:
@@ -36,7 +36,9 @@ class Belief:
     def __init__(self) -> None:
         self._log_odds = 0.0
         self._looks: deque[_Look] = deque(maxlen=_MOST_LOOKS)
-        self._last: _Look | None = None
+        self._last: tuple[Observation, NDArray[np.float64]] | None = None
+        #: Whether the localizer made another statement since it was right last
+        self.has_jumped = False
 
     @property
     def probability(self) -> float:
@@ -45,56 +47,57 @@ class Belief:
 
     @property
     def against(self) -> int:
-        """Return how many of the last looks without exception spoke against the pose."""
-        count = 0
-        for one in reversed(self._looks):
-            if one.log_odds >= 0.0:
-                break
-            count += one.known >= 3
-        return count
+        """Return how many of the last full looks speak against the pose."""
+        return sum(one.is_full and one.log_odds < 0.0 for one in self._looks)
 
     def wait(self, observation: Observation, map_from_camera: NDArray[np.float64]) -> None:
         """Let the time to a look pass, and the way to its pose (4, 4)."""
         last, terms = self._last, CALIBRATION.watch
-        self._last = _Look(observation, map_from_camera, 0.0, 0)
+        self._last = observation, map_from_camera
         if last is None:
             return
-        if jumped(last.observation, last.map_from_camera, observation, map_from_camera):
-            self._log_odds, self._looks = 0.0, deque(maxlen=_MOST_LOOKS)
+        away_m, away_deg = _moved_without_odometry(*last, observation, map_from_camera)
+        if away_m > SAME_PLACE.distance_m or away_deg > SAME_PLACE.angle_deg:
+            # Where the camera had confirmed the pose before, this one is wrong, unless that was.
+            self._log_odds = -min(max(self._log_odds, 0.0), terms.most_jump)
+            self._looks.clear()
+            self.has_jumped = True
             return
-        time_s = max(0, observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
-        way_m = pose_error(map_from_camera, last.map_from_camera)[0]
+        time_s = max(0, observation.stamp_ns - last[0].stamp_ns) / NS_PER_S
+        way_m = float(np.linalg.norm(map_from_camera[:3, 3] - last[1][:3, 3]))
         keep = math.exp(-terms.lost_per_s * time_s - terms.lost_per_m * way_m)
         likely = 0.5 + keep * (self.probability - 0.5)
         self._log_odds = math.log(likely / (1.0 - likely))
 
-    def add(self, observation: Observation, map_from_camera: NDArray[np.float64],
-            log_odds: float, known: int) -> None:
-        """Take in a look after wait, by its log odds and its detections of the map's classes."""
-        look = _Look(observation, map_from_camera, log_odds, known)
-        self._log_odds += log_odds * (1.0 - max(
-            (_correlation(one, look) for one in self._looks), default=0.0))
+    def add(self, observation: Observation, log_odds: float, is_full: bool) -> float:
+        """Take in a look after wait; return its weight, 1 if it shares no errors with others."""
+        look = _Look(observation, log_odds, is_full)
+        weight = 1.0 - max((_correlation(one, look) for one in self._looks), default=0.0)
+        self._log_odds += weight * log_odds
         self._looks.append(look)
+        if self.probability > CALIBRATION.watch.localized:
+            self.has_jumped = False
+        return weight
 
 
-def jumped(before: Observation, pose_before: NDArray[np.float64], now: Observation,
-           pose_now: NDArray[np.float64]) -> bool:
-    """Return whether a localizer made another statement: its pose moved, and odometry did not."""
+def _moved_without_odometry(before: Observation, pose_before: NDArray[np.float64],
+                            now: Observation, pose_now: NDArray[np.float64]
+                            ) -> tuple[float, float]:
+    """Return how far a localizer moved its pose against odometry [m] [deg]; 0 without odometry."""
     if before.odom_from_camera is None or now.odom_from_camera is None:
-        return False
+        return 0.0, 0.0
     carried = pose_before @ invert_transform(before.odom_from_camera) @ now.odom_from_camera
-    return not SAME_ANSWER.agree(carried, pose_now)
+    return pose_error(carried, pose_now)
 
 
 def _correlation(one: _Look, look: _Look) -> float:
     """Return the correlation of the errors of two looks, 0 to 1."""
     terms = CALIBRATION.watch
-    if one.observation.odom_from_camera is None or look.observation.odom_from_camera is None:
-        time_s = abs(look.observation.stamp_ns - one.observation.stamp_ns) / NS_PER_S
-        away = time_s / terms.correlated_s
+    then, now = one.observation, look.observation
+    if then.odom_from_camera is None or now.odom_from_camera is None:
+        away = abs(now.stamp_ns - then.stamp_ns) / NS_PER_S / terms.correlated_s
     else:
-        way_m, turn_deg = pose_error(one.observation.odom_from_camera,
-                                     look.observation.odom_from_camera)
+        way_m, turn_deg = pose_error(then.odom_from_camera, now.odom_from_camera)
         away = way_m / terms.correlated_m + turn_deg / terms.correlated_deg
     # looks that say the opposite are no repetition: the robot was carried away, or back
     return terms.correlated * math.exp(-away - abs(one.log_odds - look.log_odds) / terms.most)

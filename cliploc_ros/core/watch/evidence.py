@@ -22,6 +22,9 @@ from cliploc_ros.core.search.frame_search import prior_of
 from cliploc_ros.core.watch.alignment import Alignment
 from cliploc_ros.core.watch.expectation import Expected, expect
 
+# A wrong pose shows where this many objects are in the image, and so many landmarks should be.
+_OBJECTS, _MAPPED = 3, 2
+
 
 class LookEvidence(NamedTuple):
     """What one look says of the given pose."""
@@ -34,15 +37,18 @@ class LookEvidence(NamedTuple):
     missed: int  #: Those of them that no detection shows
     away_m: float  #: From the given pose to the best one near it
     away_deg: float
-    rival: float  #: Log odds by which a pose further away fits better
     crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
+
+    def is_full(self, has_jumped: bool) -> bool:
+        """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
+        return self.known >= _OBJECTS and (has_jumped or self.expected >= _MAPPED)
 
     @property
     def terms(self) -> tuple[float, ...]:
         """Return the terms of the model, in the order of calibration.yaml."""
         return (1.0, min(self.utility, 12.0), float(self.matched > 0), float(self.unexplained),
                 float(self.missed), math.log1p((self.away_m / 0.3) ** 2),
-                math.log1p((self.away_deg / 8.0) ** 2), min(self.rival, 6.0), self.crowd)
+                math.log1p((self.away_deg / 8.0) ** 2), self.crowd)
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
@@ -62,18 +68,21 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     pairs = sum(int((in_view == one).sum()) for one in classes[own])
     return LookEvidence(int(own.sum()), fit.support.inliers, unexplained, float(utility),
                         len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
-                        alignment.away_deg, alignment.rival, math.log1p(pairs)), found
+                        alignment.away_deg, math.log1p(pairs)), found
 
 
-def log_odds(evidence: LookEvidence, calibration: Calibration = CALIBRATION) -> float:
-    """Return the log odds of a look by its objects that the given pose is right."""
+def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = CALIBRATION
+             ) -> float:
+    """Return the log odds of a look by its objects that the given pose is right.
+
+    A place that the map does not show is no wrong pose, nor is a view without objects: a look that
+    is not full says little against a pose.
+    """
     terms = calibration.watch
     if not evidence.known:
         return 0.0  # something may hide everything
     found = float(np.dot(terms[:len(evidence.terms)], evidence.terms))
-    # a place that the map does not show is no wrong pose, nor is a view without objects
-    least = terms.least if evidence.known >= 3 and evidence.expected >= 2 else terms.least_unsure
-    return min(max(found, least), terms.most)
+    return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
 
 
 def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
