@@ -34,7 +34,7 @@ from cliploc_ros.core.watch.watch import WatchState
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.poses import slerp
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.demo.pictures import draw_kidnapped
+from cliploc_ros.demo.pictures import Moment, Step, draw_kidnapped
 from cliploc_ros.demo.processes import DemoError, own_ros_domain
 from cliploc_ros.demo.run import DemoOptions, nodes, prepare
 from cliploc_ros.messages import detections_from_msg
@@ -61,25 +61,6 @@ class View:
 
     file: Path
     map_from_camera: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Moment:
-    """Where the robot was at a time [s], where its localizer had it, and what the watch said."""
-
-    time_s: float
-    truth: NDArray[np.float64]
-    believed: NDArray[np.float64]
-    state: str
-
-
-@dataclass(frozen=True)
-class Step:
-    """What happened, when [s], and after how many looks."""
-
-    time_s: float
-    looks: int
-    text: str
 
 
 class KidnappedRobot(Node):

@@ -4,8 +4,8 @@
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -24,9 +24,6 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo.review import ACCEPTED, REFUSED, Judged, Review
 from cliploc_ros.evaluation.figures import EDGED, draw_map
-
-if TYPE_CHECKING:
-    from cliploc_ros.demo.kidnapped import Moment, Step
 
 _DPI = 110
 _BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'
@@ -229,8 +226,27 @@ def _draw_camera(axes: Axes, map_from_camera: NDArray[np.float64], color: str, m
               linestyle='none', markerfacecolor='none' if hollow else color)
 
 
+@dataclass(frozen=True)
+class Moment:
+    """Where the robot was at a time [s], where its localizer had it, and what the watch said."""
+
+    time_s: float
+    truth: NDArray[np.float64]
+    believed: NDArray[np.float64]
+    state: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened, when [s], and after how many looks."""
+
+    time_s: float
+    looks: int
+    text: str
+
+
 def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_map: LandmarkMap,
-                   moments: Sequence['Moment'], steps: Sequence['Step'], path: Path) -> None:
+                   moments: Sequence[Moment], steps: Sequence[Step], path: Path) -> None:
     """Draw a kidnapped robot: its last view before it was found lost, its ways, and its error.
 
     The boxes are of the view; the outlines are what the localizer's pose of that time expects.
@@ -275,7 +291,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
                 edgecolor=_EXPECTED, linewidth=1.5, linestyle=':', path_effects=_EDGED))
 
 
-def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence['Moment']) -> None:
+def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:
     """Draw where the robot was, and where its localizer had it."""
     draw_map(axes, landmark_map)
     for name, color, style in (('truth', _TRUTH, '-'), ('believed', REFUSED, '--')):

@@ -7,7 +7,7 @@ import time
 import numpy as np
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
-from scene import MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from std_msgs.msg import Header
 from tester import RELIABLE, make_frame, transform_of
 
@@ -19,6 +19,7 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
 
 ROOM = make_room()
+NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.height, np.uint8)
 # The camera looks along the base's x axis.
 MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
 BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
@@ -79,7 +80,9 @@ class Robot:
             self._odom.publish(odometry)
         if self._tick % IMAGE_EVERY == 0 and self.sees:
             seen = see_room(ROOM, self.map_from_base @ BASE_FROM_CAMERA)
-            self._tester.publish(make_frame(seen, now_s))
+            image, *others = make_frame(seen, now_s)
+            image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
+            self._tester.publish((image, *others))
         if self._tester.initial_poses:  # as AMCL takes it at rest
             given = transform_of(self._tester.initial_poses.pop().pose.pose)
             self.believed = given @ invert_transform(odom_from_base)
